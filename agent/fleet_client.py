@@ -130,7 +130,7 @@ class FleetClient:
             publish: send it now; else only answer questions with it.
             skipped: images that were skipped so far.
         """
-        self._status = replace(status, doing=one_line(status.doing), detail=one_line(status.detail))
+        self._status = status
         self._stamp_ns, self._battery, self._skipped = stamp_ns, battery, skipped
         mission = self._missions.report
         self._troubles.mission(None if mission is None else (mission.order.id, mission.state))
@@ -169,8 +169,9 @@ class FleetClient:
         # What fails now comes before a question that once had no answer.
         failure = one_line(self._failure())
         trouble, age = (failure, 0.0) if failure else self._troubles.newest()
+        status = self._status
         return AgentStatus(
-            self._status,
+            replace(status, doing=one_line(status.doing), detail=one_line(status.detail)),
             self._stamp_ns,
             self._agent,
             self._map.epoch,

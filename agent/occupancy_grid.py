@@ -66,7 +66,7 @@ class OccupancyGrid:
     def cells(self, points: Array) -> NDArray[np.int64]:
         """(..., 2) m in map -> (..., 2) cell indices, clipped to the grid."""
         index = np.floor(points / self._settings.cell).astype(np.int64) + self._half - self._middle
-        return np.asarray(np.clip(index, 0, 2 * self._half - 1), np.int64)
+        return np.asarray(np.minimum(np.maximum(index, 0), 2 * self._half - 1), np.int64)
 
     def centre(self, cell: tuple[int, int]) -> Array:
         """(2,) m in map, middle of a cell."""
@@ -108,15 +108,14 @@ class OccupancyGrid:
         hits = proximity < self._description.ranger_reach - 0.05
         # A cell counts once, however many beams meet it: all of them write the same into it.
         ended = origin + directions[hits] * ends[hits, None]
-        odds = self._odds.reshape(-1)
-        passed, met = self._numbers(points[along]), self._numbers(ended)
-        odds[passed] -= MISS
-        odds[met] += HIT + MISS
+        odds, passing = self._odds.reshape(-1), points[along]
+        numbers = self._numbers(np.concatenate([passing, ended, origin + _FOOTPRINT]))
+        first, last = len(passing), len(passing) + len(ended)
+        odds[numbers[:first]] -= MISS
+        odds[numbers[first:last]] += HIT + MISS
         # The robot's own footprint is free.
-        own = self.cells(origin + np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]]))
-        self._odds[own[:, 0], own[:, 1]] = -MOST
-        for changed in (passed, met):
-            odds[changed] = np.clip(odds[changed], -MOST, MOST)
+        odds[numbers[last:]] = -MOST
+        odds[numbers] = np.minimum(np.maximum(odds[numbers], -MOST), MOST)
 
     def _numbers(self, points: Array) -> NDArray[np.int64]:
         """(N,) numbers of the cells, row by row, in which (N, 2) m in map lie."""
@@ -215,6 +214,8 @@ class OccupancyGrid:
         return DistanceField(self, drivable, cost, before)
 
 
+_FOOTPRINT: Array = np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]])
+"""m, in robot."""
 _NEIGHBOURS = [(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if dx or dy]
 _CLOSE = float(np.float32(0.05))
 """What is nearer than this is touched, m; of the precision of `OccupancyGrid.room`."""

@@ -144,9 +144,10 @@ def reduce_pair(
         z = np.where(good, y[:, 2], 1.0)
         seen = y[:, :2] / z[:, None]
         slope = _projected(at.translation[0], seen, z)
+        length = np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
         residual = pair.after - seen - slope * (mean - rho)[:, None]
         jacobian = np.concatenate(
-            [_jacobian(seen, z, rho, slope, mean), slope[:, :, None] * shapes[:, None]], axis=2
+            [_jacobian(seen, z, rho, slope / length, mean), slope[:, :, None] * shapes[:, None]], axis=2
         )
         # (sigma^2 I + spread^2 g g')^-1 by Sherman and Morrison.
         gain = 1.0 / ((sigma / spread) ** 2 + (slope**2).sum(1))
@@ -165,7 +166,7 @@ def reduce_pair(
     depths = rho[agreeing]
     typical = (median(depths), float(depths.std())) if agreeing.sum() > 5 else depth
     across = np.abs(residual[:, 0] * slope[:, 1] - residual[:, 1] * slope[:, 0])
-    scatter = 1.4826 * median(across / np.maximum(np.linalg.norm(slope, axis=1), 1e-12))
+    scatter = 1.4826 * median(across / length[:, 0])
     floor = floor_ratios(pair, at[0], floor_sigma)
     return PairInformation(at[0], matrix, vector, int(agreeing.sum()), typical, scatter, floor)
 
@@ -224,8 +225,8 @@ def _inverse_depths(
     return np.maximum(best, 0.0)
 
 
-def _jacobian(seen: Array, z: Array, rho: Array, slope: Array, mean: float) -> Array:
-    """(N, 2, 7) of the predicted coordinates with respect to a step and to the scale of the depths.
+def _jacobian(seen: Array, z: Array, rho: Array, along: Array, mean: float) -> Array:
+    """(N, 2, 6) of the predicted coordinates with respect to a step; (N, 2) `along` each point's line.
 
     A depth is estimated from the very residual along the line on which the point may lie. So along that line
     the depth known beforehand takes its place: a product of one noise with itself has a mean.
@@ -234,7 +235,6 @@ def _jacobian(seen: Array, z: Array, rho: Array, slope: Array, mean: float) -> A
     jacobian = np.zeros((len(seen), 2, 6))
     jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
     jacobian[:, :, 2] = -seen
-    along = slope / np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
     shared = (mean - rho)[:, None] * np.einsum("ni,nij->nj", along, jacobian[:, :, :3])
     jacobian[:, :, :3] *= rho[:, None, None]
     jacobian[:, :, :3] += along[:, :, None] * shared[:, None]

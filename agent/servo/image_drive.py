@@ -73,7 +73,7 @@ class ImageDrive:
         bearings = np.asarray(bearings, dtype=np.float64)
         sense = math.copysign(1.0, self._distance)
         if self._outward:
-            obstacle = self._free(sense, proximity) <= STOP
+            obstacle = self._free(self._near(sense, proximity)) <= STOP
             few = sense > 0 and self._safe(bearings) < MIN_VISIBLE
             if obstacle or few or sense * (self._distance - travelled) <= 0.005:
                 self._outward = False
@@ -85,10 +85,12 @@ class ImageDrive:
         if not self._outward and sense * travelled <= 0.005:
             return Command(), True, self._reason
         direction = sense if self._outward else -sense
-        if not self._outward and self._free(direction, proximity) <= STOP:
+        near = self._near(direction, proximity)
+        free = self._free(near)
+        if not self._outward and free <= STOP:
             return Command(), True, "ended: an obstacle on the way back"
-        forward = direction * self._speed(travelled, self._free(direction, proximity))
-        turn = self._turn(direction, heading_error, bearings, proximity)
+        forward = direction * self._speed(travelled, free)
+        turn = self._turn(direction, heading_error, bearings, near)
         return Command(forward, turn), False, "driving forth" if self._outward else "driving back"
 
     def _speed(self, travelled: float, free: float) -> float:
@@ -101,7 +103,7 @@ class ImageDrive:
         return max(min(ramp, top), min(0.03, top)) * max(share, 0.15)
 
     def _turn(
-        self, direction: float, heading_error: float, bearings: NDArray[Any], proximity: NDArray[Any]
+        self, direction: float, heading_error: float, bearings: NDArray[Any], near: NDArray[np.float64]
     ) -> float:
         """rad/s: hold the heading; give way to features off the middle, and to obstacles on one side."""
         turn = -HEADING_GAIN * heading_error
@@ -112,7 +114,6 @@ class ImageDrive:
             room = self._description.camera.semi_aperture - BORDER
             out_left, out_right = int((bearings > room).sum()), int((bearings < -room).sum())
             turn += 0.15 * CENTRE_GAIN * (out_left - out_right) / len(bearings)
-        near = self._near(direction, proximity)
         if len(near):
             distances, offsets = near.T
             weight = np.clip((SLOW - distances) / SLOW, 0.0, 1.0)
@@ -130,9 +131,8 @@ class ImageDrive:
         left = offsets * (1.0 if direction > 0 else -1.0)
         return np.column_stack([distances[:count][chosen], left[chosen]])
 
-    def _free(self, direction: float, proximity: NDArray[Any]) -> float:
+    def _free(self, near: NDArray[np.float64]) -> float:
         """Free way in the direction of travel, m: to the nearest thing within the width of the robot."""
-        near = self._near(direction, proximity)
         if not len(near):
             return math.inf
         radius = self._description.radius
