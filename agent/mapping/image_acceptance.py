@@ -7,7 +7,7 @@ import copy
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.arrays import among
+from mapweave.agent.arrays import among, same_image
 from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector, relit
 from mapweave.agent.observation import Observation
 from mapweave.agent.settings import TrackingSettings
@@ -113,6 +113,6 @@ class ImageAcceptance:
         """
         moved = self.moved
         stands = max(abs(moved.x), abs(moved.y), abs(moved.heading)) < 1e-3
-        if stands or self._accepted is None or not np.array_equal(image, self._accepted):
+        if stands or self._accepted is None or not same_image(image, self._accepted):
             return False
         return int(image.min()) < int(image.max())

@@ -8,6 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import same_image
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.pose import Pose2
 
@@ -60,7 +61,7 @@ class CameraMonitor:
 
     def _compare(self, image: NDArray[np.uint8]) -> None:
         """Whether an image is the last one again, and whether it shows anything."""
-        if self._image is not None and np.array_equal(image, self._image):
+        if self._image is not None and same_image(image, self._image):
             way = math.hypot(self._moved.x, self._moved.y)
             moved = way > MOVED[0] or abs(self._moved.heading) > MOVED[1]
             # Only an image with nothing in it is the same from everywhere. A frozen one is until it changes.

@@ -49,6 +49,7 @@ class Tracker:
         self._image: NDArray[np.uint8] | None = None
         self.ids: NDArray[np.int64] = np.zeros(0, np.int64)
         self.raw: Array = np.zeros((0, 2))
+        self._undistorted: tuple[Array, Array] = self.raw, self.raw
         self.ages: NDArray[np.int64] = np.zeros(0, np.int64)
         self.held: NDArray[np.bool_] = np.zeros(0, np.bool_)
         self._matcher = TemplateMatcher()
@@ -57,8 +58,12 @@ class Tracker:
 
     @property
     def pixels(self) -> Array:
-        """(N, 2) px in the ideal image, where the points are now."""
-        return self._lens.undistort(self.raw)
+        """(N, 2) px in the ideal image, where the points are now; not to be written to."""
+        if self._undistorted[0] is not self.raw:
+            pixels = self._lens.undistort(self.raw)
+            pixels.flags.writeable = False
+            self._undistorted = self.raw, pixels
+        return self._undistorted[1]
 
     @property
     def templates(self) -> Templates:

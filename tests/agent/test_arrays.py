@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.agent.arrays import among, median
+from mapweave.agent.arrays import among, median, same_image
 
 
 @pytest.mark.parametrize("others", [0, 1, 7, 40])
@@ -30,3 +30,13 @@ def test_median_is_that_of_numpy(kind: type) -> None:
 
 def test_median_of_nothing_known_is_nan() -> None:
     assert math.isnan(median(np.array([1.0, math.nan, 2.0])))
+
+
+def test_images_are_the_same_to_the_last_grey_level() -> None:
+    image = np.random.default_rng(5).integers(0, 255, (12, 16), dtype=np.uint8)
+    other = image.copy()
+    assert same_image(image, other)
+    other[-1, -1] ^= 1
+    assert not same_image(image, other)
+    assert not same_image(image, image[:-1])
+    assert not same_image(image, image[:, :-1])
