@@ -123,9 +123,10 @@ def _loops(
         np.stack([link.a_from_b.mean.vector for link in links]),
         np.stack([link.a_from_b.covariance for link in links]),
     )
-    a, b = [link.a for link in links], [link.b for link in links]
-    through_second = second.graph.relative([b[k] for k in i], [b[k] for k in j])
-    through_first = first.graph.relative([a[k] for k in j], [a[k] for k in i])
+    a = first.graph.index([link.a for link in links])
+    b = second.graph.index([link.b for link in links])
+    through_second = second.graph.relative_rows(b[i], b[j])
+    through_first = first.graph.relative_rows(a[j], a[i])
     loop = across.take(i) @ through_second @ across.take(j).inverse() @ through_first
     floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
     loop = PoseGaussians(loop.means, loop.covariances + floor)

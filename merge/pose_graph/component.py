@@ -85,16 +85,15 @@ class Component(PoseGraph):
         """Of all measurements."""
         return float(self.factors.strains(self.means).sum())
 
-    def relative(self, starts: Sequence[NodeId], ends: Sequence[NodeId]) -> PoseGaussians:
-        """Poses `start_from_end` of K pairs, by what was measured around them.
+    def relative_rows(self, i: Rows, j: Rows) -> PoseGaussians:
+        """Poses `i_from_j` of (K,) rows, by what was measured around them.
 
         Raises:
             ValueError: nothing joins a pair: this is no component.
         """
-        count, involved = len(self.nodes), len({*starts, *ends})
-        if count <= EXACT or (count <= MOST_EXACT and AROUND * involved >= count):
-            return super().relative(starts, ends)
-        i, j = self.index(starts), self.index(ends)
+        count = len(self.nodes)
+        if count <= EXACT or (count <= MOST_EXACT and AROUND * len(np.unique([i, j])) >= count):
+            return super().relative_rows(i, j)
         means = compose_poses(inverse_poses(self.means[i]), self.means[j])
         covariances = np.zeros((len(i), 3, 3))
         left, least = np.flatnonzero(i != j), NEARBY
@@ -107,7 +106,7 @@ class Component(PoseGraph):
             left = np.concatenate(apart)
             if len(left) and least >= len(self.nodes):
                 k = int(left[0])
-                raise ValueError(f"nothing joins {starts[k]} and {ends[k]}")
+                raise ValueError(f"nothing joins {self.nodes[i[k]]} and {self.nodes[j[k]]}")
             least *= 4
         return PoseGaussians(means, covariances)
 

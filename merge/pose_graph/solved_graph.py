@@ -60,12 +60,16 @@ class PoseGraph:
 
     def covariance(self, nodes: Sequence[NodeId]) -> Array:
         """(K, 3, K, 3) joint covariance of some nodes, by solving for their columns only."""
-        columns = (3 * self.index(nodes)[:, None] + np.arange(3)).ravel()
+        return self._joint(self.index(nodes))
+
+    def _joint(self, rows: NDArray[np.int64]) -> Array:
+        """(K, 3, K, 3) joint covariance of some rows."""
+        columns = (3 * rows[:, None] + np.arange(3)).ravel()
         right = np.zeros((self.information.shape[0], len(columns)))
         right[columns, np.arange(len(columns))] = 1.0
         joint = self._factor.solve(right)[columns]
         joint = 0.5 * (joint + joint.T)
-        blocks: Array = joint.reshape(len(nodes), 3, len(nodes), 3)
+        blocks: Array = joint.reshape(len(rows), 3, len(rows), 3)
         return blocks
 
     @cached_property
@@ -100,11 +104,14 @@ class PoseGraph:
 
     def relative(self, starts: Sequence[NodeId], ends: Sequence[NodeId]) -> PoseGaussians:
         """Poses `start_from_end` of K pairs, with covariances that know what the two have in common."""
-        involved = sorted({*starts, *ends})
-        joint = self.covariance(involved)
-        row = {node: k for k, node in enumerate(involved)}
-        i, j = np.array([row[n] for n in starts], int), np.array([row[n] for n in ends], int)
-        means = compose_poses(inverse_poses(self.means[self.index(starts)]), self.means[self.index(ends)])
+        return self.relative_rows(self.index(starts), self.index(ends))
+
+    def relative_rows(self, i: NDArray[np.int64], j: NDArray[np.int64]) -> PoseGaussians:
+        """The same of (K,) rows: poses `i_from_j`."""
+        means = compose_poses(inverse_poses(self.means[i]), self.means[j])
+        involved, where = np.unique(np.concatenate([i, j]), return_inverse=True)
+        joint = self._joint(involved)
+        i, j = np.split(where, 2)
         # (start @ ds)^-1 (end @ de) = start_from_end @ (de - Ad(end_from_start) ds) to first order.
         ad = -adjoints(inverse_poses(means))
         cross = ad @ joint[i, :, j, :]
