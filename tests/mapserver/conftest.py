@@ -12,8 +12,16 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.memory import MemoryHub
 from synthetic.maps import changes_of, write_store
 from synthetic.world import room, take_map
+from tests.examined import examined_once
 from tests.mapserver.house import ROBOT, House, MappedRoom
 from tests.mapserver.played import HandAgent, Server
+
+
+@pytest.fixture(scope="module", autouse=True)
+def examined() -> Iterator[None]:
+    """Servers and commands of tests compare the same nodes again and again."""
+    with examined_once():
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -11,9 +11,17 @@ import cv2
 import numpy as np
 import pytest
 
+from tests.examined import examined_once
 from tests.mapweave.command_line import CAMERA
 from tests.simulator import INSTALLED
 from tests.waiting import free_port
+
+
+@pytest.fixture(scope="module", autouse=True)
+def examined() -> Iterator[None]:
+    """Servers and commands of tests compare the same nodes again and again."""
+    with examined_once():
+        yield
 
 
 @pytest.fixture
