@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import replace
+from functools import cache, partial
 
 import numpy as np
 import pytest
@@ -35,11 +37,8 @@ def fleet() -> Fleet:
     return draw_fleet(SEED, SCENES["house"], Fault.NONE, stops=2)
 
 
-def beside_copies(fleet: Fleet, shift: Pose2, excluding: tuple[str, ...]) -> MergedMap:
-    """Copies of r0's nodes, and of r1's shifted against where they are, beside the true maps.
-
-    Links with some robots are refused by mutual exclusion, others for want of support.
-    """
+def joined_with_copies(fleet: Fleet, shift: Pose2) -> MergedMap:
+    """Copies of r0's nodes, and of r1's shifted against where they are, merged with the true maps."""
     rng = np.random.default_rng(SEED)
     sound = {map_id: content for map_id, content in fleet.maps.items() if map_id != ODD}
     theirs = [node for k in ("r0", "r1") for node in sound[MapId(k, 1)][0]]
@@ -49,7 +48,19 @@ def beside_copies(fleet: Fleet, shift: Pose2, excluding: tuple[str, ...]) -> Mer
     for map_id, content in {**sound, ODD: copied}.items():
         for body in bodies(content):
             merger.apply(map_id, body)
-    merged = merger.merged()
+    return merger.merged()
+
+
+@pytest.fixture(scope="module")
+def copies(fleet: Fleet) -> Callable[[Pose2], MergedMap]:
+    """`joined_with_copies` by the shift, of which most tests have the same."""
+    return cache(partial(joined_with_copies, fleet))
+
+
+def beside(merged: MergedMap, excluding: tuple[str, ...]) -> MergedMap:
+    """The copies beside the true maps: links with some robots are refused by mutual exclusion, others for
+    want of support.
+    """
     found = [*merged.links, *(r.link for r in merged.refused if r.link is not None)]
     mine = [link for link in found if (link.a.map == ODD) != (link.b.map == ODD)]
 
@@ -74,9 +85,9 @@ def beside_copies(fleet: Fleet, shift: Pose2, excluding: tuple[str, ...]) -> Mer
     ),
 )
 def test_two_robots_that_agree_exclude_a_torn_map(
-    fleet: Fleet, shift: Pose2, excluding: tuple[str, ...], torn: bool
+    copies: Callable[[Pose2], MergedMap], shift: Pose2, excluding: tuple[str, ...], torn: bool
 ) -> None:
-    merged = beside_copies(fleet, shift, excluding)
+    merged = beside(copies(shift), excluding)
     assert [{node.agent for node in part} for part in merged.components] == [{"r0", "r1", "r2"}, {"r3"}]
     found = TornMapSearch(ConsistencySettings()).torn(merged)
     assert found.keys() == ({ODD} if torn else set())
@@ -86,8 +97,10 @@ def test_two_robots_that_agree_exclude_a_torn_map(
 
 
 @pytest.mark.slow
-def test_what_did_not_change_is_not_tested_again(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    merged, search = beside_copies(fleet, TORN, ("r0", "r1")), TornMapSearch(ConsistencySettings())
+def test_what_did_not_change_is_not_tested_again(
+    copies: Callable[[Pose2], MergedMap], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    merged, search = beside(copies(TORN), ("r0", "r1")), TornMapSearch(ConsistencySettings())
     assert search.torn(merged)
     tested = []
     monkeypatch.setattr("mapweave.merge.torn_maps.is_torn", lambda *_: tested.append(1))
@@ -102,9 +115,9 @@ def test_what_did_not_change_is_not_tested_again(fleet: Fleet, monkeypatch: pyte
 
 
 @pytest.mark.slow
-def test_a_second_map_of_its_robot_that_joins_it_is_no_defect(fleet: Fleet) -> None:
+def test_a_second_map_of_its_robot_that_joins_it_is_no_defect(copies: Callable[[Pose2], MergedMap]) -> None:
     """The same links are refused, of two maps instead of one. Before, the whole merge failed."""
-    merged, search = beside_copies(fleet, TORN, ("r0", "r1")), TornMapSearch(ConsistencySettings())
+    merged, search = beside(copies(TORN), ("r0", "r1")), TornMapSearch(ConsistencySettings())
     alone = next(graph for graph in merged.graphs if graph.maps == {ODD})
     assert search.torn(merged)
     more = MapId(ODD.agent, ODD.epoch + 1)
