@@ -31,11 +31,13 @@ class TrackHistory:
         self._poses: list[Pose2] = []
         self._ids: list[NDArray[np.int64]] = []
         self._pixels: list[Array] = []
+        self._moved: tuple[Pose2, NDArray[np.int64]] | None = None
 
     def record(
         self, anchor_from_robot: Pose2, ids: NDArray[np.int64], pixels: Array, force: bool = False
     ) -> None:
         """Keep an observation, ids (N,) and pixels (N, 2) px, if the robot has moved or it is forced."""
+        self._express()
         if self._poses and not force:
             moved = self._poses[-1].inverse() @ anchor_from_robot
             if math.hypot(moved.x, moved.y) < self._step and abs(moved.heading) < self._turn_step:
@@ -49,6 +51,7 @@ class TrackHistory:
 
     def snapshot(self) -> TrackHistory:
         """The history as it is now, which later observations do not change."""
+        self._express()
         copy = TrackHistory(self._step, self._turn_step, self._most)
         copy._poses, copy._ids, copy._pixels = self._poses.copy(), self._ids.copy(), self._pixels.copy()
         return copy
@@ -63,6 +66,7 @@ class TrackHistory:
             Poses (T, 3) [x m, y m, heading rad] in the anchor's frame, and pixels (T, N, 2), NaN where
             a track was not seen.
         """
+        self._express()
         pixels = np.full((len(self._poses), len(ids), 2), np.nan)
         if len(ids) and self._poses:
             # One table for all images: a search in each costs several times as much.
@@ -79,7 +83,18 @@ class TrackHistory:
         return poses, pixels
 
     def reanchor(self, old_from_new: Pose2, alive: NDArray[np.int64]) -> None:
-        """Express everything in a new anchor's frame and keep only observations of the present tracks."""
+        """Express everything in a new anchor's frame and keep only observations of the present tracks.
+
+        That is done when the history is next used, in the tick after: see `Tracker.templates`.
+        """
+        self._express()
+        self._moved = old_from_new, alive
+
+    def _express(self) -> None:
+        """Do what the last `reanchor` has left."""
+        if self._moved is None:
+            return
+        (old_from_new, alive), self._moved = self._moved, None
         new_from_old = old_from_new.inverse()
         poses, ids, pixels = self._poses, self._ids, self._pixels
         self._poses, self._ids, self._pixels = [], [], []
