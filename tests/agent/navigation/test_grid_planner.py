@@ -10,6 +10,7 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from mapweave.agent.navigation.grid_planner import GridPlanner
+from tests.hybridmap.kernel_forms import in_numpy
 
 LEAST, WISHED = 0.2, 0.4
 
@@ -52,6 +53,16 @@ def test_costs_are_the_least(seed):
     np.testing.assert_allclose(
         GridPlanner(room, first, LEAST, WISHED).costs, searched(room, first), atol=1e-9
     )
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_costs_are_the_same_to_the_last_bit_without_numba(seed):
+    rng = np.random.default_rng(50 + seed)
+    room = random_room(rng)
+    first = tuple(int(rng.integers(n)) for n in room.shape)
+    compiled = GridPlanner(room, first, LEAST, WISHED).costs
+    with in_numpy():
+        assert np.array_equal(GridPlanner(room, first, LEAST, WISHED).costs, compiled)
 
 
 @pytest.mark.parametrize("seed", range(6))
