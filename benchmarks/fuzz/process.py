@@ -16,6 +16,7 @@ import signal
 import sys
 import time
 import traceback
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -51,6 +52,13 @@ class Fuzzing:
         self._written = 0.0
         signal.signal(signal.SIGALRM, self._out_of_time)
 
+    def prepare(self, data: bytes) -> None:
+        """Run one input without a limit and without counting what comes of it."""
+        self._work.mkdir(exist_ok=True)
+        with suppress(Exception):
+            self._target.run(data, self._work)
+        self._clear()
+
     def one(self, data: bytes) -> None:
         """Run one input."""
         from benchmarks.fuzz.targets import AcceptedInvalid
@@ -75,10 +83,13 @@ class Fuzzing:
             self._found("crashes", data, error)
         finally:
             signal.setitimer(signal.ITIMER_REAL, 0.0)
-        for path in self._work.iterdir():
-            shutil.rmtree(path) if path.is_dir() else path.unlink()
+        self._clear()
         if time.monotonic() - self._written > 0.2:
             self.write()
+
+    def _clear(self) -> None:
+        for path in self._work.iterdir():
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
 
     def write(self) -> None:
         """Keep the counts."""
@@ -140,6 +151,9 @@ def main() -> None:
     corpus = folder / "corpus"
     samples = [path.read_bytes() for path in sorted(corpus.iterdir())]
     fuzzing = Fuzzing(target, folder)
+    # What the first inputs import and compile is no hang on a busy machine.
+    for sample in samples:
+        fuzzing.prepare(sample)
     for sample in samples:
         fuzzing.one(sample)
     fuzzing.write()
