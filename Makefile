@@ -12,6 +12,9 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-com
 # Compiles what runs often where it is not compiled yet: no robot and no test waits for it.
 COMPILE := $(BIN)/python -c 'import mapweave.agent.runner; from mapweave.hybridmap import jit; jit.load()'
 
+# pytest keeps what it has read of the tests: else each of its processes reads all of them anew the first time.
+READ_TESTS := $(BIN)/python -m pytest --collect-only --quiet > /dev/null 2>&1
+
 .PHONY: setup demo test check docs bench slow scenarios sbom audit clean
 
 setup: $(STAMP)
@@ -27,7 +30,7 @@ ifeq ($(EXTRA),dev)
 	  "or more; with python3.11 on x86-64 it takes seconds, and make EXTRA=test does without the simulator"
 endif
 	@$(PIP) -e '.[$(EXTRA)]'
-	@$(COMPILE)
+	@$(READ_TESTS) & $(COMPILE); status=$$?; wait; exit $$status
 	@touch $(STAMP)
 
 demo: setup
