@@ -75,7 +75,7 @@ def decode_grey(data: bytes) -> NDArray[np.uint8]:
 
     check_cost(data)
     try:
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+        image = cv2.imdecode(np.frombuffer(to_end(data), np.uint8), cv2.IMREAD_GRAYSCALE)
     except cv2.error:
         # OpenCV raises for some broken input and returns nothing for other.
         image = None
@@ -95,8 +95,28 @@ def check_cost(data: bytes) -> None:
         raise InvalidValue(f"an image of {width}x{height} px is too large, at most {MAX_PIXELS} are taken")
     if data.startswith(b"\xff\xd8") and data.count(b"\xff\xda") > MAX_SCANS:
         raise InvalidValue(f"a JPEG of more than {MAX_SCANS} scans takes too long to decode")
-    if data.startswith(PNG):
-        _check_chunks(data)
+    to_end(data)
+
+
+def to_end(data: bytes) -> bytes:
+    """What a decoder may see: a PNG as far as its last chunk, all of any other file.
+
+    It takes as much memory as a chunk claims before it reads it, also of what stands behind the last one.
+
+    Raises:
+        InvalidValue: a chunk is longer than the file.
+    """
+    if not data.startswith(PNG):
+        return data
+    at = len(PNG)
+    while at < len(data):
+        kind, end = data[at + 4 : at + 8], at + 12 + int.from_bytes(data[at : at + 4], "big")
+        if end > len(data):
+            raise InvalidValue("the image is damaged")
+        at = end
+        if kind == b"IEND":
+            break
+    return data[:at]
 
 
 def image_size(data: bytes) -> tuple[int, int]:
@@ -116,18 +136,6 @@ def image_size(data: bytes) -> tuple[int, int]:
     if data.startswith(b"\xff\xd8"):
         return _jpeg_size(data)
     raise InvalidValue("send a JPEG or PNG image")
-
-
-def _check_chunks(data: bytes) -> None:
-    """Refuse a PNG with a chunk that is longer than the file: the decoder takes so much memory first."""
-    at = len(PNG)
-    while at < len(data):
-        end = at + 12 + int.from_bytes(data[at : at + 4], "big")
-        if end > len(data):
-            raise InvalidValue("the image is damaged")
-        if data[at + 4 : at + 8] == b"IEND":
-            return
-        at = end
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:

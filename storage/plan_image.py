@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.floor_plan import MAX_BYTES, MAX_SIDE, PlanImage
 from mapweave.storage.atomic_file import read_whole
-from mapweave.storage.image_file import check_cost, image_size
+from mapweave.storage.image_file import check_cost, image_size, to_end
 
 WITH_ALPHA = (4, 6)
 """Colour types of PNG files with transparency."""
@@ -104,7 +104,7 @@ def _pixels(data: bytes) -> NDArray[np.uint8]:
     png_with_alpha = data.startswith(b"\x89PNG") and len(data) > 25 and data[25] in WITH_ALPHA
     try:
         flag = cv2.IMREAD_UNCHANGED if png_with_alpha else cv2.IMREAD_ANYCOLOR
-        image = cv2.imdecode(np.frombuffer(data, np.uint8), flag)
+        image = cv2.imdecode(np.frombuffer(to_end(data), np.uint8), flag)
     except cv2.error:
         image = None
     if image is None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import math
 from pathlib import Path
@@ -11,6 +12,7 @@ import pytest
 
 from benchmarks.fuzz import benchmark, process
 from benchmarks.fuzz.targets import AcceptedInvalid, check_again, check_finite
+from mapweave.hybridmap import jit
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.pose import Pose2
 
@@ -64,3 +66,12 @@ def test_the_command_prints_its_counts(capsys: pytest.CaptureFixture[str]) -> No
     found = sum(result[name] for name in ("crashes", "hangs", "accepted_invalid"))
     assert status == (1 if found else 0)
     assert result["peak_rss_mb"] > 10
+
+
+def test_no_kernel_counts_its_branches() -> None:
+    """Numba cannot compile it then; a kernel of whole numbers is compiled after some hundred calls."""
+    for module in ("wire.landmark_codec", "agent.runner", "mapserver.server"):
+        importlib.import_module(f"mapweave.{module}")
+    kernels = {kernel.__module__ for kernel in jit.KERNELS}
+    counted = {module for module in kernels if any(module.startswith(name) for name in process.DECODERS)}
+    assert counted and counted <= {*process.COMPILED}

@@ -14,6 +14,7 @@ import pytest
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.image_file import decode_grey, image_size, read_grey
+from mapweave.storage.plan_image import plan_pixels
 
 CAMERA = Camera(64, 48, 60, 60, 32, 24, 0.3)
 
@@ -78,6 +79,21 @@ def test_a_png_whose_chunk_claims_gigabytes_is_not_decoded(chunk, monkeypatch):
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
     with pytest.raises(InvalidValue, match="the image is damaged"):
         decode_grey(begin + struct.pack(">I", 0x7FFFFFF0) + chunk + bytes(40))
+
+
+def test_a_decoder_sees_a_png_to_its_end_alone(monkeypatch):
+    """Behind an end without an image OpenCV goes on: it took 1.2 GB for 120 bytes; found by fuzzing."""
+    whole = png(64, 48)
+    claim = struct.pack(">I", 0x48000000) + b"IDAT" + bytes(40)
+    assert np.array_equal(decode_grey(whole + claim), decode_grey(whole))
+    seen: list[bytes] = []
+    monkeypatch.setattr(cv2, "imdecode", lambda data, _: seen.append(data.tobytes()))
+    head, end = whole[:33], whole[-12:]
+    with pytest.raises(InvalidValue, match="the image is damaged"):
+        decode_grey(head + end + claim)
+    with pytest.raises(InvalidValue, match="the image is damaged"):
+        plan_pixels(head + end + claim)
+    assert seen == [head + end] * 2
 
 
 @pytest.mark.parametrize("marker", [0x00, 0x01, 0xD0, 0xD7, 0xD8, 0xD9])
