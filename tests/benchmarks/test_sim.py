@@ -12,12 +12,12 @@ import pytest
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_its_last_line_is_one_object():
-    command = [sys.executable, "-m", "benchmarks.sim", "--robots", "2", "--seconds", "2", "--json"]
+    command = [sys.executable, "-m", "benchmarks.sim", "--robots", "1", "2", "--seconds", "2", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     values = json.loads(done.stdout.strip().splitlines()[-1])
-    assert set(values["real_time_factor"]) == set(values["share"]) == {"2"}
+    assert set(values["real_time_factor"]) == set(values["share"]) == {"1", "2"}
     for name in ("real_time_factor", "real_time_factor_one_process"):
-        assert values[name]["2"] > 0.0
+        assert all(factor > 0 for factor in values[name].values())
     for parts in values["share"].values():
         assert {"render", "physics", "features", "filter", "bus"} < set(parts)
         assert sum(parts.values()) == pytest.approx(1.0, abs=0.01)
