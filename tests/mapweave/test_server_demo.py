@@ -223,12 +223,15 @@ def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
             eventually(lambda: get(http, standing).get("standing") == "linked")
             assert not any(one["in_force"] for one in get(http, "constraints")["constraints"])
             assert page.run("return window.shift") < 0.02, page.run("return window.shifted")
+            assert not page.errors()
         eventually(lambda: "no server" in page.run(TEXT.format("connection")))
         with demo(http, zenoh):
             eventually(lambda: page.run(TEXT.format("connection")) == "live", seconds=60)
             eventually(lambda: page.run("return mapweave.model.order.length") > 60)
-        refused = [words for words in page.errors() if "ERR_CONNECTION_REFUSED" not in words]
-        assert all("WebSocket" in words for words in refused), refused
+        # While the server ended and was away: it was not reached, or gave no answer any more.
+        gone = ("ERR_CONNECTION_REFUSED", "ERR_EMPTY_RESPONSE", "WebSocket")
+        others = [words for words in page.errors() if not any(one in words for one in gone)]
+        assert not others
 
 
 @pytest.mark.slow
