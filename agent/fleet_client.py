@@ -18,8 +18,8 @@ from mapweave.agent.troubles import Troubles
 from mapweave.hybridmap.agent_status import AgentStatus, Status, one_line
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.mission_order import MissionOrder
-from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RelocalizeAnswer
@@ -27,6 +27,7 @@ from mapweave.wire.bus import Bus, Reply, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_record
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.patience import BusyServers
 from mapweave.wire.senders import serve_senders
 from mapweave.wire.traffic_meter import TrafficMeter
 
@@ -249,7 +250,8 @@ class FleetClient:
             return settles(answers[-1])
 
         end = time.monotonic() + self._timeout
-        while not self._bus.ask(key, payload, max(end - time.monotonic(), ASK_AGAIN), enough):
+        servers = BusyServers(self._bus, key, payload, enough)
+        while not servers.ask(max(end - time.monotonic(), ASK_AGAIN)):
             # No reply: a server or router may have died with the question. Without any it is not repeated.
             now = time.monotonic()
             if optional or now >= end or not (self._servers or now - self._server_lost_at < FAILOVER):

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+import threading
 import time
+from collections.abc import Callable
 
 from mapweave.wire.bus import Bus, Reply
 
@@ -23,3 +26,69 @@ def ask_patiently(bus: Bus, key: str, payload: bytes, timeout: float) -> list[Re
         if pause <= 0.0 or time.monotonic() + pause > end:
             return replies
         time.sleep(pause)
+
+
+class BusyServers:
+    """One question to several servers, of which one may be busy while another says nothing.
+
+    A server that is stopped, or behind a bad network, keeps the question open until its time is over. While
+    it is waited for, a server that was busy is asked again at its time.
+    """
+
+    def __init__(self, bus: Bus, key: str, payload: bytes, enough: Callable[[Reply], bool]) -> None:
+        """Ask nothing yet.
+
+        Args:
+            bus: the connection.
+            key: that is asked.
+            payload: the question.
+            enough: whether a reply ends the wait; called for one reply after the other.
+        """
+        self._bus, self._key, self._payload, self._enough = bus, key, payload, enough
+        self._changed = threading.Condition()
+        self._settled = False
+        self._open = 0
+        self._replies: list[Reply] = []
+        self._again_at = math.inf
+
+    def ask(self, timeout: float) -> list[Reply]:
+        """Wait until a reply is enough, all servers have replied or the time is over.
+
+        Args:
+            timeout: s.
+
+        Returns:
+            All replies so far: of a busy server that, too.
+        """
+        end = time.monotonic() + timeout
+        with self._changed:
+            self._begin(timeout)
+            while self._open and not self._settled:
+                self._changed.wait(self._again_at - time.monotonic() if self._again_at < end else None)
+                now = time.monotonic()
+                if self._open and not self._settled and self._again_at <= now < end:
+                    self._again_at = math.inf
+                    self._begin(end - now)
+            return list(self._replies)
+
+    def _begin(self, timeout: float) -> None:
+        self._open += 1
+        threading.Thread(target=self._wait, args=(timeout,), name="question", daemon=True).start()
+
+    def _wait(self, timeout: float) -> None:
+        try:
+            self._bus.ask(self._key, self._payload, timeout, self._take)
+        finally:
+            with self._changed:
+                self._open -= 1
+                self._changed.notify()
+
+    def _take(self, reply: Reply) -> bool:
+        with self._changed:
+            if not self._settled:
+                self._replies.append(reply)
+                self._settled = self._enough(reply)
+                if reply.retry_after > 0.0:
+                    self._again_at = min(self._again_at, time.monotonic() + reply.retry_after)
+                self._changed.notify()
+            return self._settled

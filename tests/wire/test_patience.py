@@ -2,11 +2,17 @@
 
 from __future__ import annotations
 
+import threading
 import time
+from collections.abc import Iterator
+from itertools import pairwise
+from unittest.mock import ANY
+
+import pytest
 
 from mapweave.wire.bus import Reply, Request
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from mapweave.wire.patience import ask_patiently
+from mapweave.wire.patience import BusyServers, ask_patiently
 
 
 def test_a_busy_server_is_asked_again_at_its_time() -> None:
@@ -31,3 +37,86 @@ def test_a_busy_server_is_asked_again_at_its_time() -> None:
     closing.close()
     server.close()
     person.close()
+
+
+@pytest.fixture
+def silent(hub: MemoryHub) -> Iterator[MemoryBus]:
+    """A server that takes questions and answers none, as one that is stopped."""
+    bus, end = MemoryBus(hub), threading.Event()
+    bus.serve("where", lambda request: void(end.wait(30.0)))
+    yield bus
+    end.set()
+    bus.close()
+
+
+def void(_: object) -> None:
+    """A handler's result."""
+
+
+def answered(reply: Reply) -> bool:
+    """Whether it is an answer, no refusal."""
+    return bool(reply.payload)
+
+
+def test_a_busy_server_is_asked_again_while_another_says_nothing(hub: MemoryHub, silent: MemoryBus) -> None:
+    server, robot = MemoryBus(hub), MemoryBus(hub)
+    asked: list[float] = []
+
+    def answer(request: Request) -> None:
+        asked.append(time.monotonic())
+        if len(asked) < 3:
+            request.refuse("busy", 0.1)
+        else:
+            request.reply(b"here")
+
+    server.serve("where", answer)
+    began = time.monotonic()
+    replies = BusyServers(robot, "where", b"", answered).ask(20.0)
+    assert time.monotonic() - began < 5.0
+    assert [one.error or one.payload for one in replies] == ["busy", "busy", b"here"]
+    assert len(asked) == 3 and all(b - a >= 0.1 for a, b in pairwise(asked))
+    server.close()
+    robot.close()
+
+
+def test_a_busy_server_alone_is_not_asked_again(hub: MemoryHub) -> None:
+    """The robot goes on, and asks again at the time that the server names."""
+    server, robot = MemoryBus(hub), MemoryBus(hub)
+    asked: list[Request] = []
+    server.serve("where", lambda request: (asked.append(request), request.refuse("busy", 0.01))[1])
+    assert BusyServers(robot, "where", b"", answered).ask(20.0) == [Reply(error="busy", retry_after=ANY)]
+    assert len(asked) == 1
+    server.close()
+    robot.close()
+
+
+def test_a_slow_answer_counts_after_the_busy_one_was_asked_again(hub: MemoryHub) -> None:
+    slow, busy, robot = MemoryBus(hub), MemoryBus(hub), MemoryBus(hub)
+    first = threading.Event()
+
+    def answer(request: Request) -> None:
+        if first.is_set():
+            request.refuse("your last question is open", 5.0)
+            return
+        first.set()
+        threading.Timer(0.5, request.reply, (b"here",)).start()
+
+    slow.serve("where", answer)
+    busy.serve("where", lambda request: request.refuse("busy", 0.1))
+    began = time.monotonic()
+    assert Reply(b"here") in BusyServers(robot, "where", b"", answered).ask(20.0)
+    assert time.monotonic() - began < 5.0
+    for bus in (slow, busy, robot):
+        bus.close()
+
+
+@pytest.mark.parametrize("timeout", [0.05, 0.3])
+def test_the_wait_ends_with_its_time(hub: MemoryHub, silent: MemoryBus, timeout: float) -> None:
+    server, robot = MemoryBus(hub), MemoryBus(hub)
+    server.serve("where", lambda request: request.refuse("busy", 0.1))
+    began = time.monotonic()
+    replies = BusyServers(robot, "where", b"", answered).ask(timeout)
+    assert timeout <= time.monotonic() - began < timeout + 2.0
+    assert replies and all(one.error == "busy" for one in replies)
+    server.close()
+    robot.close()
