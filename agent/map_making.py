@@ -28,7 +28,7 @@ from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.ranger_monitor import not_exploring
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import ChangeBody, NodePut
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 

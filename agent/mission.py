@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from mapweave.agent.observation import Command
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.nearby import NearbyAnswer
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalWait
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (

@@ -16,6 +16,7 @@ from mapweave.agent.mission import Carried, Explore, GoTo, Idle, Mission
 from mapweave.agent.settings import WithoutServer
 from mapweave.hybridmap.agent_status import Status, one_line
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import (
     MAX_KEPT,
     MissionKind,
@@ -23,7 +24,6 @@ from mapweave.hybridmap.mission_order import (
     MissionReport,
     MissionState,
 )
-from mapweave.hybridmap.node import NodeId
 
 log = logging.getLogger(__name__)
 

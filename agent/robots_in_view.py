@@ -18,8 +18,8 @@ from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.mission import Answer, WhoIsNear
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRobot
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.vision.sift import TEXTURE_BLOCK_PX
 

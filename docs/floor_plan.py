@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapweave.drawing.plan_picture import draw_plan
 from mapweave.formats.plan_export import plan_words
 from mapweave.hybridmap.floor_plan import FloorPlan, PlanImage, PlanPair
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.mapserver.floor_plans import placed_plan
 from mapweave.mapserver.merging.merger import Merger

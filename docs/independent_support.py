@@ -17,7 +17,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.patches import Ellipse
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
 from mapweave.merge.outlier_rejection.pairwise_consistency import sort_links

@@ -35,6 +35,7 @@ from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, Nod
 from mapweave.hybridmap.descriptor import quantise
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.drive_statistics import DriveStatistics
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent, MapEventKind
 from mapweave.hybridmap.mission_order import (
@@ -45,7 +46,7 @@ from mapweave.hybridmap.mission_order import (
     Missions,
     MissionState,
 )
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.portal import Portal, PortalDone, PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2, PoseGaussian

@@ -8,9 +8,9 @@ from typing import Annotated
 from msgspec import Meta
 
 from mapweave.hybridmap.drive_statistics import DriveStatistics
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import Amount, Name, Number, Share, Stamp
 from mapweave.hybridmap.mission_order import MissionReport
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalWait
 from mapweave.hybridmap.pose import Pose2
 

@@ -17,9 +17,9 @@ from msgspec import Meta
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.manual_constraint import MOST_WORDS
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.portal import Portal
 from mapweave.hybridmap.wall_time import utc_words

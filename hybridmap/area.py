@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import Coordinate
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 
 LEAST_CORNERS, MOST_CORNERS = 3, 64

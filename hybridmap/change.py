@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mapweave.hybridmap.node import Edge, EdgeId, MapId, Node, NodeId
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
+from mapweave.hybridmap.node import Edge, Node
 
 
 @dataclass(frozen=True)

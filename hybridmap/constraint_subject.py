@@ -18,8 +18,9 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import NUMBER, MapId, NodeId, check_name
 from mapweave.hybridmap.limits import MAX_STAMP_NS, Key, LandmarkCount, Stamp
-from mapweave.hybridmap.node import NUMBER, MapId, Node, NodeId, check_name
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.wall_time import LONGEST, NANOSECONDS, read_time
 

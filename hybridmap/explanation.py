@@ -12,6 +12,7 @@ from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import (
     MAX_POSITION,
     Amount,
@@ -24,7 +25,7 @@ from mapweave.hybridmap.limits import (
     Words,
 )
 from mapweave.hybridmap.manual_constraint import ManualConstraint
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, PoseGaussian
 
 

@@ -9,8 +9,8 @@ import numpy as np
 from msgspec import Meta
 
 from mapweave.hybridmap.errors import InvalidValue, Refused
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import Amount, Coordinate, Number, Probability, Words
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 
 MAX_PAIRS = 64

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING
 
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
-from mapweave.hybridmap.node import Edge, EdgeId, Node, NodeId
+from mapweave.hybridmap.ids import EdgeId, NodeId
+from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import PoseGaussian
 
 if TYPE_CHECKING:

@@ -16,8 +16,8 @@ from mapweave.hybridmap.constraint_subject import (
     Subject,
 )
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import Stamp
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.wall_time import utc_words
 
 MOST_WORDS = 300

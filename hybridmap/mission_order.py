@@ -12,8 +12,8 @@ from typing import Annotated
 from msgspec import Meta
 
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import MAX_STAMP_NS, Name, Share, Stamp, Words
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.portal import PortalWait
 
 MAX_KEPT = 200

@@ -7,8 +7,8 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import Amount, Name, Words
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 
 MAX_STARTS = 8

@@ -13,13 +13,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.ids import MERGE_AUTHOR as MERGE_AUTHOR
-from mapweave.hybridmap.ids import NAME as NAME
-from mapweave.hybridmap.ids import NUMBER as NUMBER
-from mapweave.hybridmap.ids import EdgeId as EdgeId
-from mapweave.hybridmap.ids import MapId as MapId
-from mapweave.hybridmap.ids import NodeId as NodeId
-from mapweave.hybridmap.ids import check_name as check_name
+from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.hybridmap.ranges import NO_RANGES, Ranges
 from mapweave.hybridmap.trajectory_segment import NO_SEGMENT, TrajectorySegment

@@ -9,8 +9,8 @@ from typing import Annotated, ClassVar
 from msgspec import Meta
 
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import Name, Number
-from mapweave.hybridmap.node import NodeId
 
 MOST_NOTE = 120
 """Characters of a note."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import Stamp
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.wall_time import utc_words
 

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.constraint_subject import Ends
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import (
     MAX_NUMBER,
     MAX_POSITION,
@@ -25,7 +26,7 @@ from mapweave.hybridmap.limits import (
     Probability,
     Words,
 )
-from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.node import EdgeKind, Node
 from mapweave.hybridmap.portal import PortalStop
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 

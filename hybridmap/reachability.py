@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, Node
+from mapweave.hybridmap.ids import EdgeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Array, Pose2
 
 # What the servo manages: from within this it parked in `benchmarks.servo` and `benchmarks.parking`.

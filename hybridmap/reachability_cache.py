@@ -8,7 +8,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import Edge, EdgeId, Node, NodeId
+from mapweave.hybridmap.ids import EdgeId, NodeId
+from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.reachability import Reachability, left, reachability_of
 
 

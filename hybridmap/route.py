@@ -10,7 +10,8 @@ from typing import Any
 import networkx as nx
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
+from mapweave.hybridmap.ids import EdgeId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2
 
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import Angle, Distance, Number
-from mapweave.hybridmap.node import NodeId
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.reachability import FARTHEST, STOPS, WIDEST, least_in_view
 from mapweave.hybridmap.superseded import Superseded

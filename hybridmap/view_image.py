@@ -8,7 +8,7 @@ from typing import Annotated
 from msgspec import Meta
 
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 
 MAX_SIDE = 640
 """px; larger images are made smaller."""

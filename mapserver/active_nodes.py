@@ -9,7 +9,8 @@ from typing import Protocol
 import numpy as np
 
 from mapweave.hybridmap.constraint_subject import RetiredWindow
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.plausibility import LEAST_NODES, fragments, unreliable_robots
 from mapweave.mapserver.retrieval.compared_landmarks import bounded

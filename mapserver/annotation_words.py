@@ -11,8 +11,8 @@ import numpy as np
 from mapweave.hybridmap.annotation import BODIES, Annotation, Annotations, Body, Place
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.named_nodes import Resolve
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import Resolved, ResolveRequest
 from mapweave.hybridmap.wall_time import read_time
 from mapweave.mapserver.places import position_of

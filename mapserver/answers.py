@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.mapserver.active_nodes import ActiveNodes, doubted
 from mapweave.mapserver.coverage import Coverage
 from mapweave.mapserver.merging.merger import Merger

@@ -14,9 +14,9 @@ from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import Change, ChangeBody, NodePut
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.own_maps import maps_of
 from mapweave.storage.map_file import MapFile

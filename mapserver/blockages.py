@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Collection
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 
 FORGET = 120.0
 """How long a blockage counts after it was reported last, s; infinite where only simulated time passes,

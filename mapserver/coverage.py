@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.query import MAX_KNOWN, KnownAnswer
 from mapweave.merge.pose_graph.merged_map import MergedMap
 

@@ -18,6 +18,7 @@ from mapweave.hybridmap.explanation import (
     PairExplanation,
     RouteExplanation,
 )
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import (
     ConstraintList,
     ConstraintRequest,
@@ -26,7 +27,6 @@ from mapweave.hybridmap.manual_constraint import (
     event_words,
 )
 from mapweave.hybridmap.map_event import History, MapEvent
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.answers import Answers

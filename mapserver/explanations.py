@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 
 from mapweave.hybridmap.explanation import MAX_MAPS_LISTED, Explanation, FleetExplanation
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router

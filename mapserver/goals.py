@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.places import Places, position_of
 
 HOME = "home"

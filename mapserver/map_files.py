@@ -10,9 +10,10 @@ import numpy as np
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.node import Edge, NodeId
+from mapweave.hybridmap.node import Edge
 from mapweave.mapserver.own_maps import PROBABILITY, is_link, maps_of
 from mapweave.merge.manual_constraints import apply_constraints
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities

@@ -11,9 +11,9 @@ from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.limits import MAX_WORDS
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
-from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.log.store import HISTORY, Store
 from mapweave.merge.explanation.component_changes import joined_maps, joinings, partings
 from mapweave.merge.mutual_exclusion.collision import is_exclusion

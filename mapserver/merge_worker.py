@@ -11,8 +11,9 @@ from itertools import islice
 
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory

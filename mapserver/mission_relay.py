@@ -14,6 +14,7 @@ from dataclasses import replace
 
 from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.hybridmap.mission_order import (
     MAX_KEPT,
     MAX_VIA,
@@ -27,7 +28,6 @@ from mapweave.hybridmap.mission_order import (
     later_stamp,
     new_id,
 )
-from mapweave.hybridmap.node import MapId, NodeId, check_name
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.mapserver.goals import node_of_goal
 from mapweave.mapserver.log.store import Store

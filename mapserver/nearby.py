@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.nearby import MAX_NEARBY, NearbyAnswer, NearbyRequest, NearbyRobot
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.hybridmap.segments import distances
 from mapweave.merge.pose_graph.merged_map import MergedMap

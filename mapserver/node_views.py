@@ -7,7 +7,7 @@ from collections import OrderedDict
 from collections.abc import Callable
 
 from mapweave.hybridmap.errors import Busy, InvalidMessage, InvalidValue, MapweaveError
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.view_image import ViewImage, ViewRequest
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.view_file import checked_view

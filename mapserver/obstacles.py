@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Obstacle
 from mapweave.hybridmap.segments import distances

@@ -5,7 +5,8 @@ from __future__ import annotations
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.explanation import MARGINAL
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MERGE_AUTHOR, Edge, MapId
+from mapweave.hybridmap.ids import MERGE_AUTHOR, MapId
+from mapweave.hybridmap.node import Edge
 from mapweave.storage.map_file import MapFile
 from mapweave.wire.codec import element_of
 

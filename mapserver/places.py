@@ -12,8 +12,8 @@ import numpy as np
 from mapweave.hybridmap.annotation import Annotation, Annotations, Place
 from mapweave.hybridmap.area import inside
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import reason_of
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.portal import MAX_FLOOR_WORDS
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (

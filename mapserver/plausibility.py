@@ -10,7 +10,8 @@ from collections import Counter
 from collections.abc import Collection, Container, Mapping
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeKind, MapId
+from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
 from mapweave.merge.mutual_exclusion.trajectories import runs_backwards
 from mapweave.merge.pose_graph.merged_map import MergedMap

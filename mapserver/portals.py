@@ -9,7 +9,7 @@ import networkx as nx
 
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.node import EdgeId, NodeId
+from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.portal import MAX_FLOOR_WORDS, Portal, PortalMeans, PortalStop
 from mapweave.merge.floors import floor_of
 from mapweave.merge.pose_graph.merged_map import MergedMap

@@ -14,8 +14,8 @@ from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from itertools import islice
 
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import MAX_POSITION
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.mapserver.services import guarded
 from mapweave.merge.pose_graph.merged_map import MergedMap

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
 from mapweave.mapserver.nearby import StandingRobot

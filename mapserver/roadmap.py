@@ -9,7 +9,8 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.area import Floats
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
+from mapweave.hybridmap.ids import EdgeId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.reachability import RECOGNISED
 from mapweave.hybridmap.reachability_cache import ReachabilityCache

@@ -17,8 +17,8 @@ from mapweave.hybridmap.agent_status import (
     one_line,
 )
 from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import MAX_POSITION
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.known_logs import Lag
 from mapweave.mapserver.places import Places

@@ -9,7 +9,8 @@ from itertools import pairwise
 
 from mapweave.hybridmap.annotation import Annotation, Preference
 from mapweave.hybridmap.explanation import Hop, MapsExplanation, RouteExplanation
-from mapweave.hybridmap.node import Edge, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.portal import PortalStop
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.reachability import RECOGNISED

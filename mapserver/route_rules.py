@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Pair, Preference
 from mapweave.hybridmap.area import Area, Floats, crosses, inside
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.wall_time import utc_words
 from mapweave.mapserver.roadmap import Roadmap

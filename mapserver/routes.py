@@ -13,8 +13,8 @@ import numpy as np
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.manual_constraint import reason_of
-from mapweave.hybridmap.node import EdgeId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.hybridmap.reachability import RECOGNISED

@@ -10,10 +10,10 @@ from functools import partial
 from itertools import islice
 
 from mapweave.hybridmap.errors import Busy, InvalidMessage, MapweaveError
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionRequest
 from mapweave.hybridmap.nearby import NearbyRequest
-from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.query import (
     KnownRequest,

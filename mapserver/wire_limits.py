@@ -10,7 +10,7 @@ from collections.abc import Callable, Collection
 from dataclasses import replace
 
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import NO_COMPONENT, Certainty, RelocalizeAnswer, RouteAnswer
 from mapweave.wire.pose_codec import pack_pose

@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.explanation import PairExplanation as PairExplanation
     from mapweave.hybridmap.explanation import RouteExplanation as RouteExplanation
     from mapweave.hybridmap.hybrid_map import HybridMap as HybridMap
+    from mapweave.hybridmap.ids import MapId as MapId
+    from mapweave.hybridmap.ids import NodeId as NodeId
     from mapweave.hybridmap.manual_constraint import ManualConstraint as ManualConstraint
     from mapweave.hybridmap.map_event import MapEvent as MapEvent
     from mapweave.hybridmap.map_event import MapEventKind as MapEventKind
@@ -44,9 +46,7 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.node import Edge as Edge
     from mapweave.hybridmap.node import EdgeKind as EdgeKind
     from mapweave.hybridmap.node import Landmarks as Landmarks
-    from mapweave.hybridmap.node import MapId as MapId
     from mapweave.hybridmap.node import Node as Node
-    from mapweave.hybridmap.node import NodeId as NodeId
     from mapweave.hybridmap.pose import Pose2 as Pose2
     from mapweave.hybridmap.pose import PoseGaussian as PoseGaussian
     from mapweave.hybridmap.query import Certainty as Certainty
@@ -80,10 +80,11 @@ else:
         "mapweave.hybridmap.errors": ("MapweaveError", "NotConnected", "Refused"),
         "mapweave.hybridmap.explanation": ("MapsExplanation", "PairExplanation", "RouteExplanation"),
         "mapweave.hybridmap.hybrid_map": ("HybridMap",),
+        "mapweave.hybridmap.ids": ("MapId", "NodeId"),
         "mapweave.hybridmap.manual_constraint": ("ManualConstraint",),
         "mapweave.hybridmap.map_event": ("MapEvent", "MapEventKind"),
         "mapweave.hybridmap.mission_order": ("MissionKind", "MissionReport", "MissionState"),
-        "mapweave.hybridmap.node": ("Edge", "EdgeKind", "Landmarks", "MapId", "Node", "NodeId"),
+        "mapweave.hybridmap.node": ("Edge", "EdgeKind", "Landmarks", "Node"),
         "mapweave.hybridmap.pose": ("Pose2", "PoseGaussian"),
         "mapweave.hybridmap.query": ("Certainty", "RelocalizeAnswer", "View"),
         "mapweave.map": ("FileMap", "Map", "open"),

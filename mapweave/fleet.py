@@ -24,6 +24,7 @@ from mapweave.fleet_map import FleetMap
 from mapweave.fleet_plans import FleetPlans
 from mapweave.hybridmap.agent_status import SILENT, AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
+from mapweave.hybridmap.ids import NodeId, check_name
 from mapweave.hybridmap.mission_order import (
     MAX_KEPT,
     MissionKind,
@@ -35,7 +36,6 @@ from mapweave.hybridmap.mission_order import (
     later_stamp,
     new_id,
 )
-from mapweave.hybridmap.node import NodeId, check_name
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.identities.key_file import read_key_file
 from mapweave.wire.bus import Bus, Sample

@@ -17,6 +17,7 @@ from mapweave.hybridmap.constraint_subject import (
     read_window,
 )
 from mapweave.hybridmap.errors import InvalidValue, Refused
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import (
     ConstraintList,
     ConstraintRequest,
@@ -25,7 +26,6 @@ from mapweave.hybridmap.manual_constraint import (
     to_take_back,
 )
 from mapweave.hybridmap.named_nodes import own_ids_of, retired_of
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.refusals import refusals
 from mapweave.wire.log_messages import decode_record

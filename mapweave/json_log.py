@@ -40,7 +40,7 @@ class JsonFormatter(logging.Formatter):
 
 def _named(arguments: object) -> dict[str, str]:
     """The map, robot and node that a message names as values; the first of each kind."""
-    from mapweave.hybridmap.node import MapId, NodeId
+    from mapweave.hybridmap.ids import MapId, NodeId
 
     found: dict[str, str] = {}
     for value in arguments if isinstance(arguments, tuple) else ():

@@ -34,8 +34,9 @@ from mapweave.hybridmap.explanation import (
     RouteExplanation,
     route_over,
 )
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.named_nodes import ids_of
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.map_reading import MapReading

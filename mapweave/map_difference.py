@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from mapweave.evaluation.map_score import align
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import event_words
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import wrap_angle
 from mapweave.mapserver.map_history import between
 from mapweave.merge.pose_graph.merged_map import MergedMap

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.own_maps import maps_of
 from mapweave.opened_map import open_map
 from mapweave.storage.map_file import MapFile, write_map_file

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from mapweave.extras import need
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.merge.settings import MergeSettings

@@ -12,9 +12,10 @@ import gtsam  # noqa: F401, where it is missing this says so before a map is rea
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.node import Edge, MapId
+from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.merging.merger import Merger

@@ -20,8 +20,8 @@ from mapweave.agent.replication.salvage import salvage as salvage_journal
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log import sqlite_store
 from mapweave.mapserver.log.opening import is_postgres
 from mapweave.mapserver.log.salvage import Salvage, all_of, salvage

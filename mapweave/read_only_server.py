@@ -15,10 +15,10 @@ from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.constraint_history import with_constraints

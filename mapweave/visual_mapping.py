@@ -20,7 +20,8 @@ from mapweave.agent.recordings.recording import Recording
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
-from mapweave.hybridmap.node import Landmarks, MapId
+from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.node import Landmarks
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.query import View

@@ -18,8 +18,8 @@ from mapweave.hybridmap.constraint_subject import (
 )
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, reason_of, verb_of
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.link_checks import checked_link
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
 from mapweave.merge.pose_graph.merged_map import MergedMap

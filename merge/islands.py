@@ -17,8 +17,8 @@ import numpy as np
 
 from mapweave.hybridmap.constraint_subject import Linked, RetiredArea
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.manual_constraints import CutMaps, apply_constraints
 from mapweave.merge.merging import MergeCache, decide
 from mapweave.merge.outlier_rejection.loop_closures import distance2_of

@@ -11,8 +11,8 @@ import networkx as nx
 
 from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, reason_of
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.floors import floor_of
 from mapweave.merge.manual_constraints import apply_constraints, link_by_hand

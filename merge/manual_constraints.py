@@ -11,8 +11,8 @@ import numpy as np
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraints, reason_of
-from mapweave.hybridmap.node import EdgeId, MapId, NodeId
 from mapweave.merge.floors import across_floors
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse, refuse_edge

@@ -18,7 +18,7 @@ from collections.abc import Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.merge.mutual_exclusion.refutation import Refutation
 from mapweave.merge.mutual_exclusion.trajectories import TrajectoryCache
 from mapweave.merge.outlier_rejection.agglomerative_joining import agglomerate

@@ -20,8 +20,9 @@ import numpy as np
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredArea, RetiredNodes, RetiredWindow
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
 from mapweave.merge.pose_graph.solved_graph import PoseGraph

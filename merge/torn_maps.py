@@ -14,7 +14,7 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.merge.mutual_exclusion.collision import is_exclusion
 from mapweave.merge.outlier_rejection.wrong_geometry import UNSOLVABLE, is_torn
 from mapweave.merge.pose_graph.candidates import Pair

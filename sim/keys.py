@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from mapweave.hybridmap.node import check_name
+from mapweave.hybridmap.ids import check_name
 from mapweave.wire.keys import Keys
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
-from mapweave.hybridmap.node import check_name
+from mapweave.hybridmap.ids import check_name
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.body import BodySettings
 from mapweave.sim.camera import CAMERAS, CameraSetup, check_range

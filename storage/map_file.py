@@ -29,10 +29,11 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.annotation import Annotation
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import Number, Words
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.node import Edge, NodeId
+from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.storage.atomic_file import read_whole, write_whole

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.merge.pose_graph.candidates import Pair

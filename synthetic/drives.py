@@ -16,7 +16,7 @@ from itertools import count
 import numpy as np
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.merge.pose_graph.links import Link
 from synthetic.fleet import FleetSettings, link_between, map_of, walk_of

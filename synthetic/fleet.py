@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import CODE_BYTES, Edge, EdgeId, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
+from mapweave.hybridmap.node import CODE_BYTES, Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.merge.pose_graph.links import Link
 

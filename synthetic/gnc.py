@@ -16,7 +16,7 @@ import gtsam
 import networkx as nx
 import numpy as np
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.merge.pose_graph.component import along_tree
 from mapweave.merge.pose_graph.factors import Factors, Measurement

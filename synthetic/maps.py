@@ -8,7 +8,8 @@ from pathlib import Path
 import numpy as np
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from mapweave.hybridmap.node import Edge, MapId, Node
+from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore

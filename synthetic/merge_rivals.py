@@ -9,7 +9,7 @@ import numpy as np
 
 from mapweave.evaluation.map_score import align
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.outlier_rejection.max_clique import best_clique

@@ -18,7 +18,8 @@ from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.registration.recognition import register
 from mapweave.registration.selection import SelectionSettings

@@ -13,8 +13,9 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.descriptor import quantise
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.landmark_tables import DIMENSIONS, SYMBOLS, TOTAL_BITS, landmark_tables
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 

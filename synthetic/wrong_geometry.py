@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, View
 from mapweave.mapserver.answers import Answers

@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import MAX_LANDMARKS, MAX_NUMBER, MAX_STAMP_NS, Key, Name, Number, Stamp
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.ranges import NO_RANGES
 from mapweave.hybridmap.trajectory_segment import NO_SEGMENT
 from mapweave.wire.landmark_codec import MAX_LANDMARKS_BYTES, pack_landmarks, unpack_landmarks

@@ -18,12 +18,12 @@ from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.explanation import Explanation, FleetExplanation, PairExplanation, RouteExplanation
 from mapweave.hybridmap.floor_plan import PIECE, PlacedPlans, PlanPiece, PlanReceived
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import Stamp
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.mission_order import MissionOrder, MissionReport, MissionRequest, Missions
 from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRequest
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.hybridmap.pruned_node import PrunedNode
 from mapweave.hybridmap.query import (

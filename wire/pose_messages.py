@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.ids import NodeId, check_name
 from mapweave.hybridmap.limits import MAX_POSITION, Name, Number
-from mapweave.hybridmap.node import NodeId, check_name
 from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.log_messages import Id
 from mapweave.wire.packing import Limit, pack, unpack

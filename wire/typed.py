@@ -29,9 +29,10 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Ends
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue, MapweaveError
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import MAX_FLOAT, Coordinate
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
-from mapweave.hybridmap.node import Edge, MapId, Node, NodeId
+from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.vision.equidistant import Equidistant
 from mapweave.vision.lens import Distortion, RadialTangential

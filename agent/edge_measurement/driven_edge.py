@@ -12,7 +12,8 @@ import numpy as np
 
 from mapweave.agent.edge_measurement.traverse import Traverse
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind
+from mapweave.hybridmap.ids import EdgeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
 THERE, BACK, INLIERS = "there", "back", "inliers"

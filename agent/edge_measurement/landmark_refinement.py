@@ -9,7 +9,8 @@ import numpy as np
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.quantization import snap
 

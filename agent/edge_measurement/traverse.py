@@ -13,7 +13,7 @@ import numpy as np
 from mapweave.agent.localization.fix import Fix, wheel_step
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.observation import Observation, RobotDescription
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 
 HERE = PoseGaussian(Pose2(), np.zeros((3, 3)))

@@ -14,7 +14,7 @@ from mapweave.agent.exploration.viewpoint_selection import REACH
 from mapweave.agent.mapping.episode import Episode, Move
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.settings import ExplorerSettings
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 
 CLOSED = 0.05
 """With no more than this share of its border unknown the reachable floor counts as explored."""

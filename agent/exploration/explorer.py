@@ -23,7 +23,7 @@ from mapweave.agent.mission import Answer, Question
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.settings import ExplorerSettings
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Array
 
 COVERED_REACH = 0.7

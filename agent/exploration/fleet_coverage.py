@@ -6,7 +6,7 @@ import numpy as np
 
 from mapweave.agent.exploration.viewpoint_selection import seen_around
 from mapweave.agent.mission import Answer, WhatIsKnown
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.query import KnownAnswer
 

@@ -15,7 +15,8 @@ from mapweave.agent.mission import WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from mapweave.agent.observation import Command
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.registration.recognition import Recognition

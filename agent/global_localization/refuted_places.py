@@ -6,7 +6,7 @@ import math
 
 from mapweave.agent.global_localization.pose_consistency import OTHER_VIEW
 from mapweave.agent.motion_primitives import MotionPrimitives
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 
 TURN_SHARE = 0.15

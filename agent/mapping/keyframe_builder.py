@@ -23,7 +23,8 @@ from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.edge_limits import unmeasurable
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment

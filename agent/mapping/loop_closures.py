@@ -7,7 +7,8 @@ from collections.abc import Callable
 import numpy as np
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeKind, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.registration.recognition import register
 

@@ -24,7 +24,8 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.track_quality import TrackQuality
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.registration.recognition import Recognition
 from mapweave.vision.lens import Lens

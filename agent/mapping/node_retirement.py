@@ -12,7 +12,8 @@ from collections import deque
 from collections.abc import Callable, Container
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeKind, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.reachability import FARTHEST, RECOGNISED, left
 from mapweave.hybridmap.reachability_cache import ReachabilityCache

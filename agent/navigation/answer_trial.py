@@ -16,7 +16,7 @@ from mapweave.agent.global_localization.pose_consistency import PoseHypothesis, 
 from mapweave.agent.global_localization.refuted_places import RefutedPlaces
 from mapweave.agent.localization.fix import TURN_SHARE, Fix
 from mapweave.agent.motion_primitives import MotionPrimitives
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteLeg
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from mapweave.agent.settings import NavigatorSettings
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.query import MAX_BLOCKED, MAX_OBSTACLES, Obstacle
 
 Pair = tuple[NodeId, NodeId]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from mapweave.agent.robots_in_view import RobotBeside
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 
 REFUSED = 20.0
 """A fleet that answers for so long that there is no way is believed, s: it may first have to merge."""

@@ -29,7 +29,8 @@ from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.portal import PortalStop
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg

@@ -8,7 +8,7 @@ from itertools import pairwise
 import numpy as np
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Obstacle, RouteAnswer, RouteLeg
 from mapweave.hybridmap.reachability import closed_edges

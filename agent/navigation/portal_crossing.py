@@ -9,7 +9,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 from mapweave.agent.settings import PortalSettings
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 
 

@@ -18,7 +18,7 @@ from mapweave.agent.navigation.portal_crossing import PortalCrossing
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteLeg
 from mapweave.registration.recognition import RecognitionSettings

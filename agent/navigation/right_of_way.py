@@ -12,7 +12,7 @@ from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mission import MayIDrive
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.navigation.goal_patience import YIELDED
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.query import ReserveAnswer
 
 EVERY = 1.0

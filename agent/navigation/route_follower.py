@@ -19,7 +19,7 @@ from mapweave.agent.servo.proximity import ranger_points
 from mapweave.agent.servo.servo_step import State
 from mapweave.agent.servo.supervisor import Servo
 from mapweave.agent.settings import AgentSettings
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, averaged, wrap_angle
 from mapweave.hybridmap.query import RouteLeg
 from mapweave.vision.lens import Lens

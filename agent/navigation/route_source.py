@@ -15,7 +15,8 @@ from mapweave.agent.navigation.blocks import Blocks
 from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeKind, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 
 RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)

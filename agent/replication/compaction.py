@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 from mapweave.agent.replication.log_entry import Entry
 from mapweave.hybridmap.change import EdgePut, NodeRetired
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 
 
 def undone(entries: Iterable[Entry], limit: int, everyone: int) -> list[int]:

@@ -15,8 +15,8 @@ from mapweave.agent.replication.compaction import undone
 from mapweave.agent.replication.log_entry import Entry
 from mapweave.hybridmap.change import Change, ChangeBody, EdgeRetired, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.hybridmap.mission_order import MAX_KEPT, MissionReport, Missions
-from mapweave.hybridmap.node import MapId, NodeId, check_name
 from mapweave.storage.database import Database
 from mapweave.wire.codec import decode_body, element_of, encode_body, wrap_body
 from mapweave.wire.keys import check_epoch

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from mapweave.hybridmap.change import ChangeBody
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 
 
 class Entry(NamedTuple):

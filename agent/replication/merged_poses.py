@@ -11,7 +11,7 @@ import queue
 import threading
 
 from mapweave.hybridmap.errors import InvalidMessage
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.pose_messages import MergedPose, PoseNews

@@ -20,7 +20,7 @@ from mapweave.agent.replication.journal import Draft, Journal
 from mapweave.agent.replication.log_state import LogState
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
-from mapweave.hybridmap.node import MapId, check_name
+from mapweave.hybridmap.ids import MapId, check_name
 from mapweave.wire.bus import Bus, Request, Sample
 from mapweave.wire.codec import wrap_body
 from mapweave.wire.keys import Keys

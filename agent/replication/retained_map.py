@@ -9,7 +9,7 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.log_entry import Entry
 from mapweave.hybridmap.change import ChangeBody, EdgeRetired, NodeRetired
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ from mapweave.agent.replication.journal import body_of
 from mapweave.agent.replication.log_entry import Entry
 from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
-from mapweave.hybridmap.node import MapId, NodeId, check_name
+from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.storage.database_reader import reading
 from mapweave.wire.codec import element_of
 from mapweave.wire.keys import check_epoch

@@ -16,7 +16,7 @@ from pathlib import Path
 from mapweave.agent.mapping.view import RawImage
 from mapweave.hybridmap.change import ChangeBody, NodeRetired
 from mapweave.hybridmap.errors import Busy, InvalidValue
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.view_image import ViewImage, ViewRequest
 from mapweave.storage.atomic_file import read_whole, write_whole
 from mapweave.storage.view_file import is_whole, view_file

@@ -17,7 +17,7 @@ from mapweave.agent.drivers.messages import (
 from mapweave.agent.mission import Explore
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.settings import AgentSettings
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 
 NAME = "r0"
 

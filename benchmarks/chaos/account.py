@@ -11,7 +11,7 @@ from benchmarks.chaos.agent_process import STAMP, digest
 from benchmarks.chaos.scripted_robot import ScriptedRobot
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodeRetired
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.kept_bytes import LEAST_GROWN
 from mapweave.mapserver.log.store import ROW_BYTES, Store

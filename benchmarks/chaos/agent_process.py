@@ -32,7 +32,7 @@ from mapweave.agent.replication.replicator import Replicator
 from mapweave.commands.network import stop_on_signals
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.change import ChangeBody
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.codec import encode_body

@@ -11,7 +11,7 @@ from benchmarks.chaos.agent_process import FLEET
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission import WhereAmI
 from mapweave.agent.mission_control import MissionControl
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys

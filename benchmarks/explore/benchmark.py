@@ -38,7 +38,8 @@ from mapweave.agent.settings import AgentSettings, ExplorerSettings
 from mapweave.evaluation.map_score import score_map
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeKind, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.fleet import TICKS_PER_SECOND, Stage
 from mapweave.scenarios.local_fleet import LocalFleet

@@ -22,7 +22,7 @@ from rich.table import Table
 from benchmarks.relocalize.places import Place, joined, mapped, mapped_sites
 from benchmarks.relocalize.queries import KINDS, Query, known, nowhere, twins
 from benchmarks.relocalize.score import RIGHT_DEG, RIGHT_M, errors
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.mapserver.relocalization.calibration import COEFFICIENTS, HypothesisSupport, probabilities
 from mapweave.mapserver.relocalization.candidates import MOST_COMPARED, Candidates

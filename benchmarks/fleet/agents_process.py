@@ -28,7 +28,7 @@ from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.change import ChangeBody
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.bus_settings import AGENT_LEASE, BusSettings
 from mapweave.wire.keys import Keys

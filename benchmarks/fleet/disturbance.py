@@ -10,7 +10,7 @@ from dataclasses import dataclass
 from typing import Protocol
 
 from mapweave.agent.replication.journal import Journal
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Head, Mark
 from mapweave.wire.zenoh_bus import ZenohBus

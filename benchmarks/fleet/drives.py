@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
 from synthetic.world import Sensing, room, take_map, take_view

@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.flood.fleet import FLEET, Room
 from mapweave.hybridmap.change import Change, NodePut
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.query import KnownRequest, RouteRequest
 from mapweave.wire.bus import Request
 from mapweave.wire.bus_settings import BusSettings

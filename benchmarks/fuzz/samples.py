@@ -19,9 +19,10 @@ from mapweave.agent.ros_messages import making
 from mapweave.hybridmap.change import Change, EdgePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionRequest
-from mapweave.hybridmap.node import EdgeKind, MapId, Node
+from mapweave.hybridmap.node import EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (
     Certainty,

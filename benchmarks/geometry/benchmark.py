@@ -45,7 +45,7 @@ from mapweave.agent.recordings.recording import Recording
 from mapweave.evaluation.map_score import align
 from mapweave.evaluation.truth import Truth
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 
 P = Parameter

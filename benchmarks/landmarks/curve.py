@@ -16,7 +16,8 @@ from rich.progress import track
 from benchmarks.landmarks.places import SimulatedPlace
 from benchmarks.landmarks.rivals import DEPTH_FLOOR
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.query import View

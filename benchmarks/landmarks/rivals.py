@@ -15,7 +15,8 @@ from benchmarks.landmarks.pairs import Pair
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.descriptor import decode, encode, root_sift, rounding_noise
-from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.ranges import Ranges

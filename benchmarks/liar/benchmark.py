@@ -26,7 +26,7 @@ from rich.progress import Progress
 
 from benchmarks.command_line import command_line
 from benchmarks.rules.switches import Switch, switched_off
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver import active_nodes, answers
 from mapweave.mapserver.log import entry
 from mapweave.mapserver.merging import implausible_maps

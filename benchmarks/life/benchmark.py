@@ -39,7 +39,7 @@ from rich.table import Table
 from benchmarks.command_line import command_line
 from benchmarks.life.house import House
 from benchmarks.process_usage import held_bytes
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty, View
 from mapweave.hybridmap.superseded import Superseded

@@ -19,7 +19,7 @@ from rich.progress import Progress, TaskID
 from benchmarks.process_usage import resident_mb
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.pose_graph.merged_map import MergedMap

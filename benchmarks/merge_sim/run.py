@@ -23,7 +23,8 @@ from benchmarks.merge_sim.views import views_shared
 from mapweave.evaluation.map_score import FALSE_LINK, FALSE_LINK_TURN, align, is_false, pose_error
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.verification import verify

@@ -14,8 +14,8 @@ from mapweave.fleet import send_order
 from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import InvalidFile, NotConnected
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.fleet import SERVER, TICKS_PER_SECOND, Stage
 from mapweave.scenarios.local_fleet import LocalFleet

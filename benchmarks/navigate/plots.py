@@ -12,7 +12,7 @@ from benchmarks.navigate.floor import Floor
 from benchmarks.navigate.office import Mapped
 from mapweave.evaluation.map_score import crossed
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.scenarios.kidnap_planning import CLEARANCE, LEAST_LANDMARKS, NEAR
 from mapweave.sim.floorplan import FloorPlan

@@ -34,7 +34,7 @@ from benchmarks.process_usage import held_bytes
 from mapweave.agent.localization.place_recognition import recognise_places
 from mapweave.agent.mapping.node_retirement import NodeRetirement
 from mapweave.agent.replication.journal import Journal
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.merging.pruning import DAY_NS
 from synthetic.own_map import OwnMap
 

@@ -20,7 +20,8 @@ from mapweave.agent.pipeline import Pipeline
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, Node
+from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.routes import Router

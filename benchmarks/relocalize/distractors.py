@@ -24,7 +24,8 @@ from benchmarks.relocalize.places import (
     placed,
 )
 from mapweave.hybridmap.descriptor import decode, quantise
-from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.registration.matching import match
 
 AGENT = "d"

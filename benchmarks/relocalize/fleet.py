@@ -17,7 +17,8 @@ from benchmarks.relocalize.places import Place, joined, mapped, mapped_sites
 from benchmarks.relocalize.queries import KINDS, Query, known, nowhere, twins
 from benchmarks.relocalize.score import Reply, ask, judged, share, spent
 from mapweave.hybridmap.descriptor import decode
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 

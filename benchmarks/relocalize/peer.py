@@ -16,7 +16,8 @@ from numpy.typing import NDArray
 from scipy.cluster.vq import kmeans2
 
 from mapweave.hybridmap.descriptor import decode
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.retrieval.ranking import Ranked
 

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from benchmarks.relocalize.pictures import Photographer, Picture, Wish, taken
-from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.merge.pose_graph.component import solve_graph

@@ -11,7 +11,7 @@ import numpy as np
 
 from benchmarks.relocalize.places import Place
 from benchmarks.relocalize.queries import Query
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, PoseGaussian, wrap_angle
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 

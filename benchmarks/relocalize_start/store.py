@@ -21,7 +21,8 @@ import numpy as np
 from benchmarks.relocalize.distractors import Distractors
 from benchmarks.relocalize.places import Place
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import snap
 from mapweave.mapserver.log.entry import Entry

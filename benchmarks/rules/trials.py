@@ -12,7 +12,8 @@ from benchmarks.rules.switches import TRIAL_RULES, by_rule
 from mapweave.evaluation.map_score import is_false
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeKind, MapId
+from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.scenarios.run import TrialOptions, run_trial
 from mapweave.scenarios.scenario import load_scenario, scenario_path

@@ -35,8 +35,8 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import Lockstep
 from mapweave.fleet import send_order
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.sim.robots import RobotSetup

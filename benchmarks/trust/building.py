@@ -11,7 +11,8 @@ from benchmarks.relocalize.pictures import Photographer, Wish
 from benchmarks.relocalize.places import LEAST_LANDMARKS, WAY_HEADING, WAY_XY, lookouts, placed
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.sim.floorplan import FloorPlan
 from mapweave.sim.world import World

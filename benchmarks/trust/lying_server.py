@@ -10,7 +10,8 @@ import numpy as np
 
 from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import (
     Certainty,

@@ -19,7 +19,7 @@ import numpy as np
 
 from docs.floor_plan import plan_of, to_pixels
 from mapweave.hybridmap.change import Change
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore

@@ -15,8 +15,8 @@ from mapweave.drawing.link_picture import draw_link
 from mapweave.drawing.map_picture import MapPicture, draw_map
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.merge.explanation.node_explanation import explain_nodes

@@ -15,7 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import MapweaveError
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.mapserver.retrieval.ranking import NearestLandmarks
 

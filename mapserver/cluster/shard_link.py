@@ -20,7 +20,8 @@ from typing import Any
 
 import numpy as np
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.mapserver.cluster.gateway import ClusterGone
 from mapweave.mapserver.cluster.shard import (
     HELLO,

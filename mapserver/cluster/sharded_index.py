@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.cluster.shard import question_of
 from mapweave.mapserver.cluster.shard_link import ShardLink

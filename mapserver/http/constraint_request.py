@@ -31,9 +31,9 @@ from mapweave.hybridmap.constraint_subject import (
     read_window,
 )
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint, to_take_back
 from mapweave.hybridmap.named_nodes import Record, Resolve, own_ids_of, retired_of
-from mapweave.hybridmap.node import NodeId
 from mapweave.wire.conversion import json_value
 
 ONE = "link, unmerge, retire, area, window, or undo with a number"

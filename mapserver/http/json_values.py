@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, event_words
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.wire.typed import Packers, packed
 

@@ -16,8 +16,8 @@ import numpy as np
 
 from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.live_map import NODE_COLUMNS

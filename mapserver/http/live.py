@@ -23,8 +23,8 @@ from starlette.websockets import WebSocket, WebSocketDisconnect
 from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.map_event import History, MapEvent
-from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.last_shown import NOTHING, LastShown
 from mapweave.mapserver.http.live_map import LiveMap, Pair

@@ -7,7 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.mapserver.http.row_table import RowTable
 from mapweave.mapserver.http.serving import json_bytes
 from mapweave.merge.floors import labels_of

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import EdgeKind, Node
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.merge.floors import floor_of

@@ -12,7 +12,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from mapweave.hybridmap.annotation import Annotations
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.node_details import node_details
 from mapweave.mapserver.node_views import NoView

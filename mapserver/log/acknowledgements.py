@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.node import MapId, check_name
+from mapweave.hybridmap.ids import MapId, check_name
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.store import Store
 from mapweave.wire.bus import Bus, Closing, Request

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import deque
 from dataclasses import dataclass, field
 
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.entry import Applied, Entry
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.wire.log_messages import MAX_REFUSALS, MAX_ROWS, LogRequest, Refusal

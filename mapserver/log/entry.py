@@ -8,7 +8,7 @@ from typing import NamedTuple
 from mapweave.hybridmap.change import Change, EdgePut
 from mapweave.hybridmap.edge_limits import unmeasurable
 from mapweave.hybridmap.errors import InvalidMessage
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.wire.codec import decode_body, element_of, unwrap_body
 from mapweave.wire.log_messages import Refusal
 

@@ -9,7 +9,7 @@ from itertools import takewhile
 
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.agent_log import AgentLog, PullSettings
 from mapweave.mapserver.log.entry import Applied, Position, words_of
 from mapweave.mapserver.log.intake import Intakes

@@ -22,7 +22,7 @@ from dataclasses import replace
 
 from mapweave.hybridmap.change import Change, ChangeBody
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, MapweaveError
-from mapweave.hybridmap.node import MapId, check_name
+from mapweave.hybridmap.ids import MapId, check_name
 from mapweave.mapserver.log.acknowledgements import Acknowledgements
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.entry import Entry, words_of

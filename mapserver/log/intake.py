@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.kept_bytes import KeptBytes

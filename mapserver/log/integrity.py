@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from typing import Any, NamedTuple
 
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 
 log = logging.getLogger(__name__)
 

@@ -10,7 +10,7 @@ from collections.abc import Callable
 import psycopg
 
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.store import EVERYTHING, News
 from mapweave.storage.postgres_session import RETRY, PostgresAddress, PostgresSession
 

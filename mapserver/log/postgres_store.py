@@ -15,7 +15,7 @@ from typing import Any
 import psycopg
 
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.log.postgres_follower import CHANNEL, LOG, RECORD, PostgresFollower, words_of
 from mapweave.mapserver.log.sql_store import SqlStore

@@ -6,7 +6,7 @@ import logging
 from dataclasses import dataclass
 
 from mapweave.hybridmap.errors import InvalidMessage
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.wire.bus import Reply
 from mapweave.wire.log_messages import LogAnswer, LogRequest

@@ -10,7 +10,7 @@ from typing import Any
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.integrity import checksum
 from mapweave.mapserver.log.store import HISTORY, Store
 from mapweave.storage.database_reader import reading

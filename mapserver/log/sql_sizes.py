@@ -6,8 +6,8 @@ import threading
 from collections.abc import Sequence
 
 from mapweave.hybridmap.change import EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import MAX_NUMBER
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log.entry import Traffic
 from mapweave.mapserver.log.sql_tables import SqlTables
 from mapweave.mapserver.log.store import ROW_BYTES

@@ -8,7 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, S
 from mapweave.hybridmap.annotation import MAX_ANNOTATIONS
 from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
-from mapweave.hybridmap.node import EdgeId, MapId, NodeId
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.mapserver.log.entry import Applied, Entry, Position
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.mapserver.log.sql_sizes import SqlSizes

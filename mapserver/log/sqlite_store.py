@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.log.integrity import SCHEMA, Gap, insert, repair
 from mapweave.mapserver.log.sql_store import SqlStore

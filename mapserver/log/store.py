@@ -13,7 +13,7 @@ from typing import Protocol
 
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
-from mapweave.hybridmap.node import EdgeId, MapId, NodeId
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.mapserver.log.entry import Applied, Entry, Position, Traffic
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.wire.log_messages import Refusal

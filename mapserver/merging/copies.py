@@ -6,7 +6,8 @@ from collections.abc import Collection
 
 import numpy as np
 
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Node
 
 LEAST_COPIED = 10
 """Landmarks that are the same bit by bit: as many as a recognition needs."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Container
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.plausibility import (
     contradict_each_other,
     contradict_themselves,

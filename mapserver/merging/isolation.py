@@ -6,7 +6,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar
 
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 
 MAX_REASON = 200
 """Characters."""

@@ -9,9 +9,9 @@ import numpy as np
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.mapserver.plausibility import fragments

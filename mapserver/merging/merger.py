@@ -10,8 +10,9 @@ from functools import partial
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredMap
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.mapserver.merging.copies import Copies

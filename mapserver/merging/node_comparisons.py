@@ -6,7 +6,8 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from itertools import islice
 
-from mapweave.hybridmap.node import Edge, EdgeKind, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.verification_cache import (
     CachedVerifications,

@@ -19,7 +19,7 @@ import numpy as np
 from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.explanation import MARGINAL
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeId, MapId, NodeId
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.pruned_node import PrunedNode, PrunedNodes
 from mapweave.mapserver.log.store import PRUNING
 from mapweave.merge.pose_graph.candidates import Pair

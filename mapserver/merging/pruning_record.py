@@ -6,7 +6,7 @@ import logging
 from collections.abc import Callable, Collection, Iterable
 
 from mapweave.hybridmap.errors import InvalidMessage
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.pruning import Pruning, named_nodes, plan_of

@@ -10,7 +10,8 @@ import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.verdicts import Verdict
 

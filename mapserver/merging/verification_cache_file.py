@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.landmark_tables import VERSION as TABLES
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.checksummed_file import seal, unseal
 from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, VerificationCache

@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.recognition import Recognition, RecognitionSettings, register

@@ -16,7 +16,8 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.mapserver.relocalization.alias_cache import AliasCache, AliasedNode
 from mapweave.mapserver.relocalization.aliased_landmarks import between, same_place

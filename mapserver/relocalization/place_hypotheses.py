@@ -9,7 +9,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.relocalization.calibration import HypothesisSupport

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import PoseGaussian, wrap_angle
 from mapweave.hybridmap.query import NO_COMPONENT, Certainty, RelocalizeAnswer, SimilarPlace, Whereabouts
 from mapweave.mapserver.relocalization.aliased_landmarks import between

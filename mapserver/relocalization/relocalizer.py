@@ -10,7 +10,8 @@ from __future__ import annotations
 from collections.abc import Callable, Collection
 from dataclasses import dataclass, field
 
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions, AliasedRegionSettings

@@ -8,7 +8,7 @@ from enum import Enum, auto
 
 import numpy as np
 
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
 from mapweave.mapserver.relocalization.place_hypotheses import (

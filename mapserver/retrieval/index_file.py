@@ -21,9 +21,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.landmark_tables import DIMENSIONS
 from mapweave.hybridmap.landmark_tables import VERSION as TABLES
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.retrieval.coarse_quantizer import CoarseQuantizer
 from mapweave.mapserver.retrieval.inverted_file import Block

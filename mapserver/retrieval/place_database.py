@@ -17,7 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.retrieval import voting

@@ -12,7 +12,8 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import CODE_BYTES, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import CODE_BYTES, Node
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.retrieval import voting
 from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS, bounded

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import MapweaveError
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.mapserver.retrieval import voting
 
 REACH = 0.6

@@ -13,8 +13,8 @@ from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.named_nodes import Record, Resolve, ids_of
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ExplainRequest, ResolveAnswer, ResolveRequest
 from mapweave.refusals import refusals
 from mapweave.wire.bus import Reply

@@ -41,7 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.extras import need
     from mapweave.hybridmap.constraint_subject import EXAMPLE
     from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation
-    from mapweave.hybridmap.node import NodeId
+    from mapweave.hybridmap.ids import NodeId
     from mapweave.hybridmap.query import ExplainRequest
     from mapweave.mapserver.http.json_values import json_values
 

@@ -12,8 +12,9 @@ from mapweave.commands.map_input import SOURCES, map_source, opened
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.hybrid_map import HybridMap
+    from mapweave.hybridmap.ids import MapId
     from mapweave.hybridmap.manual_constraint import ManualConstraints
-    from mapweave.hybridmap.node import Edge, MapId
+    from mapweave.hybridmap.node import Edge
     from mapweave.hybridmap.pin import Pin
     from mapweave.merge.pose_graph.merged_map import MergedMap
     from mapweave.merge.settings import MergeSettings

@@ -46,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.agent.recordings.image_folder import images_in
     from mapweave.hybridmap.change import NodePut
     from mapweave.hybridmap.errors import NotConnected
-    from mapweave.hybridmap.node import MapId, check_name
+    from mapweave.hybridmap.ids import MapId, check_name
     from mapweave.photographs import map_of_photographs, send_map
     from mapweave.storage.atomic_file import check_place
     from mapweave.storage.map_file import MapFile, write_map_file

@@ -15,7 +15,7 @@ from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.explanation import RouteExplanation
-    from mapweave.hybridmap.node import NodeId
+    from mapweave.hybridmap.ids import NodeId
     from mapweave.mapserver.routes import Router
     from mapweave.merge.pose_graph.merged_map import MergedMap
 

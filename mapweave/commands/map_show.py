@@ -14,7 +14,7 @@ from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 
 if TYPE_CHECKING:
-    from mapweave.hybridmap.node import NodeId
+    from mapweave.hybridmap.ids import NodeId
     from mapweave.hybridmap.pose import Pose2
     from mapweave.storage.map_file import MapFile
 

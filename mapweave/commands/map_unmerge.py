@@ -29,8 +29,8 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.constraint_subject import Apart
     from mapweave.hybridmap.explanation import FleetExplanation
+    from mapweave.hybridmap.ids import MapId
     from mapweave.hybridmap.named_nodes import own_ids_of
-    from mapweave.hybridmap.node import MapId
     from mapweave.hybridmap.query import ExplainRequest
 
     ends = ends_of(own_ids_of(arguments.ends, *names_of(arguments)))

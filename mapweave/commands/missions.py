@@ -146,7 +146,7 @@ def run_missions(arguments: argparse.Namespace) -> int:
 def _robot(arguments: argparse.Namespace) -> str:
     """The robot that is named, or none."""
     from mapweave.commands.usage import arguments_read
-    from mapweave.hybridmap.node import check_name
+    from mapweave.hybridmap.ids import check_name
 
     with arguments_read():
         return check_name(arguments.robot) if arguments.robot else ""

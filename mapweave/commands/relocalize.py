@@ -21,7 +21,8 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mapweave.hybridmap.floor_plan import PlacedPlan
-    from mapweave.hybridmap.node import Node, NodeId
+    from mapweave.hybridmap.ids import NodeId
+    from mapweave.hybridmap.node import Node
     from mapweave.hybridmap.pose import Pose2
     from mapweave.hybridmap.query import RelocalizeAnswer, View, Whereabouts
     from mapweave.settings import NetworkSettings

@@ -192,7 +192,7 @@ def name_of(arguments: argparse.Namespace) -> str:
     """Of the robot in the fleet: as given, else that of its splits.toml, else the file's or folder's."""
     import re
 
-    from mapweave.hybridmap.node import check_name
+    from mapweave.hybridmap.ids import check_name
 
     given = (arguments.robot or arguments.recording.resolve().stem).lower()
     fallback = re.sub("[^a-z0-9_-]", "-", given).strip("-_")[:32]  # a longer name is refused

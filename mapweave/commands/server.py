@@ -101,7 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     # Modules stay: looking among them for garbage took a sixth of the start.
     gc.disable()
-    from mapweave.hybridmap.node import check_name
+    from mapweave.hybridmap.ids import check_name
     from mapweave.terminal import log_with_time, stamped
 
     # Lines have dates, so that a log shows when two maps came apart.

@@ -15,7 +15,7 @@ from mapweave.commands.usage import UsageError
 def name(text: str) -> str:
     """The name of a robot, server or fleet."""
     from mapweave.hybridmap.errors import InvalidValue
-    from mapweave.hybridmap.node import check_name
+    from mapweave.hybridmap.ids import check_name
 
     try:
         return check_name(text)

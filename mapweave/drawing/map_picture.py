@@ -14,7 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.drawing.names import Name, draw_names
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
+from mapweave.hybridmap.ids import EdgeId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.sim.floorplan import FloorPlan
 from mapweave.storage.atomic_file import write_whole

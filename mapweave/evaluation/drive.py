@@ -14,7 +14,8 @@ from mapweave.evaluation.asking_again import Asked, Trial, trials_of
 from mapweave.evaluation.truth import Truth
 from mapweave.evaluation.verdict import LEVELS, SURE, Verdict
 from mapweave.hybridmap.change import Change, ChangeBody
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.hybridmap.query import Whereabouts
 from mapweave.mapserver.merging.merger import Merger

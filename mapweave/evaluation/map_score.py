@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import Edge, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 from mapweave.sim.floorplan import Rectangle
 from mapweave.storage.atomic_file import write_whole

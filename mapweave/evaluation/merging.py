@@ -23,7 +23,8 @@ from mapweave.evaluation.pieces import pieces
 from mapweave.evaluation.truth import Truth
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import DeviceError, InvalidFile
-from mapweave.hybridmap.node import Edge, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.merging.merger import Merger

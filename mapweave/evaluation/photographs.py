@@ -24,7 +24,8 @@ from mapweave.evaluation.asking_again import Trial
 from mapweave.evaluation.verdict import Verdict
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
-from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, View
 from mapweave.mapserver.retrieval.place_index import PlaceIndex

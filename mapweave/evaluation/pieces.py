@@ -10,7 +10,7 @@ from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.recordings.image_folder import images_of
 from mapweave.agent.recordings.splits import robots_of
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
-from mapweave.hybridmap.node import check_name
+from mapweave.hybridmap.ids import check_name
 
 OVERLAP = 0.3
 """Of a piece, what the next one shares with it."""

@@ -24,7 +24,7 @@ from mapweave.evaluation.map_score import align
 from mapweave.evaluation.truth import Truth
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.storage.map_file import MapFile, pack_map_file
 

@@ -16,7 +16,8 @@ from mapweave.evaluation.map_score import write_tum
 from mapweave.formats.g2o import G2oEdge, G2oGraph, write_g2o
 from mapweave.formats.graph import graph_of
 from mapweave.formats.map_part import MapPart
-from mapweave.hybridmap.node import Edge, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.hybridmap.route import RouteSettings, edge_cost

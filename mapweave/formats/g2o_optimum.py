@@ -7,7 +7,7 @@ import numpy as np
 
 from mapweave.formats.g2o import G2oGraph
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, Measurement

@@ -7,7 +7,8 @@ from collections.abc import Callable, Iterable, Mapping
 import networkx as nx
 import numpy as np
 
-from mapweave.hybridmap.node import Edge, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import Pose2
 
 Numbers = Mapping[str, float]

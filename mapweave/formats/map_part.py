@@ -7,7 +7,8 @@ from functools import cached_property
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeId, Node, NodeId
+from mapweave.hybridmap.ids import EdgeId, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.merge.manual_constraints import apply_constraints
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
-from mapweave.hybridmap.node import check_name
+from mapweave.hybridmap.ids import check_name
 from mapweave.storage.atomic_file import write_whole
 from mapweave.storage.os_errors import reason_of
 from mapweave.storage.settings_file import build, read_toml

@@ -22,7 +22,7 @@ from tempfile import TemporaryDirectory
 import msgspec
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue, Refused, SettingsError
-from mapweave.hybridmap.node import check_name
+from mapweave.hybridmap.ids import check_name
 from mapweave.identities.folder_changes import kept_on_failure, locked
 from mapweave.identities.hosts import check_hosts, endpoints_of
 from mapweave.identities.key_file import (

@@ -30,8 +30,8 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import FreeRunning, Synchronization
 from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.processes.agent_files import epochs_of_files, map_path, trajectory_path, views_path
 from mapweave.processes.portal_command import PortalCommand
 from mapweave.processes.server_watch import ServerWatch

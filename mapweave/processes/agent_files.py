@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mapweave.hybridmap.node import NUMBER, MapId
+from mapweave.hybridmap.ids import NUMBER, MapId
 
 
 def map_path(folder: Path, map_id: MapId) -> Path:

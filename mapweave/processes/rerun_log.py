@@ -36,7 +36,8 @@ from mapweave.agent.pipeline import Pipeline, Step
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import NotConnected, SettingsError
-from mapweave.hybridmap.node import Edge, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.processes.edge_colours import COLOURS
 

@@ -28,7 +28,8 @@ from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.replication.merged_poses import MergedPoses
 from mapweave.agent.ros_messages import making
 from mapweave.agent.ros_messages.values import BASES, FOOTPRINT, TF_TYPE, heading_of, stamp_of
-from mapweave.hybridmap.node import Edge, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from mapweave.processes.edge_colours import COLOURS
 from mapweave.wire.pose_messages import MergedPose

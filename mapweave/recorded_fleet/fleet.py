@@ -11,7 +11,7 @@ from types import TracebackType
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.change import ChangeBody
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.http.last_shown import LastShown
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore

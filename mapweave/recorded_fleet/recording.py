@@ -6,7 +6,7 @@ from functools import cache
 from pathlib import Path
 
 from mapweave.hybridmap.change import ChangeBody
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.storage.map_file import read_map_file
 from mapweave.wire.codec import element_of
 

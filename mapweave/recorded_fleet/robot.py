@@ -19,8 +19,8 @@ from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys

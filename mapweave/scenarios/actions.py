@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from typing import Any
 
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
+from mapweave.hybridmap.ids import NodeId, check_name
 from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.node import NodeId, check_name
 from mapweave.scenarios.liar.lies import EVERY
 from mapweave.sim import events
 from mapweave.sim.robots import camera_from_table

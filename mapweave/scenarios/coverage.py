@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping
 import numpy as np
 
 from mapweave.evaluation.map_score import crossed, is_false
-from mapweave.hybridmap.node import Edge, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.scenarios.recording import Trajectory
 from mapweave.sim.floorplan import FloorPlan

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from mapweave.drawing.map_picture import colours_of
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.scenarios.recording import Lost, Moment
 from mapweave.scenarios.trajectories import TrajectoryScore
 

@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import NotConnected
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.fleet import SERVER, Fleet, Stage
 from mapweave.scenarios.kidnap_planning import Kidnapping, NothingToShow, choose_goal, plan_kidnapping

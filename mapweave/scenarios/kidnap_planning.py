@@ -11,7 +11,7 @@ import numpy as np
 
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.floorplan import FloorPlan, Rectangle
 

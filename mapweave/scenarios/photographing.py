@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from mapweave.hybridmap.errors import InvalidFile, NotConnected
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.photographs import map_of_photographs, send_map
 from mapweave.scenarios.actions import Photograph

@@ -7,7 +7,8 @@ from collections.abc import Callable, Mapping
 from mapweave.fleet import Fleet as Person
 from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.fleet import FLEET, Fleet, Stage
 from mapweave.storage.map_file import MapFile

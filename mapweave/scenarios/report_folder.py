@@ -15,7 +15,8 @@ from mapweave.drawing.map_picture import Drive, MapPicture, draw_map, outline_of
 from mapweave.evaluation.map_score import MapScore, is_false, score_map, write_tum
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.error_plot import draw_errors
 from mapweave.scenarios.expectations import Verdict

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.scenarios.expectations import Verdict
 from mapweave.scenarios.figures import Figures, as_text
 from mapweave.scenarios.recording import Recording

@@ -10,7 +10,7 @@ import numpy as np
 
 from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import InvalidMessage, NotConnected
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.scenarios.recording import Trajectory
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.keys import Keys

@@ -11,8 +11,8 @@ from typing import Any
 from mapweave.fleet import send_order
 from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios import actions
 from mapweave.scenarios.actions import MISSION_KINDS

@@ -13,7 +13,8 @@ import numpy as np
 from mapweave.evaluation.map_score import is_false, link_recall, pose_error, score_map
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.coverage import explored_share, longest_loop
 from mapweave.scenarios.figures import Figures, RobotFigures, measured

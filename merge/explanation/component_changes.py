@@ -7,8 +7,8 @@ from collections.abc import Collection, Iterable
 
 import networkx as nx
 
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import reason_of
-from mapweave.hybridmap.node import MapId
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 

@@ -13,8 +13,8 @@ import networkx as nx
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import MapsExplanation, NearMiss
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import reason_of, retired_words
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.reachability import reachability_of
 from mapweave.merge.explanation.component_changes import joined_maps
 from mapweave.merge.explanation.node_explanation import node_of

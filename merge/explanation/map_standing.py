@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import Counter
 from typing import NamedTuple
 
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import reason_of
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge.explanation.component_changes import joined_maps
 from mapweave.merge.pose_graph.merged_map import MergedMap
 

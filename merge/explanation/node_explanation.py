@@ -11,8 +11,9 @@ from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import LinkAgreement, Misfit, PairExplanation, Standing
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import reason_of, retired_words
-from mapweave.hybridmap.node import Edge, MapId, Node, NodeId
+from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.explanation.own_edges import claims, consequences, edge_in_words, own_edge
 from mapweave.merge.manual_constraints import apply_constraints

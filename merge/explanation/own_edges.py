@@ -7,7 +7,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.reachability import RECOGNISED, left, reachability_of
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS
 from mapweave.merge.pose_graph.links import Link

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Container
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.verification import verify
 from mapweave.registration.matching import match

@@ -26,7 +26,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.map_maintenance.adjacency import Adjacency
 from mapweave.merge.map_maintenance.changed_nodes import ChangedNodes

@@ -26,7 +26,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.hybridmap.reachability import FARTHEST, WIDEST
 from mapweave.hybridmap.reachability_cache import ReachabilityCache

@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.reachability import RECOGNISED
 from mapweave.hybridmap.reachability_cache import ReachabilityCache

@@ -10,7 +10,7 @@ import networkx as nx
 import numpy as np
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.merge.mutual_exclusion.collision import Collision
 from mapweave.merge.mutual_exclusion.exclusion import clash_of
 from mapweave.merge.mutual_exclusion.trajectories import RobotTrajectory, TrajectoryCache

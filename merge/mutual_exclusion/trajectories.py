@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array
 from mapweave.merge.mutual_exclusion.range_scans import RangeScans
 from mapweave.merge.pose_graph.fragments import Fragment

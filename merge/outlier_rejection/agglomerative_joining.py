@@ -12,7 +12,7 @@ from collections.abc import Container, Mapping, Sequence, Set
 
 import networkx as nx
 
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup
 from mapweave.merge.outlier_rejection.link_probability import standpoints

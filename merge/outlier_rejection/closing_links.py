@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 import networkx as nx
 import numpy as np
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.merge.outlier_rejection.pairwise_consistency import Sorted
 from mapweave.merge.pose_graph.component_solver import ComponentSolver

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup, Verdict
 from mapweave.merge.outlier_rejection.pairwise_consistency import group_links
 from mapweave.merge.outlier_rejection.segmentation import fragments_of

@@ -30,7 +30,8 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.explanation import ALIASED
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Array
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link, link_of

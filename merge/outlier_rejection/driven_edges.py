@@ -12,7 +12,8 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, MapId
+from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.pose_graph.links import RefusedLink, refuse_edge
 from mapweave.merge.pose_graph.solved_graph import PoseGraph

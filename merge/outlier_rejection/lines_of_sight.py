@@ -12,7 +12,8 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 

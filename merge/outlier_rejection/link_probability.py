@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
 from mapweave.merge.pose_graph.factors import believable
 from mapweave.merge.pose_graph.links import Link

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.merge.pose_graph.links import RefusedLink, link_of, refuse_edge
 from mapweave.merge.settings import ConsistencySettings

@@ -16,7 +16,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.merge.outlier_rejection.bent_maps import nearly_there
 from mapweave.merge.outlier_rejection.independent_support import (

@@ -16,7 +16,8 @@ from dataclasses import replace
 import networkx as nx
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.merge.outlier_rejection.closing_links import join
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS, sort_loop_closures
 from mapweave.merge.outlier_rejection.pairwise_consistency import group_links, sort_links

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 
 LEAST_OVERLAP = 3.0
 """Pairs whose nodes have less in common (see `overlap`) are not compared."""

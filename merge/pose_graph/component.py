@@ -10,7 +10,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.pose_graph.factors import Factors, Measurement, Rows
 from mapweave.merge.pose_graph.optimization import ANCHOR_SIGMA, optimized

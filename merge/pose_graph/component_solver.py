@@ -12,7 +12,7 @@ import networkx as nx
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.pose_graph.component import Component
 from mapweave.merge.pose_graph.factors import Factors, Rows

@@ -6,7 +6,7 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.merge.pose_graph.factors import Factors, Measurement
 from mapweave.merge.pose_graph.links import RefusedLink
 from mapweave.merge.pose_graph.solved_graph import PoseGraph

@@ -11,7 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.explanation import ALIASED
-from mapweave.hybridmap.node import MERGE_AUTHOR, Edge, EdgeId, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MERGE_AUTHOR, EdgeId, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.merge.pose_graph.factors import Measurement
 

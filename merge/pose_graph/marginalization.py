@@ -30,7 +30,7 @@ import networkx as nx
 import numpy as np
 
 from mapweave.hybridmap.explanation import MARGINAL
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component import Component

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, nearest_covariance
 from mapweave.hybridmap.pruned_node import PrunedNodes

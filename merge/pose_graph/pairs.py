@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.merge.pose_graph.candidates import LEAST_HOPS, LEAST_OVERLAP, MOST_PER_MAP, Pair
 
 

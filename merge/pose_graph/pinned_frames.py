@@ -11,7 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2
 from mapweave.merge.pose_graph.component import Component

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
 from mapweave.registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 

@@ -14,7 +14,8 @@ from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, Node
+from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2
 from synthetic.world import World
 from tests.agent.scripted_fleet import home_map, home_world

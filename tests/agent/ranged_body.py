@@ -9,7 +9,7 @@ import numpy as np
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Pipeline, Step
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.codec import encode_body
 

@@ -14,7 +14,8 @@ from mapweave.agent.observation import Command, Observation, Odometry, RobotDesc
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import AgentSettings, NavigatorSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteLeg, Whereabouts
 from mapweave.vision.lens import Lens

@@ -21,7 +21,8 @@ from mapweave.agent.camera_occupancy import (
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.settings import OccupancyGridSettings
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
 HEIGHT = 0.3

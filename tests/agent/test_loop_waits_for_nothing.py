@@ -25,8 +25,8 @@ from mapweave.agent.runner import Runner
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.wire.bus import Bus

@@ -9,7 +9,7 @@ from mapweave.agent.mission import Explore, GoTo, Idle, Mission
 from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.settings import AgentSettings, NavigatorSettings
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from tests.agent.ranged_body import BODY, MAP, live, on, still
 
 

@@ -15,6 +15,7 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.settings import WithoutServer
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.hybridmap.mission_order import (
     MAX_KEPT,
@@ -25,7 +26,6 @@ from mapweave.hybridmap.mission_order import (
     MissionState,
     later_stamp,
 )
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
 

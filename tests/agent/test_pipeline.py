@@ -15,7 +15,8 @@ from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.pipeline import Pipeline, Step
 from mapweave.agent.settings import AgentSettings, NavigatorSettings
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.vision.equidistant import Equidistant
 from mapweave.vision.lens import Lens

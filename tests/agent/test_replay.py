@@ -21,7 +21,7 @@ from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.hybridmap.errors import DeviceError
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 
 COUNT = 14

@@ -15,7 +15,7 @@ from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World

@@ -12,8 +12,8 @@ from mapweave.agent.mission import GoTo
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodeRetired
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.wire.keys import Keys

@@ -16,8 +16,9 @@ from mapweave.agent.mission import Answer, Explore, WhoIsNear
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.robots_in_view import EVERY, NUMBER, OLDEST, OVERDUE, SIGMAS, RobotsInView
 from mapweave.hybridmap.camera import Camera
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRobot
-from mapweave.hybridmap.node import Landmarks, MapId, NodeId
+from mapweave.hybridmap.node import Landmarks
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from tests.agent.conftest import PhotoWalls
 from tests.agent.ranged_body import on, rangers

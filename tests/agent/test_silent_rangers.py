@@ -14,7 +14,7 @@ from mapweave.agent.pipeline import Pipeline, Step
 from mapweave.agent.ranger_monitor import RangerMonitor
 from mapweave.agent.settings import AgentSettings, ExplorerSettings
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world

@@ -16,8 +16,8 @@ from mapweave.agent.observation import Command
 from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
-from mapweave.hybridmap.node import MapId
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode

@@ -13,7 +13,7 @@ from benchmarks.merge_sim import benchmark as merge_sim
 from benchmarks.merge_sim.benchmark import Failure, figures, measure, outcome, summary
 from benchmarks.merge_sim.run import Run, false_merges
 from benchmarks.merge_sim.views import lengths, views_shared
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.camera import WEBCAM
 from mapweave.sim.renderer import Renderer

@@ -19,8 +19,8 @@ from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.sim.floorplan import FloorPlan, Rectangle
 from mapweave.sim.ground_truth_messages import RobotStatus, SimStatus

@@ -18,7 +18,8 @@ from benchmarks.relocalize.places import Place, placed, spread_out, twin_lookout
 from benchmarks.relocalize.queries import Query, beside
 from benchmarks.relocalize.score import Reply, ask, figures, judged, spent
 from mapweave.hybridmap.descriptor import decode, root_sift
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
 from mapweave.mapserver.relocalization.calibration import HypothesisSupport

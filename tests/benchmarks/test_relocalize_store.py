@@ -11,7 +11,7 @@ from benchmarks.relocalize.places import Place
 from benchmarks.relocalize_start.store import fill
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from synthetic.world import room, take_map

@@ -15,8 +15,8 @@ from benchmarks.fleet.drives import drive
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.change import Change, EdgePut
 from mapweave.hybridmap.drive_statistics import DriveStatistics
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore

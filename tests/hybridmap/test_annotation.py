@@ -19,7 +19,7 @@ from mapweave.hybridmap.annotation import (
 )
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.storage.map_file import MapFile, pack_map_file, unpack_map_file
 from mapweave.wire.messages import decode, encode

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 
 from mapweave.hybridmap.area import Area, crosses, inside
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 
 NODE = NodeId("r0", 1, 3)

@@ -19,6 +19,7 @@ from mapweave.hybridmap.constraint_subject import (
     read_window,
 )
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.hybridmap.manual_constraint import (
     ManualConstraint,
@@ -26,7 +27,6 @@ from mapweave.hybridmap.manual_constraint import (
     event_words,
     to_take_back,
 )
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
 A, B = NodeId("a", 1, 3), NodeId("b", 1, 5)

@@ -10,7 +10,8 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.descriptor import quantise
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment

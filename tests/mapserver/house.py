@@ -14,7 +14,7 @@ from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission_control import MissionControl
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import Status
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.http.web import Web

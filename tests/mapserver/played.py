@@ -6,7 +6,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from mapweave.hybridmap.change import Change, NodeRetired
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.agent_log import PullSettings
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.ingest_settings import IngestSettings

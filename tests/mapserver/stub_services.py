@@ -13,9 +13,9 @@ from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import Busy, InvalidValue
 from mapweave.hybridmap.explanation import Explanation, FleetExplanation
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import (
     Certainty,

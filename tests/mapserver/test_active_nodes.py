@@ -10,8 +10,8 @@ import pytest
 
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty, View
 from mapweave.hybridmap.superseded import Superseded

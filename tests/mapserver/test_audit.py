@@ -17,8 +17,8 @@ from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.annotation import Annotation, Place
 from mapweave.hybridmap.constraint_subject import RetiredNodes
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder, Profile

@@ -18,9 +18,9 @@ from mapweave.hybridmap.change import ChangeBody, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ResolveRequest
 from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.map_files import map_file_of

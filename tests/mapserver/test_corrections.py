@@ -20,7 +20,7 @@ from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.constraint_subject import Linked, RetiredArea, RetiredNodes
 from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.log.sqlite_store import SqliteStore

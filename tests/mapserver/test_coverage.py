@@ -10,7 +10,7 @@ import pytest
 
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from mapweave.hybridmap.query import MAX_KNOWN, KnownAnswer, KnownRequest
 from mapweave.mapserver.coverage import Coverage

@@ -22,9 +22,9 @@ from mapweave.hybridmap.explanation import (
     RouteExplanation,
     Standing,
 )
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.query import ExplainRequest, RouteRequest
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.base_map import BaseMap

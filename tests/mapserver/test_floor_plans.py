@@ -11,7 +11,7 @@ import pytest
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.floor_plan import IDENTITY, FloorPlan, PlanImage, PlanPair
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.floor_plans import CLICK, check_plan, placed_plan

@@ -14,10 +14,11 @@ from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.edge_limits import unmeasurable
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import MAX_NUMBER
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import MapEventKind
-from mapweave.hybridmap.node import Edge, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty
 from mapweave.mapserver.answers import Answers

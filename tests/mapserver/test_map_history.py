@@ -13,9 +13,9 @@ import pytest
 from mapweave.hybridmap.change import NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import History, MapEvent, MapEventKind
-from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.constraint_history import with_constraints

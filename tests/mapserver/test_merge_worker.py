@@ -12,8 +12,8 @@ import pytest
 
 from mapweave.hybridmap.change import Change, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import NO_COMPONENT, Certainty
 from mapweave.mapserver.merge_worker import MergeWorker

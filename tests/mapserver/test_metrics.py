@@ -12,7 +12,7 @@ from prometheus_client.metrics_core import Metric
 from prometheus_client.parser import text_string_to_metric_families
 
 from mapweave.hybridmap.agent_status import AgentStatus, Status
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
 from mapweave.wire.log_messages import Head, Mark

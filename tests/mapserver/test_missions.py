@@ -11,6 +11,7 @@ import pytest
 from mapweave import fleet
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.hybridmap.mission_order import (
     MAX_KEPT,
@@ -21,7 +22,6 @@ from mapweave.hybridmap.mission_order import (
     MissionState,
     new_id,
 )
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver import mission_relay
 from mapweave.mapserver.http.web import Web

@@ -8,7 +8,7 @@ import pytest
 
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.same_site import is_loopback

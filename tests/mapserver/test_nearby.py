@@ -10,8 +10,9 @@ import pytest
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.nearby import MAX_NEARBY, NearbyAnswer, NearbyRequest
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.nearby import CELL, KEPT, MAP_SIGMA, Nearby

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.errors import Busy, InvalidValue
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.view_image import MAX_BYTES, ViewImage, ViewRequest
 from mapweave.mapserver import node_views
 from mapweave.mapserver.node_views import NodeViews, NoView

@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.nearby import NearbyRequest
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Obstacle, ReserveRequest, RouteAnswer, RouteRequest
 from mapweave.mapserver.nearby import Nearby
@@ -112,7 +112,8 @@ class Fleet:
 def ring() -> Router:
     """Two ways from node 0 to node 4: 4 m by the corridor, 8 m by the hall."""
     from mapweave.hybridmap.change import Change, EdgePut, NodePut
-    from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind
+    from mapweave.hybridmap.ids import EdgeId
+    from mapweave.hybridmap.node import Edge, EdgeKind
     from mapweave.hybridmap.pose import PoseGaussian
     from mapweave.mapserver.merging.merger import Merger
     from tests.mapserver.test_reservations import MAP, place_node

@@ -21,9 +21,9 @@ from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.map_event import MapEventKind
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, ResolveRequest
 from mapweave.hybridmap.superseded import Superseded

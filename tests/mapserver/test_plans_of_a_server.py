@@ -18,8 +18,8 @@ from mapweave.exit_status import FAILED, NO, USAGE
 from mapweave.fleet import Fleet, login
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.floor_plan import PIECE, PlanPiece
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.map_event import MapEventKind
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ResolveRequest
 from mapweave.mapserver.http.web import Web

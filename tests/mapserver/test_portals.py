@@ -14,8 +14,9 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.annotation import Annotation, Annotations, Body, Closure, Floor, Preference
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.portal import Portal, PortalMeans, PortalStop
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import RouteAnswer

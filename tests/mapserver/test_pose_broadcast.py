@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.replication.merged_poses import MergedPoses
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver import pose_broadcast
 from mapweave.mapserver.pose_broadcast import PoseBroadcast

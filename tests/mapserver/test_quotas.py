@@ -10,8 +10,8 @@ import pytest
 from mapweave.commands.status import cells
 from mapweave.hybridmap.change import Change, NodeRetired
 from mapweave.hybridmap.errors import Busy
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.nearby import NearbyRequest
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import KnownRequest, ReserveRequest
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings

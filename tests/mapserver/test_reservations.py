@@ -11,8 +11,9 @@ from hypothesis import strategies as st
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.nearby import NearbyRequest
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest
 from mapweave.mapserver.merging.merger import Merger

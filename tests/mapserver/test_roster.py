@@ -8,8 +8,8 @@ import pytest
 
 from mapweave.hybridmap.agent_status import MAX_ROBOTS, AgentStatus, FleetStatus, RobotEntry, Status
 from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MAX_VIA, MissionKind, MissionOrder, MissionReport, MissionState
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.places import Places

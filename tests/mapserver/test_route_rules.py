@@ -15,7 +15,8 @@ from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Pref
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.route import edge_cost

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import Change, EdgePut
-from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.map_explanation import explain_maps

@@ -11,8 +11,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.nearby import NearbyRequest
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import (
     Certainty,

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
-from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, Whereabouts
 from mapweave.mapserver.answers import Answers

@@ -19,7 +19,7 @@ from mapweave.exit_status import USAGE
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.own_maps import maps_of

@@ -15,7 +15,8 @@ import pytest
 from mapweave.cli import main
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import EdgePut, NodePut
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.storage.map_file import MapFile, write_map_file
 from tests.mapweave.command_line import complaint
@@ -173,7 +174,8 @@ def one_node():
     """A map of one place."""
     from mapweave.hybridmap.camera import Camera
     from mapweave.hybridmap.change import NodePut
-    from mapweave.hybridmap.node import Landmarks, Node, NodeId
+    from mapweave.hybridmap.ids import NodeId
+    from mapweave.hybridmap.node import Landmarks, Node
     from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
     camera = Camera(64, 48, 60, 60, 32, 24, 0.3)

@@ -21,8 +21,8 @@ from mapweave.exit_status import INTERRUPTED, NO, USAGE
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
 from mapweave.hybridmap.errors import NotConnected
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import read_map_file

@@ -19,7 +19,7 @@ from mapweave.evaluation.asking_again import Asked, trial_figures, trials_of
 from mapweave.evaluation.photographs import evidence
 from mapweave.evaluation.verdict import Verdict, figures
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import NO_COMPONENT, Certainty, RelocalizeAnswer, Whereabouts
 

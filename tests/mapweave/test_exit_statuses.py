@@ -12,8 +12,8 @@ import pytest
 from mapweave.cli import main
 from mapweave.exit_status import FAILED, NO, USAGE
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.offline_merge import merge_parts
 from mapweave.storage.map_file import write_map_file

@@ -12,7 +12,7 @@ import pytest
 from mapweave.drawing.link_picture import draw_link
 from mapweave.explanation_text import MOST_LINKS, WIDTH, pair_words
 from mapweave.hybridmap.explanation import LinkAgreement, PairExplanation
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.merge.explanation.node_explanation import explain_nodes
 from tests.mapserver.stub_services import two_maps
 

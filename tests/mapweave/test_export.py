@@ -23,7 +23,8 @@ from mapweave.formats.g2o import G2oEdge, G2oGraph, read_g2o, write_g2o
 from mapweave.formats.g2o_optimum import optimum_of
 from mapweave.formats.map_part import MapPart
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
-from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.merge.pose_graph.merged_map import MergedMap

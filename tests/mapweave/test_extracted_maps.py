@@ -16,7 +16,7 @@ from mapweave.cli import main
 from mapweave.exit_status import NO
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.storage.map_file import read_map_file

@@ -18,8 +18,8 @@ from mapweave.cli import main
 from mapweave.exit_status import FAILED, MISSING_EXTRA, NO, USAGE
 from mapweave.extras import MODULES
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.offline_merge import merge_parts

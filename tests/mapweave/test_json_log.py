@@ -16,7 +16,7 @@ from pathlib import Path
 
 import pytest
 
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.json_log import JsonFormatter
 from mapweave.wire.log_messages import Mark

@@ -25,8 +25,8 @@ from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes import agent_process
 from mapweave.processes.agent import Agent, AgentOptions

@@ -18,7 +18,7 @@ import pytest
 from mapweave.cli import main
 from mapweave.exit_status import NO, USAGE
 from mapweave.hybridmap.change import ChangeBody, NodePut
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.map_files import merged_of
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, read_map_file, write_map_file

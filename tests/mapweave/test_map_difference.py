@@ -12,7 +12,7 @@ import pytest
 from mapweave.cli import main
 from mapweave.exit_status import NO
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.map_difference import difference
 from mapweave.mapserver.map_files import merged_of

@@ -19,7 +19,8 @@ from mapweave.drawing.map_picture import (
     outline_of,
 )
 from mapweave.drawing.names import CELL, NamePlacement
-from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.sim.floorplan import FloorPlan, Rectangle
 

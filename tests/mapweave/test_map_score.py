@@ -21,7 +21,8 @@ from mapweave.evaluation.map_score import (
     same_place,
     score_map,
 )  # fmt: skip
-from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.sim.floorplan import Rectangle, distances_to
 

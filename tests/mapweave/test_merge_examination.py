@@ -21,7 +21,7 @@ from mapweave.cli import main
 from mapweave.evaluation.merging import changes
 from mapweave.evaluation.pieces import OVERLAP, cut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.camera import WEBCAM
 from mapweave.sim.renderer import Renderer

@@ -20,7 +20,7 @@ from mapweave.agent.replication.replicator import Replicator
 from mapweave.cli import main
 from mapweave.exit_status import DONE, NO
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.children import Children
 from mapweave.wire.bus_settings import BusSettings

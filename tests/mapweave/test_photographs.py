@@ -16,7 +16,7 @@ from mapweave.exit_status import FAILED, USAGE
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty
 from mapweave.offline_relocalization import relocalizer_of, view_of

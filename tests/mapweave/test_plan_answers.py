@@ -11,7 +11,7 @@ from mapweave.commands.relocalize import _json, _print
 from mapweave.commands.status import COLUMNS, cells
 from mapweave.hybridmap.agent_status import AgentStatus, RobotEntry, Status
 from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlan, PlanImage, PlanPair, PlanPart
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from tests.mapserver.stub_services import ANSWER
 

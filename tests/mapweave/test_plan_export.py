@@ -12,7 +12,7 @@ from ruamel.yaml import YAML
 
 from mapweave.formats.plan_export import FORMATS, export_json, export_nav2, export_rmf, export_tf, plan_words
 from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlan, PlanImage, PlanPair
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.mapserver.floor_plans import check_plan
 from mapweave.merge.pose_graph.component import Component

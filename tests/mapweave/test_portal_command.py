@@ -9,7 +9,7 @@ import pytest
 
 from mapweave.agent.settings import PortalSettings
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.processes.portal_command import PortalCommand
 from tests.waiting import eventually

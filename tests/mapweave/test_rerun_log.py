@@ -25,7 +25,7 @@ from mapweave.cli import main
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.fleet import Stage
 from mapweave.scenarios.scenario import load_scenario, scenario_path

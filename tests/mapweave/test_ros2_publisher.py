@@ -16,8 +16,8 @@ import pytest
 from mapweave.agent.drivers.checked import CheckedRobot
 from mapweave.agent.mission import Carried
 from mapweave.commands.agent import open_robot, ros2_link
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes import ros2_publisher
 from mapweave.processes.agent import AgentOptions

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.http.live import LOADING, NOT_THERE
 from mapweave.storage.map_file import MapFile, write_map_file
 from synthetic.maps import looking_around, map_tours

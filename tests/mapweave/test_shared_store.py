@@ -18,7 +18,7 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.cli import main
 from mapweave.hybridmap.change import ChangeBody, NodeRetired
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.opened_map import open_map

@@ -8,8 +8,9 @@ from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredArea, RetiredNodes, Subject
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import EdgeId, MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.manual_constraints import apply_constraints
 from mapweave.merge.merging import MergeCache, decide

@@ -10,8 +10,8 @@ import pytest
 from mapweave.hybridmap.change import NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart, RetiredMap
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.merge.islands import Islands
 from mapweave.merge.manual_constraints import apply_constraints

@@ -11,8 +11,8 @@ import pytest
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.merge import islands as islands_module
 from mapweave.merge.islands import Islands
 from mapweave.merge.pose_graph import component_solver

@@ -12,8 +12,9 @@ from mapweave.hybridmap.annotation import Annotation, Annotations, Floor
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.annotator import check_annotation
 from mapweave.mapserver.map_files import map_file_of, merged_of

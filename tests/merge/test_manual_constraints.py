@@ -7,8 +7,9 @@ import pytest
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import Apart
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.explanation.map_explanation import explain_maps

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.pose_graph.links import Link, RefusedLink

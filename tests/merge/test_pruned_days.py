@@ -11,7 +11,7 @@ import pytest
 
 from mapweave.hybridmap.change import NodeRetired
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component import Component, solve_graph
 from mapweave.merge.pose_graph.factors import Measurement

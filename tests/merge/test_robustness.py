@@ -8,7 +8,8 @@ import pytest
 
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.pose_graph.component import solve_graph

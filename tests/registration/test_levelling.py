@@ -7,7 +7,8 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.registration.levelling import level
 from mapweave.registration.recognition import recognise, register

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, averaged
 from mapweave.registration.planar_pose import PlanarPoseSettings
 from mapweave.registration.pose_refinement import refine_pose

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.registration import recognition
 from mapweave.registration.recognition import (

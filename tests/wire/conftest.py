@@ -14,7 +14,8 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.descriptor import quantise
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import FURTHEST, LONGEST, MOST, TrajectorySegment

@@ -17,7 +17,8 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.node import Edge, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.wire.codec import decode_body, decode_change, element_of, encode_body, encode_change
 

@@ -34,8 +34,9 @@ from mapweave.hybridmap.explanation import (
     RouteExplanation,
     Standing,
 )
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
-from mapweave.hybridmap.node import MapId, Node, NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import ExplainRequest
 from mapweave.wire.codec import encode_body

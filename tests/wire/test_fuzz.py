@@ -26,8 +26,9 @@ from mapweave.hybridmap.explanation import (
     PairExplanation,
     Standing,
 )
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
-from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.node import EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import (
     Certainty,

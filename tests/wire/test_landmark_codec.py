@@ -18,8 +18,9 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.descriptor import encode
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.landmark_tables import landmark_tables
-from mapweave.hybridmap.node import Landmarks, Node, NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.ranges import Ranges

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.messages import decode, encode
 

@@ -19,9 +19,10 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.constraint_subject import Ends
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
-from mapweave.hybridmap.node import EdgeKind, MapId, NodeId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
 from mapweave.wire import typed

@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import LIMITS, KeptHistory, KeptPruned, KeptPruning
 from tests.wire import plain_decoder

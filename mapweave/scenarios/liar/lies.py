@@ -14,9 +14,10 @@ import numpy as np
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.descriptor import decode, quantise
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.landmark_tables import DIMENSIONS
 from mapweave.hybridmap.limits import MAX_LANDMARKS, MAX_NUMBER
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.registration.matching import match
 from mapweave.wire.codec import encode_body, encode_change, wrap_body

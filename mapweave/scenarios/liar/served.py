@@ -11,7 +11,7 @@ from types import TracebackType
 import numpy as np
 
 from mapweave.hybridmap.agent_status import FleetStatus
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.mapserver.relocalization.verdict import FLOOR_HEADING, FLOOR_XY, GATE

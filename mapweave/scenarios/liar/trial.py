@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
 from mapweave.scenarios.liar.lies import WAYS, Lie, Map, Setting, bodies, honest, messages

@@ -16,7 +16,8 @@ from mapweave.agent.pipeline import Pipeline
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, EdgePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.wire.codec import decode_body, encode_body

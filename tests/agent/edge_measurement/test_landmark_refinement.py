@@ -18,7 +18,8 @@ from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import CODE_BYTES, Landmarks, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import CODE_BYTES, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.wire.codec import decode_body, encode_body
 

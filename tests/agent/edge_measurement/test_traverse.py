@@ -13,7 +13,7 @@ from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
 ROBOT = RobotDescription(Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3))

@@ -22,7 +22,7 @@ from mapweave.agent.mapping.episode import Move
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from tests.agent.ranged_body import BEARINGS, BODY
 

@@ -13,7 +13,7 @@ from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Command
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 
 

@@ -19,7 +19,8 @@ from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import KnownAnswer
 

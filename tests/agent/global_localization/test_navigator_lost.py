@@ -17,7 +17,7 @@ from mapweave.agent.observation import Observation, Odometry
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer
 from synthetic.world import take_map

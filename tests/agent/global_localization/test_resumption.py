@@ -16,7 +16,8 @@ from mapweave.agent.global_localization.search_policy import TO_MAP, SearchPolic
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import CODE_BYTES, MapId
+from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.node import CODE_BYTES
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.vision.sift import Features
 from synthetic.world import CAMERA, World, room, take_map, take_view

@@ -13,7 +13,8 @@ from mapweave.agent.localization import place_recognition
 from mapweave.agent.localization.place_recognition import aliased_places, recognise_places
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Landmarks, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Landmarks
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
 from synthetic.world import CAMERA, World, room, take_map, take_view

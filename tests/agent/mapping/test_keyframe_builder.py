@@ -12,7 +12,8 @@ from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.edge_limits import unmeasurable
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.registration.selection import SelectionSettings
 

@@ -14,7 +14,7 @@ from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.settings import AgentSettings, TrackerSettings, TrackingSettings
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.lens import Lens
 

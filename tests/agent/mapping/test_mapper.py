@@ -12,7 +12,7 @@ from mapweave.agent.mapping import keyframe_builder
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.change import EdgePut, NodePut
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.registration.selection import choose
 from mapweave.vision.lens import Lens

@@ -11,7 +11,8 @@ import pytest
 from mapweave.agent.mapping.node_retirement import EVERY, KEPT, NodeRetirement, Released, alone
 from mapweave.hybridmap.change import EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.reachability import FARTHEST, WIDEST
 from mapweave.hybridmap.superseding import CROWD

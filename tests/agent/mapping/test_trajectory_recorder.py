@@ -10,7 +10,7 @@ import pytest
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
 from mapweave.agent.observation import Observation, Odometry
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.trajectory_segment import MOST
 

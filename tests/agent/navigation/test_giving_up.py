@@ -8,7 +8,7 @@ from mapweave.agent.mission import Answer, Question, WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER
 from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.settings import NavigatorSettings
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteAnswer
 from tests.agent.scripted_fleet import (

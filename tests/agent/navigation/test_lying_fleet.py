@@ -18,7 +18,7 @@ from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.navigation.answer_trial import TRIALS, AnswerTrial
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.settings import NavigatorSettings
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import RouteAnswer
 from synthetic.world import take_map

@@ -14,7 +14,8 @@ from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.drive_statistics import DriveStatistics
-from mapweave.hybridmap.node import EdgeKind, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, Obstacle, RelocalizeAnswer, RouteAnswer, RouteLeg
 from synthetic.world import World, take_map

@@ -14,7 +14,8 @@ from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Obstacle
 from tests.agent.scripted_fleet import BODY, FREE, IMAGE, WALL_AHEAD, A

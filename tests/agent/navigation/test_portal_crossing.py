@@ -14,7 +14,7 @@ from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.observation import Command
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteAnswer

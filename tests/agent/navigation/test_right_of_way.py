@@ -17,8 +17,8 @@ from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import NavigatorSettings
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.nearby import NearbyRequest
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
 from mapweave.mapserver.nearby import Nearby

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from mapweave.agent.replication.epochs import FOUR_DIGITS, LARGEST, newest_on_server, next_epoch
 from mapweave.hybridmap.errors import InvalidMessage
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.bus import Request

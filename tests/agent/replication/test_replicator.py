@@ -14,7 +14,7 @@ from mapweave.agent.replication.journal import Draft, Journal
 from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
 from mapweave.hybridmap.change import ChangeBody, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.wire.bus import Sample
 from mapweave.wire.codec import decode_change
 from mapweave.wire.keys import Keys

@@ -16,8 +16,8 @@ from mapweave.agent.replication.view_keeper import MOST_WAITING, ViewKeeper
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.view_image import MAX_BYTES, ViewImage, ViewRequest
 from mapweave.processes.agent import Agent, AgentOptions

@@ -17,7 +17,7 @@ from mapweave.agent.runner import Runner
 from mapweave.agent.sensor_health.sensor_monitor import FIRST_TRIAL, TRIAL_SIDE, Fault
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.simulation import Simulation

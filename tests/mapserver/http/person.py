@@ -9,7 +9,7 @@ import numpy as np
 
 from mapweave.hybridmap.annotation import Annotation
 from mapweave.hybridmap.change import ChangeBody
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.server import MapServer
 from synthetic.maps import map_tours

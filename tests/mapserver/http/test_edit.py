@@ -13,7 +13,7 @@ import pytest
 from mapweave.hybridmap.annotation import Closure, Floor, Pin, Place, Preference
 from mapweave.hybridmap.area import inside
 from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredArea, RetiredMap
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web

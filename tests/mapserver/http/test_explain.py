@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.errors import Busy
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
-from mapweave.hybridmap.node import NodeId
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.route_explaining import explain_route

@@ -22,8 +22,8 @@ from websockets.sync.client import ClientConnection, connect
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
 from mapweave.hybridmap.annotation import Annotation, Annotations, Floor
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.http.live import MOST_VIEWERS, Live

@@ -13,8 +13,8 @@ import pytest
 import scipy.sparse as sparse
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.last_shown import NOTHING, LastShown, read_shown, write_shown

@@ -11,7 +11,7 @@ import pytest
 from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
 from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
 from mapweave.hybridmap.errors import Busy, InvalidValue
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, SimilarPlace
 from mapweave.mapserver.http.web import Web
 from tests.browser import PROGRAMS, Browser, there_is_none

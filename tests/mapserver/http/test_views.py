@@ -13,8 +13,8 @@ import pytest
 from mapweave.agent.observation import Observation
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.node import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.server import MapServer

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.errors import Busy
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.http.web import Web
 from tests.mapserver.http.client import ask, post
 from tests.mapserver.stub_services import ANSWER, StubServices, picture, two_maps

@@ -14,7 +14,8 @@ from mapweave.agent.replication.replicator import ReplicationSettings, Replicato
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log.agent_log import PullSettings
 from mapweave.mapserver.log.ingest import Ingest

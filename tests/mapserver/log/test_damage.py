@@ -17,8 +17,8 @@ from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
-from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.explainer import ConstraintRecord
 from mapweave.mapserver.log import sql_store
 from mapweave.mapserver.log.entry import Traffic

@@ -15,8 +15,8 @@ from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
-from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.explainer import ConstraintRecord
 from mapweave.mapserver.log import group_commit, postgres_follower

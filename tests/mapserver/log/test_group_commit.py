@@ -12,7 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.errors import InvalidFile, MapweaveError
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.agent_log import AgentLog, PullSettings
 from mapweave.mapserver.log.entry import Applied, Entry
 from mapweave.mapserver.log.group_commit import GroupCommit, NextRun

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from mapweave.hybridmap.change import Change
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.agent_log import AgentLog, PullSettings
 from mapweave.mapserver.log.entry import Applied, Entry
 from mapweave.mapserver.log.ingest_settings import IngestSettings

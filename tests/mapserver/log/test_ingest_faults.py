@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
 from mapweave.hybridmap.change import Change, EdgePut
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.mapserver.log.agent_log import PullSettings
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.ingest_settings import IngestSettings

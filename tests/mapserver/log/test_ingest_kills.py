@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.replication.journal import Journal
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import encode_change
 
@@ -45,7 +45,8 @@ from pathlib import Path
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.change import EdgePut
-from mapweave.hybridmap.node import Edge, EdgeKind, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys

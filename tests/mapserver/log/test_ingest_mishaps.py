@@ -11,7 +11,7 @@ import pytest
 
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import InvalidFile, MapweaveError
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.store import Run
 from mapweave.wire.bus import Request
 from mapweave.wire.codec import MAX_CHANGE_BYTES

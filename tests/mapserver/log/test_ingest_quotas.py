@@ -14,7 +14,7 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log import ingest, intake, kept_bytes, known_logs, pull_schedule, pulled
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.intake import ADVICE

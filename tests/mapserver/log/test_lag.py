@@ -5,7 +5,7 @@ from __future__ import annotations
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.agent_log import MOST_ANNOUNCED, AgentLog, PullSettings
 from mapweave.mapserver.log.entry import Applied
 

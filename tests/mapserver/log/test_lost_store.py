@@ -10,7 +10,7 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
 from mapweave.hybridmap.change import ChangeBody, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
 from mapweave.wire.keys import Keys

@@ -21,7 +21,7 @@ from hypothesis.stateful import (
 from mapweave.cli import main
 from mapweave.hybridmap.change import Change, ChangeBody, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue, MapweaveError
-from mapweave.hybridmap.node import EdgeId, MapId, NodeId
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.mapserver.log.entry import Applied, Entry
 from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.postgres_store import PostgresStore

@@ -22,7 +22,7 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
 from mapweave.hybridmap.change import NodeRetired
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.ingest_settings import IngestSettings
 from mapweave.mapserver.log.sqlite_store import SqliteStore

@@ -16,7 +16,8 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue, MapweaveError
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log import sql_store, sqlite_store
 from mapweave.mapserver.log.entry import Applied, Entry

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut
-from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.pose_graph.merged_map import MergedMap

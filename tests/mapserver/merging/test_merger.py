@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut, NodeRetired
-from mapweave.hybridmap.node import EdgeKind, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty
 from mapweave.hybridmap.route import RouteSettings

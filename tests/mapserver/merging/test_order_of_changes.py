@@ -12,7 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.change import Change, ChangeBody, NodePut, NodeRetired
-from mapweave.hybridmap.node import MapId, Node
+from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.node import Node
 from mapweave.mapserver.merging import node_comparisons
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.outlier_rejection import wrong_geometry

@@ -16,8 +16,8 @@ from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredNodes
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.pruned_node import PrunedNode, PrunedNodes
 from mapweave.mapserver.log.entry import Entry

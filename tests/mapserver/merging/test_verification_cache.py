@@ -11,8 +11,8 @@ import pytest
 
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.merging import verification_cache_keeper
 from mapweave.mapserver.merging.merger import Merger

@@ -20,7 +20,7 @@ import pytest
 import numpy as np
 from synthetic.maps import map_tours, write_store
 from synthetic.world import room
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.server import MapServer
 from mapweave.wire.keys import Keys

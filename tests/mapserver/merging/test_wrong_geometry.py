@@ -7,8 +7,8 @@ from collections import Counter
 import pytest
 
 from mapweave.hybridmap.constraint_subject import RetiredMap
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merging.merger import Merger

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.relocalization.aliased_landmarks import AliasedLandmarks, unexplained

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import Change, NodePut
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.mapserver.merge_worker import PREPARED_AT_ONCE, MergeWorker

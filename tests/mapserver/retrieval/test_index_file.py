@@ -12,7 +12,8 @@ from hypothesis import strategies as st
 
 from mapweave.hybridmap.change import Change, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.log.entry import Entry, Position

@@ -5,7 +5,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.node import Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.retrieval.place_database import SECOND, SETTLED, PlaceDatabase
 from synthetic.world import room, take_node, take_view

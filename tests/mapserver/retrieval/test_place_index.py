@@ -9,7 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.descriptor import decode, quantise
-from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.retrieval import place_index, ranking

@@ -16,7 +16,7 @@ import pytest
 
 from mapweave.commands.network import server_settings
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
-from mapweave.hybridmap.node import MapId
+from mapweave.hybridmap.ids import MapId
 from mapweave.identities.authority import Authority
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder, Profile

@@ -10,7 +10,8 @@ import pytest
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import EdgePut, NodePut
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.scenarios.recording import Fix, Lost, Moment, Recording, RobotRecord, Trajectory
 from mapweave.sim.floorplan import FloorPlan, Rectangle

@@ -8,7 +8,8 @@ import pytest
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore

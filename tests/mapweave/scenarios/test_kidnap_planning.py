@@ -11,7 +11,8 @@ import pytest
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import EdgePut, EdgeRetired, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.scenarios.kidnap_planning import (
     CLEARANCE,

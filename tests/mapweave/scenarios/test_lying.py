@@ -10,7 +10,8 @@ import pytest
 
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import SettingsError
-from mapweave.hybridmap.node import Edge, EdgeKind, MapId
+from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log.entry import Entry
 from mapweave.scenarios.actions import Lie, parse_action

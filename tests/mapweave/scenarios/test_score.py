@@ -17,7 +17,8 @@ from evo.main_rpe import rpe
 
 from mapweave.evaluation.map_score import align, pose_error
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.node import EdgeKind, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.recording import Fix, Lost, Trajectory
 from mapweave.scenarios.score import fleet_hash, pose_at, score

@@ -7,8 +7,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from mapweave.hybridmap.constraint_subject import RetiredMap
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.explanation.map_standing import map_standings
 from synthetic.maps import changes_of, looking_around, merger_of

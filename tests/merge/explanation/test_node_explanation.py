@@ -13,8 +13,9 @@ from mapweave.hybridmap.constraint_subject import Apart, RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import Standing
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints, reason_of
-from mapweave.hybridmap.node import Edge, EdgeKind, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.explanation.component_changes import joined_maps, joinings, partings

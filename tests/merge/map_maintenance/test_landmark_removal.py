@@ -12,7 +12,7 @@ import pytest
 from mapweave.hybridmap import superseding
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.mapserver.active_nodes import without_faded
 from mapweave.mapserver.merging.merger import Merger

@@ -11,8 +11,8 @@ import pytest
 
 from mapweave.hybridmap.change import Change, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty
 from mapweave.hybridmap.reachability import FARTHEST, WIDEST, least_in_view

@@ -13,7 +13,8 @@ from mapweave.agent.observation import Command
 from mapweave.agent.pipeline import Pipeline
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.node import Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment

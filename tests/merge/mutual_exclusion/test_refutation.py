@@ -10,7 +10,8 @@ import pytest
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.merge.merging import MergeCache, decide, merge_maps
 from mapweave.merge.mutual_exclusion.refutation import Refutation

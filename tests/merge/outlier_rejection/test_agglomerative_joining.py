@@ -1,6 +1,6 @@
 """Which pieces of map are joined first."""
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.merge.outlier_rejection.agglomerative_joining import joined
 
 K = [NodeId("a", 1, k) for k in range(6)]

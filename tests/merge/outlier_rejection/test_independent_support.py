@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.outlier_rejection.independent_support import (

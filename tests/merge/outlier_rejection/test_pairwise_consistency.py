@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.explanation import ALIASED
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection.max_clique import best_clique, independent_links
 from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances2, sort_links

@@ -8,7 +8,8 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, Landmarks, MapId, Node, NodeId
+from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.outlier_rejection.segmentation import fragments_of

@@ -9,7 +9,8 @@ import networkx as nx
 import numpy as np
 
 from mapweave.hybridmap.descriptor import decode
-from mapweave.hybridmap.node import Edge, Node, NodeId
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Edge, Node
 from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_HOPS, LEAST_OVERLAP, MOST_PER_MAP, Pair, overlap
 from mapweave.registration.matching import squared_distances
 

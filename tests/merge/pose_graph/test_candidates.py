@@ -3,7 +3,7 @@
 import numpy as np
 
 from mapweave.hybridmap.descriptor import decode
-from mapweave.hybridmap.node import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.pose_graph.candidates import overlap
 from synthetic.world import room, take_map, take_node

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.node import Edge, EdgeId, EdgeKind, NodeId
+from mapweave.hybridmap.ids import EdgeId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.pairs import PairTable

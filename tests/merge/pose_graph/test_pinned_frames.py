@@ -9,8 +9,8 @@ import pytest
 
 from mapweave.hybridmap.constraint_subject import Apart, RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import MapId, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.mapserver.merging.merger import Merger

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 
-from mapweave.hybridmap.node import NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.pose_graph import solved_graph
 from mapweave.merge.pose_graph.component import solve_graph
