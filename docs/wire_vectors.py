@@ -259,6 +259,7 @@ def map_file() -> MapFile:
         constraints(), {FAR: Superseded(NODE, 34, 0.25, -0.5)}, {FAR: np.array([True, False, True])},
         (MapEvent(STAMP, MapEventKind.JOINED, "r0.3 and r1.1 are one map now, by 4 links"),),
         annotations(), {FAR: 4}, {"0f" * 32: b"\x89PNG"},
+        {FAR.map: "change 9 is refused (edge r1.1.4 is 99000 m long, more than 1000 m)"},
     )  # fmt: skip
 
 

@@ -34,6 +34,7 @@ class BaseMap:
         annotations: what people say about them.
         history: of these maps.
         images: of floor plans, by their names.
+        refused_changes: maps of which a server refused a change, and why.
     """
 
     name: str = ""
@@ -42,6 +43,7 @@ class BaseMap:
     annotations: Annotations = field(default_factory=Annotations)
     history: tuple[MapEvent, ...] = ()
     images: Mapping[str, bytes] = field(default_factory=dict)
+    refused_changes: Mapping[MapId, str] = field(default_factory=dict)
 
     @staticmethod
     def of(name: str, content: MapFile) -> BaseMap:
@@ -53,6 +55,7 @@ class BaseMap:
             Annotations(content.annotations),
             content.history,
             content.images,
+            content.refused_changes,
         )
 
     def __str__(self) -> str:

@@ -11,6 +11,7 @@ lines are sorted, each ends with a line feed, and the hash is the SHA-256 of thi
     superseded   MessagePack [node, the node that replaces it]
     faded        MessagePack [node, the flags of its landmarks]
     retired      MessagePack [node, the number of the constraint that retires it]
+    unlinked     MessagePack [map of which a server refused a change]
 
 What follows from these is left out: poses and probabilities, which are computed again whenever a file is
 read, and words for people (title, reasons, history).
@@ -59,6 +60,8 @@ def _items(content: MapFile) -> Iterator[tuple[str, bytes]]:
         yield "faded", _packed([node, flags])
     for node, number in content.retired.items():
         yield "retired", _packed([node, number])
+    for map_id in content.refused_changes:
+        yield "unlinked", _packed([map_id])
 
 
 def _packed(item: list[Any]) -> bytes:

@@ -59,6 +59,7 @@ def map_file_of(
         (annotations or Annotations()).made,
         _numbered(merged.constraints),
         dict(images or {}),
+        dict(merged.refused_changes),
     )
 
 
@@ -104,6 +105,7 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
         constraints,
         superseded,
         faded,
+        refused_changes=content.refused_changes,
     )
     return PinnedFrames().moved(merged, Annotations(content.annotations).pins)
 

@@ -150,6 +150,8 @@ class MapServer:
         self._pins, self._floors = self._annotations.annotations.pins, self._annotations.annotations.floors
         self._constrain()
         self._worker.pin(self._pins)
+        for map_id, reason in self._base.refused_changes.items():
+            self._worker.note_refusal(map_id, reason)
         self._path = path
         self._admission = AdmissionControl(
             s.admission_control, clock.monotonic, clock.executor(s.admission_control.threads)

@@ -59,7 +59,9 @@ def extract_maps(source: Path | str, folder: Path) -> tuple[list[Extracted], str
         hybrid = maps.get(map_id, HybridMap())
         written = paths[map_id] if hybrid.nodes or hybrid.edges else None
         if written is not None:
-            write_map_file(written, MapFile("agent", str(map_id), tuple(hybrid.contents())))
+            refused = {m: why for m, why in opened.content.refused_changes.items() if m == map_id}
+            content = MapFile("agent", str(map_id), tuple(hybrid.contents()), refused_changes=refused)
+            write_map_file(written, content)
         complaint = opened.complaints.get(map_id, "")
         extracted.append(Extracted(map_id, written, len(hybrid.nodes), len(hybrid.edges), complaint))
     return extracted, opened.complaints.get(None, ""), str(opened.path)

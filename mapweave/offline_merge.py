@@ -45,6 +45,7 @@ class Parts:
         annotations: what people say about them in any of the files.
         images: of floor plans, by their names, in any of the files.
         marginals: links that are left of nodes which a server has pruned, in any of the files.
+        refused_changes: maps of which a server refused a change, and why, in any of the files.
     """
 
     maps: dict[MapId, HybridMap]
@@ -54,6 +55,7 @@ class Parts:
     annotations: Annotations = field(default_factory=Annotations)
     images: Mapping[str, bytes] = field(default_factory=dict)
     marginals: tuple[Edge, ...] = ()
+    refused_changes: Mapping[MapId, str] = field(default_factory=dict)
 
 
 def parts_of(files: Mapping[Path, MapFile] | Mapping[Path | str, MapFile]) -> Parts:
@@ -69,7 +71,8 @@ def parts_of(files: Mapping[Path, MapFile] | Mapping[Path | str, MapFile]) -> Pa
     origin: dict[MapId, Path | str] = {}
     constraints = ManualConstraints()
     notes: list[str] = []
-    for path, content in sorted(files.items(), key=lambda file: str(file[0])):
+    ordered = sorted(files.items(), key=lambda file: str(file[0]))
+    for path, content in ordered:
         if not content.changes:
             notes.append(f"there is nothing in {path}")
         for map_id, hybrid_map in sorted(maps_of(content).items()):
@@ -89,7 +92,10 @@ def parts_of(files: Mapping[Path, MapFile] | Mapping[Path | str, MapFile]) -> Pa
     images = {name: png for content in files.values() for name, png in content.images.items()}
     marginals = {edge.id: edge for content in files.values() for edge in marginal_links(content)}
     constraints = constraints.with_floors(said.floors)
-    return Parts(maps, constraints, tuple(notes), tuple(history), said, images, tuple(marginals.values()))
+    refused = {which: why for _, content in ordered for which, why in content.refused_changes.items()}
+    return Parts(
+        maps, constraints, tuple(notes), tuple(history), said, images, tuple(marginals.values()), refused
+    )
 
 
 def _length(hybrid_map: HybridMap) -> int:
@@ -120,6 +126,7 @@ def merge_parts(
     pins: Sequence[Pin] = (),
     marginals: Iterable[Edge] = (),
     standing: Iterable[Pair] = (),
+    refused_changes: Mapping[MapId, str] | None = None,
 ) -> MergedMap:
     """Merge robots' maps as the map server does.
 
@@ -132,6 +139,7 @@ def merge_parts(
         pins: that hold frames, oldest first.
         marginals: links that are left of nodes which a server has pruned.
         standing: verified links that this server no longer decides again, by their nodes.
+        refused_changes: maps of which a server refused a change, and why.
 
     Raises:
         InvalidValue: a map cannot be merged; writing the others would lose it.
@@ -139,6 +147,8 @@ def merge_parts(
     merger = Merger(settings=settings)
     merger.constrain(constraints)
     merger.pin(pins)
+    for map_id, reason in (refused_changes or {}).items():
+        merger.note_refusal(map_id, reason)
     merger.restore_pruning(Pruning([link_of(edge) for edge in marginals], standing))
     changes = [
         (map_id, change) for map_id, hybrid_map in sorted(maps.items()) for change in hybrid_map.contents()
@@ -169,6 +179,7 @@ def merge_map_files(paths: Iterable[str | PathLike[str]]) -> MapFile:
     """
     parts = parts_of({Path(path): read_map_file(Path(path)) for path in paths})
     merged = merge_parts(
-        parts.maps, parts.constraints, pins=parts.annotations.pins, marginals=parts.marginals
-    )
+        parts.maps, parts.constraints, pins=parts.annotations.pins, marginals=parts.marginals,
+        refused_changes=parts.refused_changes,
+    )  # fmt: skip
     return map_file_of(merged, parts.history, parts.annotations, parts.images)

@@ -102,7 +102,10 @@ class OpenedMap:
         of_store = self.path if self.source is MapSource.STORE and isinstance(self.path, Path) else None
         pins = Annotations(self.content.annotations).pins
         marginals = marginal_links(self.content)
-        return merge_parts(maps, constraints, progress, settings, of_store, pins, marginals, self.standing)
+        return merge_parts(
+            maps, constraints, progress, settings, of_store, pins, marginals, self.standing,
+            self.content.refused_changes,
+        )  # fmt: skip
 
     def file(self, merged: MergedMap) -> MapFile:
         """The content of a map file that holds the whole map.
@@ -228,6 +231,7 @@ def _of_salvaged(
         history=tuple(event for record in history for event in record.events),
         annotations=tuple(annotations),
         images=images(Annotations(tuple(annotations))),
+        refused_changes=salvaged.refused_changes,
     )
     complaint = _lost(path, salvaged, bad + worse + worst + wrong)
     maps = tuple(sorted(salvaged.maps))

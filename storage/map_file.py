@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.annotation import Annotation
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
-from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import Number, Words
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.map_event import MapEvent
@@ -85,6 +85,7 @@ class MapFile:
         history: of a merged map: what has become of its maps by itself, in order.
         annotations: what people say about the map, in order.
         images: PNG files of floor plans, by their SHA-256.
+        refused_changes: maps of which a server refused a change, and why: they are joined with no other.
     """
 
     kind: Kind
@@ -99,6 +100,7 @@ class MapFile:
     annotations: tuple[Annotation, ...] = ()
     retired: Mapping[NodeId, Number] = field(default_factory=dict)
     images: Mapping[str, bytes] = field(default_factory=dict)
+    refused_changes: Mapping[MapId, Words] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         """Refuse faded landmarks that the nodes do not have, and unknown constraints (InvalidValue)."""

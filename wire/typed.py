@@ -242,7 +242,7 @@ def _schema(kind: Any) -> Any:
     msgspec would read a dataclass itself, without the forms of the types within.
     """
     origin, inner = get_origin(kind), get_args(kind)
-    by_id = origin is Mapping and inner[0] is NodeId
+    by_id = origin is Mapping and inner[0] in (NodeId, MapId)
     if kind in FORMS or is_dataclass(kind) or origin is np.ndarray or by_id:
         return _opaque(kind)
     if origin is None or origin is Literal:

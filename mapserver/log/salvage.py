@@ -11,10 +11,12 @@ from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
+from mapweave.mapserver.log.entry import words_of
 from mapweave.mapserver.log.integrity import checksum
 from mapweave.mapserver.log.store import HISTORY, Store
 from mapweave.storage.database_reader import reading
 from mapweave.wire.codec import decode_body
+from mapweave.wire.log_messages import Refusal
 
 
 @dataclass(frozen=True)
@@ -28,6 +30,7 @@ class Salvage:
         constraints: the manual constraints that are good, encoded, in order.
         annotations: the annotations that are good, likewise.
         results: the server's own results that are good, by name.
+        refused_changes: maps of which a change was refused, and why the first one was.
     """
 
     maps: dict[MapId, HybridMap]
@@ -36,6 +39,7 @@ class Salvage:
     constraints: tuple[bytes, ...]
     annotations: tuple[bytes, ...]
     results: dict[str, bytes]
+    refused_changes: dict[MapId, str]
 
 
 def salvage(path: Path) -> Salvage:
@@ -58,6 +62,7 @@ def all_of(store: Store) -> Salvage:
     return Salvage(
         maps, 0, True, tuple(store.constraints()), tuple(store.annotations()),
         {} if history is None else {HISTORY: history},
+        {m: words_of(refusal) for m in store.maps() for refusal in store.refusals(m)[:1]},
     )  # fmt: skip
 
 
@@ -85,10 +90,16 @@ def _read(connection: sqlite3.Connection, path: Path) -> Salvage:
     constraints, constraints_whole = _good(connection, "manual_constraint")
     annotations, annotations_whole = _good(connection, "annotation")
     results, results_whole = _good(connection, "result")
+    refused, refused_whole = _good(connection, "refused")
+    refused_changes: dict[MapId, str] = {}
+    for agent, epoch, sequence, reason, _ in refused:
+        refused_changes.setdefault(MapId(agent, epoch), words_of(Refusal(sequence, reason)))
     return Salvage(
-        maps, damaged, not error and constraints_whole and annotations_whole and results_whole,
+        maps, damaged,
+        not error and constraints_whole and annotations_whole and results_whole and refused_whole,
         tuple(bytes(body) for _, body in constraints), tuple(bytes(body) for _, body in annotations),
         {str(name): bytes(value) for name, value in results},
+        refused_changes,
     )  # fmt: skip
 
 

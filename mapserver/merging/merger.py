@@ -272,6 +272,7 @@ class Merger:
             set_apart=self._set_apart(),
             copies={which: self._kept[which] for which in self._copied},
             wrong=self._wrong,
+            refused_changes={m: why for m, why in self._implausible.refused.items() if m in kept},
             pruned=self.pruning.pruned,
         )
         if use is not None:

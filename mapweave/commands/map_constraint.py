@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -133,8 +134,8 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
         return
     print(words)
     parts = parts_of({arguments.map: content})
-    constraints = parts.constraints + ManualConstraints([constraint])
-    merged = merged_with_progress(parts.maps, constraints, settings, parts.annotations.pins)
+    parts = replace(parts, constraints=parts.constraints + ManualConstraints([constraint]))
+    merged = merged_with_progress(parts, settings)
     out = arguments.out or arguments.map
     history = (*parts.history, *between(before, merged, constraint.stamp_ns))
     write_map_file(out, map_file_of(merged, history, parts.annotations, parts.images))

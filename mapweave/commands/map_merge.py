@@ -4,20 +4,15 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.map_input import SOURCES, map_source, opened
 
 if TYPE_CHECKING:
-    from mapweave.hybridmap.hybrid_map import HybridMap
-    from mapweave.hybridmap.ids import MapId
-    from mapweave.hybridmap.manual_constraint import ManualConstraints
-    from mapweave.hybridmap.node import Edge
-    from mapweave.hybridmap.pin import Pin
     from mapweave.merge.pose_graph.merged_map import MergedMap
     from mapweave.merge.settings import MergeSettings
+    from mapweave.offline_merge import Parts
 
 
 def add_to(actions: Any) -> None:
@@ -52,8 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     check_place(arguments.out)
     settings = settings_of(arguments).merge
     parts = parts_of({one.path: one.content for one in map(opened, arguments.files)})
-    pins = parts.annotations.pins
-    merged = merged_with_progress(parts.maps, parts.constraints, settings, pins, parts.marginals)
+    merged = merged_with_progress(parts, settings)
     write_map_file(arguments.out, map_file_of(merged, parts.history, parts.annotations, parts.images))
     joined = joinings((), merged)
     apart = [explanation.reason for explanation in explain_fleet(merged, 20) if not explanation.joined]
@@ -78,16 +72,13 @@ def run(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def merged_with_progress(
-    maps: dict[MapId, HybridMap],
-    constraints: ManualConstraints,
-    settings: MergeSettings | None = None,
-    pins: Sequence[Pin] = (),
-    marginals: Sequence[Edge] = (),
-) -> MergedMap:
+def merged_with_progress(parts: Parts, settings: MergeSettings | None = None) -> MergedMap:
     """Merge, with a bar on stderr for people."""
     from mapweave.commands.map_input import merge_progress
     from mapweave.offline_merge import merge_parts
 
     with merge_progress() as report:
-        return merge_parts(maps, constraints, report, settings, pins=pins, marginals=marginals)
+        return merge_parts(
+            parts.maps, parts.constraints, report, settings, pins=parts.annotations.pins,
+            marginals=parts.marginals, refused_changes=parts.refused_changes,
+        )  # fmt: skip

@@ -136,6 +136,8 @@ class MergedMap:
         wrong: maps with wrong geometry. Their links to other maps are refused for this reason.
         contradicted: links by hand that the rest of the map contradicts, by their nodes, and how.
         pins: people's pins of components' frames, oldest first.
+        refused_changes: maps of which a server refused a change, and why. Their links to other maps are
+            refused, unless a person links the two.
         pruned: superseded nodes that have left the maps. What they measured is in marginal links, see
             mapweave.merge.pose_graph.marginalization.
     """
@@ -155,6 +157,7 @@ class MergedMap:
     wrong: Mapping[MapId, WrongGeometry] = field(default_factory=dict)
     contradicted: Mapping[tuple[NodeId, NodeId], str] = field(default_factory=dict)
     pins: tuple[Pin, ...] = ()
+    refused_changes: Mapping[MapId, str] = field(default_factory=dict)
     pruned: PrunedNodes = field(default_factory=PrunedNodes)
 
     @staticmethod

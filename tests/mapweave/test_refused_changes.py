@@ -1,0 +1,131 @@
+"""A map of which a server refused a change is joined with no other: nor without that server."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapweave.cli import main
+from mapweave.hybridmap.change import ChangeBody, EdgePut
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.mapserver.base_map import BaseMap
+from mapweave.mapserver.content_hash import content_hash
+from mapweave.mapserver.log.entry import words_of
+from mapweave.mapserver.log.salvage import all_of, salvage
+from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.mapserver.own_maps import marginal_links
+from mapweave.mapserver.server import MapServer
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.marginalization import MARGINAL
+from mapweave.opened_map import open_map
+from mapweave.storage.map_file import read_map_file, write_map_file
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from synthetic.maps import LOG_ID, entries_of, fill_store, looking_around, map_tours
+from synthetic.world import room
+
+R0, R1 = MapId("r0", 1), MapId("r1", 1)
+WORDS = "is refused (edge r1.1.98 is 99000 m long"
+
+
+def logs() -> dict[MapId, list[ChangeBody]]:
+    """Two robots in one room."""
+    rng = np.random.default_rng(8)
+    return map_tours(room(0, 0, 5, 4, 700, rng), dict.fromkeys((R0, R1), looking_around(4)), rng)
+
+
+@pytest.fixture(scope="module")
+def stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """A store that has taken all that two robots sent, and one that has refused an edge of the second."""
+    folder, changes = tmp_path_factory.mktemp("stores"), logs()
+    far = PoseGaussian(Pose2(99e3), np.eye(3))
+    edge = Edge(NodeId(*R1, 98), NodeId(*R1, 1), NodeId(*R1, 3), far, EdgeKind.MAPPED)
+    sound, unsound = folder / "sound", folder / "unsound"
+    for path in (sound, unsound):
+        store = SqliteStore(path)
+        fill_store(store, changes)
+        if path is unsound:
+            *_, refused = entries_of(R1, [*changes[R1], EdgePut(edge)])
+            applied = store.apply(R1, LOG_ID, [refused], refused.sequence)
+            assert [WORDS in words_of(one) for one in applied.refusals] == [True]
+        store.close()
+    return sound, unsound
+
+
+def components(path: Path) -> int:
+    """Of a merged map's file."""
+    content = read_map_file(path, "merged")
+    assert len(content.poses) > 6
+    return len({number for number, _ in content.poses.values()})
+
+
+def merged(out: Path, *files: Path) -> Path:
+    assert main(["map", "merge", *map(str, files), "-o", str(out)]) == 0
+    return out
+
+
+def test_a_merge_without_the_server_does_not_join_it(stores: tuple[Path, Path], tmp_path: Path) -> None:
+    sound, unsound = stores
+    assert components(merged(tmp_path / "sound", sound)) == 1
+    whole = merged(tmp_path / "unsound", unsound)
+    assert components(whole) == 2
+    assert {maps: WORDS in why for maps, why in read_map_file(whole).refused_changes.items()} == {R1: True}
+    assert content_hash(open_map(sound).content) != content_hash(open_map(unsound).content)
+    assert any(WORDS in pair.reason for pair in read_map_file(whole).refused), "the reason is in the file"
+    # Nor do files that are made of it: merged again, or taken apart.
+    assert components(merged(tmp_path / "again", whole)) == 2
+    assert main(["map", "extract", str(unsound), "-o", str(tmp_path / "own")]) == 0
+    assert read_map_file(tmp_path / "own" / "r0.1.mapweave").refused_changes == {}
+    apart = merged(tmp_path / "apart", *sorted((tmp_path / "own").iterdir()))
+    assert components(apart) == 2 and read_map_file(apart).refused_changes.keys() == {R1}
+
+
+def test_a_person_who_links_the_two_joins_them(
+    stores: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    whole = merged(tmp_path / "whole", stores[1])
+    pair = next(pair for pair in read_map_file(whole).refused if WORDS in pair.reason)
+    ends = str(pair.a), str(pair.b)
+    assert main(["map", "link", *ends, "--map", str(whole), "--because", "a loose wheel"]) == 0
+    assert components(whole) == 1 and read_map_file(whole).refused_changes.keys() == {R1}
+    assert main(["map", "link", *ends, "--undo", "--map", str(whole)]) == 0
+    assert components(whole) == 2
+    capsys.readouterr()
+
+
+def test_a_correction_keeps_what_is_left_of_pruned_nodes(stores: tuple[Path, Path], tmp_path: Path) -> None:
+    """The links between their neighbours, which no comparison of images finds again."""
+    path = merged(tmp_path / "whole", stores[0])
+    content = read_map_file(path)
+    a, b = NodeId(*R0, 1), NodeId(*R0, 5)
+    left = Link(a, b, PoseGaussian(Pose2(0.5), 0.01 * np.eye(3)), evidence={MARGINAL: 1.0}).edge()
+    write_map_file(path, replace(content, changes=(*content.changes, EdgePut(left))))
+    assert [edge.id for edge in marginal_links(read_map_file(path))] == [left.id]
+    assert main(["map", "unmerge", "r0.1", "r1.1", "--map", str(path), "--because", "two floors"]) == 0
+    assert components(path) > 1
+    assert [(edge.a, edge.b) for edge in marginal_links(read_map_file(path))] == [(a, b)]
+
+
+def test_a_server_that_begins_with_the_file_does_not_join_it(
+    stores: tuple[Path, Path], tmp_path: Path
+) -> None:
+    for store, parts in zip(stores, (1, 2), strict=True):
+        base = BaseMap.of(store.name, open_map(store).content)
+        with MapServer(
+            MemoryBus(MemoryHub()), Keys("base"), tmp_path / store.name, "s0", base=base
+        ) as server:  # fmt: skip
+            assert server.settle(60) and server.status()["components"] == parts
+
+
+def test_a_damaged_store_still_says_which_map(stores: tuple[Path, Path], tmp_path: Path) -> None:
+    sound, unsound = stores
+    assert salvage(sound).refused_changes == {}
+    found = salvage(unsound).refused_changes
+    store = SqliteStore(unsound)
+    assert found.keys() == {R1} and all_of(store).refused_changes == found
+    store.close()
