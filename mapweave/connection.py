@@ -17,6 +17,9 @@ if TYPE_CHECKING:
 
 SOON = 1.0
 """s; a router that is there is found sooner. Commands say within 2 s of their start that there is none."""
+UNHEARD = 0.5
+"""s; a router that opens again, as when keys change, listens sooner. If nothing listens at any endpoint,
+commands wait no longer: on a slow computer loading takes the rest of the 2 s."""
 LOOK = 0.2
 """s; without a router a person learns why in this time more."""
 ANSWERED = 2.0
@@ -36,7 +39,10 @@ def reach(settings: BusSettings, advice: str = "give the endpoint of its router 
     from mapweave.wire.zenoh_bus import ZenohBus
 
     bus = ZenohBus(replace(settings, attempt=SOON / len(settings.endpoints)))
-    if not bus.wait_connected(SOON):
+    found = bus.wait_connected(UNHEARD)
+    if not found and not all(map(_refused, settings.endpoints)):
+        found = bus.wait_connected(SOON - UNHEARD)
+    if not found:
         bus.close()
         where = ", ".join(settings.endpoints)
         refused = not_let_in(settings)
@@ -58,12 +64,30 @@ def not_let_in(settings: BusSettings) -> str:
 
 def _listens(endpoint: str) -> bool:
     """Whether a program takes connections there."""
-    host, _, port = endpoint.partition("/")[2].partition("#")[0].partition("?")[0].rpartition(":")
     try:
-        with socket.create_connection((host.strip("[]"), int(port)), LOOK):
-            return True
+        _try(endpoint)
     except (OSError, ValueError):
         return False
+    return True
+
+
+def _refused(endpoint: str) -> bool:
+    """Whether the computer there says that no program takes connections."""
+    if endpoint.startswith("quic/"):
+        return False
+    try:
+        _try(endpoint)
+    except ConnectionRefusedError:
+        return True
+    except (OSError, ValueError):
+        pass
+    return False
+
+
+def _try(endpoint: str) -> None:
+    host, _, port = endpoint.partition("/")[2].partition("#")[0].partition("?")[0].rpartition(":")
+    with socket.create_connection((host.strip("[]"), int(port)), LOOK):
+        pass
 
 
 def no_server(fleet: str, holder: Credentials | None = None) -> NotConnected:

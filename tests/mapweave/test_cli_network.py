@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import connection
 from mapweave.cli import main
 from mapweave.commands import network
 from mapweave.exit_status import USAGE
@@ -71,6 +72,18 @@ def test_asking_without_a_server(capfd, recording, closed):
     picture = recording / "images" / "0.png"
     output = complaint(capfd, "relocalize", picture, "--connect", closed, "--timeout", "0.3")
     assert f"no router at {closed}: start" in output
+
+
+def test_where_nothing_listens_no_command_waits_for_a_router(capfd, closed, port, monkeypatch):
+    """The answer came after 1 s, of the 2 s that loading on a slow computer has a part of."""
+    waits = []
+    monkeypatch.setattr(ZenohBus, "wait_connected", lambda self, timeout: waits.append(timeout) or False)
+    advice = "start `mapweave server`, or give the endpoint of its router (--connect)"
+    assert f"no router at {closed}: {advice}" in complaint(capfd, "status", "--connect", closed)
+    assert waits == [connection.UNHEARD] and connection.UNHEARD < connection.SOON
+    listens = f"tcp/127.0.0.1:{port}"
+    complaint(capfd, "status", "--connect", closed, listens)
+    assert sum(waits[1:]) == connection.SOON, "it may be a busy router"
 
 
 def test_asking_about_an_image(capfd, recording, tmp_path, closed):
