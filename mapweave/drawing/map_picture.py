@@ -28,6 +28,9 @@ ARROW = 1.0 / 42.0
 """Length of an arrow as a share of the picture's width."""
 ALONG = 16
 """Points along an edge that names keep clear of."""
+LAYOUTS = 2
+"""Passes of the layout: in the first one the axes have not yet the shape of the map, and a title of two lines
+of a wide map was cut at the upper edge."""
 MOST_NODES = 150
 """Nodes whose names are tried: more cannot be told apart in a picture of this width."""
 _PARTS = re.compile(r"[0-9]+|[^0-9]+")
@@ -159,8 +162,10 @@ def draw_map(picture: MapPicture, path: Path) -> None:
         figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     image = io.BytesIO()
-    # Laid out once: matplotlib would do it again, and draw all of it once more, for each file.
-    ConstrainedLayoutEngine().execute(figure)
+    # Laid out here: matplotlib would do it again, and draw all of it once more, for each file.
+    layout = ConstrainedLayoutEngine()
+    for _ in range(LAYOUTS):
+        layout.execute(figure)
     axes.apply_aspect()
     draw_names(axes, _names(picture), _marks(picture))
     figure.savefig(image, format="png")

@@ -74,6 +74,18 @@ def test_the_title_is_written(tmp_path):
     assert dark[1] > dark[0] + 500
 
 
+@pytest.mark.parametrize(
+    "title", ["", "87 nodes, 4 maps", "87 nodes, 4 maps, 2 components\ndrawn: component 0"]
+)
+@pytest.mark.parametrize(("width", "height"), [(1, 1), (24, 3), (24, 11), (10, 9), (3, 24)])
+def test_nothing_is_cut_at_the_edge(tmp_path, title, width, height):
+    """Half of the first line of a title of two lines was outside a picture twice as wide as high."""
+    nodes = {NodeId(f"r{k}", 1, k): Pose2(k % 2 * width, k // 2 * height) for k in range(4)}
+    image = drawn(tmp_path, MapPicture(title, nodes, [], starts={node.agent: nodes[node] for node in nodes}))
+    edges = image[0], image[-1], image[:, 0], image[:, -1]
+    assert all((edge == 255).all() for edge in edges)
+
+
 def test_the_floor_the_landmarks_and_the_drive_are_drawn(tmp_path):
     plan = FloorPlan(
         (Rectangle.spanning(0, -1, 6, 3, "room 0"), Rectangle.spanning(6, 0, 6.2, 1, "door 0")),
