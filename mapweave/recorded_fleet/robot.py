@@ -128,7 +128,13 @@ class RecordedRobot:
         return nodes[::-1] if fresh is None else [fresh]
 
     def _unknown(self, node: NodeId) -> str:
-        return "" if node in self._map.nodes else f"{self._name} is a recording and knows its own map alone"
+        if node in self._map.nodes:
+            return ""
+        if node.agent == self._name:
+            # A copy, since the robot may map one meanwhile.
+            nearest = min(list(self._map.nodes), key=lambda one: abs(one.number - node.number))
+            return f"there is no node {node}; the nearest is {nearest}"
+        return f"{self._name} is a recording and knows its own map alone"
 
     def _way_to(self, goal: NodeId) -> list[NodeId]:
         way: list[NodeId] = nx.shortest_path(self._map.graph, self._nearest(), goal)

@@ -9,14 +9,16 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from urllib.request import Request, urlopen
 
 import pytest
 from websockets.sync.client import connect
 
+from mapweave.fleet import Fleet
 from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.mission_order import MissionState
 from mapweave.hybridmap.node import Node
 from mapweave.mapserver.http.last_shown import NOTHING
 from mapweave.mapserver.http.live import NOT_THERE
@@ -24,9 +26,11 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.node_comparisons import compare
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.merge.pose_graph.verdicts import Verdict
-from mapweave.recorded_fleet.fleet import prepare, split
+from mapweave.recorded_fleet.fleet import RecordedFleet, prepare, split
 from mapweave.recorded_fleet.recording import RECORDING, recorded_maps
 from mapweave.wire.codec import encode_body
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.waiting import eventually, free_port
 
@@ -113,6 +117,23 @@ def test_a_demo_that_is_stopped_while_it_starts_leaves_no_folder(tmp_path: Path,
         server.send_signal(signal.SIGTERM)
         server.communicate(timeout=60)
     assert not [*tmp_path.iterdir()]
+
+
+def test_a_goal_that_is_not_there_is_refused_with_the_reason(tmp_path: Path) -> None:
+    """Of a node of its own map that there is not, a robot said that it knows its own map alone."""
+    prepare(tmp_path, tmp_path / "s0.sqlite", NOTHING)
+    with (
+        closing(MemoryBus(MemoryHub())) as bus,
+        RecordedFleet(bus, Keys("demo"), "s0", tmp_path),
+        Fleet(bus=bus, by="anna") as fleet,
+    ):
+        refused = [fleet.go("ada", node) for node in ("ada.1.9999", "bo.1.9")]
+        taken = fleet.go("ada", "ada.1.9")
+    assert [(one.state, one.reason) for one in refused] == [
+        (MissionState.REFUSED, "there is no node ada.1.9999; the nearest is ada.1.53"),
+        (MissionState.REFUSED, "ada is a recording and knows its own map alone"),
+    ]
+    assert taken.state is MissionState.RUNNING
 
 
 def test_the_recording_is_small_and_whole() -> None:
