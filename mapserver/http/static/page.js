@@ -229,6 +229,7 @@ watch({
     addEvents(history, name => model.rowOf(name) === undefined ? find(name) : selectNode(name));
     if (page.heard) byId("announcement").textContent = history.at(-1)?.words || "";
     page.heard = true;
+    if (history.some(({ kind }) => kind === "annotated")) loadSaid();
     if (!page.loading) listCorrections();
   },
 }, up => {

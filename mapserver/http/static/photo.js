@@ -5,6 +5,7 @@ const LONGEST = 2048; // px; the server makes photos smaller anyway
 const result = byId("answer");
 
 const TAKEN = ["image/jpeg", "image/png"];
+const MANY = 3; // times as many matches as are needed: rarely by chance
 
 // What is sent: the file itself, or a JPEG of it if it is large or of another kind; null if it is no image.
 async function prepared(file) {
@@ -45,6 +46,9 @@ function whyNot(similar, show) {
     if (place.turn !== null && Math.abs(place.turn) > 0.12) item.append(` Turn by ${side(place.turn)} and try again.`);
     else if (place.turn !== null) item.append(" Go a step aside and try again.");
   }
+  if (similar.some(({ matches, inliers, needed }) => matches >= MANY * needed && inliers < needed))
+    add(result, "p", "Many landmarks match, but not where this camera would see them: check the height of the lens and the "
+      + "angle of view above, and hold the camera level.");
 }
 let file = null;
 async function locate(found, show) {

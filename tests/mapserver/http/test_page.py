@@ -74,6 +74,18 @@ def test_an_unknown_place_is_explained(page: Browser, services: StubServices, im
     )
 
 
+@pytest.mark.parametrize(("matches", "inliers", "doubted"), [(77, 0, True), (14, 9, False), (31, 10, False)])
+def test_a_camera_that_was_given_wrongly_is_suspected(
+    page: Browser, services: StubServices, image: Path, matches: int, inliers: int, doubted: bool
+) -> None:
+    """A photo with the default height of the lens and angle of view was only said to agree on no pose."""
+    near = SimilarPlace(NodeId("r0", 1, 3), matches, inliers, 10, "matches agree on no pose", None)
+    services.answer = RelocalizeAnswer(Certainty.UNKNOWN, (), "not recognised", (near,))
+    page.type("#image", str(image))
+    eventually(lambda: page.run(KIND) == "unknown")
+    assert ("check the height of the lens and the angle of view" in page.run(RESULT)) == doubted
+
+
 def test_no_unknown_distance_is_shown(page: Browser, services: StubServices, image: Path) -> None:
     services.answer = PLACE
     page.type("#image", str(image))

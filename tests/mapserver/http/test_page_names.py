@@ -6,6 +6,7 @@ from collections.abc import Iterator
 
 import pytest
 
+from mapweave.hybridmap.annotation import Annotation, Place
 from mapweave.hybridmap.constraint_subject import RetiredWindow
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.server import MapServer
@@ -92,6 +93,20 @@ def test_places_and_positions_stand_for_nodes(person: Person, server: MapServer)
     person.fill("query", "90,90")
     page.run("document.getElementById('search').requestSubmit()")
     assert "Nothing is mapped within 2 m of 90,90" in person.text("announcement")
+
+
+def test_what_another_person_says_is_shown_at_once(browser: Browser, server: MapServer) -> None:
+    """A closure of another operator was seen up to 10 s later; the page looks so rarely by itself."""
+    source = "window.setInterval = () => 0"
+    script = browser.devtools("Page.addScriptToEvaluateOnNewDocument", source=source)
+    try:
+        with Web(("127.0.0.1", 0), server) as served:
+            page = opened(browser, served.port).page
+            for name in ("kitchen", "hall"):
+                server.annotate(Annotation(name, Place(FIRST), False, "bob", 1))
+                eventually(lambda name=name: f"{name} place" in page.run(PLACES))
+    finally:
+        browser.devtools("Page.removeScriptToEvaluateOnNewDocument", identifier=script["identifier"])
 
 
 def test_a_place_that_was_replaced_is_restored(person: Person, server: MapServer) -> None:
