@@ -11,6 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -103,9 +104,11 @@ def drive_way(robot: Robot, command: Command, way: float) -> list[Observation]:
 
 
 class RobotContract:
-    """Derive from it, and give `emulator`, `DRIVER` and the other values."""
+    """Derive from it, and give `DRIVER`, `EMULATOR` and the other values."""
 
     DRIVER: str
+    EMULATOR: Callable[[Path], Any]
+    """Makes the emulator in a folder."""
     SPEED_STEP: float
     """Of a wheel, m/s: what the robot's command can say."""
     COUNT: float
@@ -115,7 +118,8 @@ class RobotContract:
 
     @pytest.fixture
     def emulator(self, tmp_path: Path) -> Iterator[Any]:
-        raise NotImplementedError
+        with closing(self.EMULATOR(tmp_path)) as emulator:
+            yield emulator
 
     @pytest.fixture
     def settings(self, emulator: Any, tmp_path: Path, video: Path) -> Path:

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.observation import Command
@@ -17,18 +14,13 @@ from tests.agent.drivers.emulators import ArduinoSketch
 
 class TestArduino(RobotContract):
     DRIVER = "arduino"
+    EMULATOR = ArduinoSketch
     SPEED_STEP = 0.001
     COUNT = 0.2e-3 + 0.005
     OPTIONS = {"wheel_radius": 0.033, "counts_per_turn": 1440}  # noqa: RUF012
     GEOMETRY = {  # noqa: RUF012
         "radius": 0.12, "axle": 0.15, "ranger_bearings_deg": [45.0, 0.0, -45.0], "ranger_reach": 1.5,
     }  # fmt: skip
-
-    @pytest.fixture
-    def emulator(self, tmp_path: Path) -> Iterator[Any]:
-        sketch = ArduinoSketch(tmp_path)
-        yield sketch
-        sketch.close()
 
     def test_distances_and_bumper(self, robot: Robot, emulator: Any) -> None:
         emulator.bumped = 1

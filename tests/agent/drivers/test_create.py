@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -16,14 +14,9 @@ from tests.agent.drivers.emulators import Create2
 
 class TestCreate(RobotContract):
     DRIVER = "create"
+    EMULATOR = Create2
     SPEED_STEP = 0.001
     COUNT = 0.45e-3 + 0.002
-
-    @pytest.fixture
-    def emulator(self, tmp_path: Path) -> Iterator[Any]:
-        create = Create2(tmp_path)
-        yield create
-        create.close()
 
     def test_it_drives_on_after_it_was_lifted(self, robot: Robot, emulator: Any) -> None:
         drive(robot, Command(0.1, 0.0), 0.3)

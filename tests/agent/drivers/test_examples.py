@@ -5,9 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -47,14 +45,9 @@ class Board(LineEmulator):
 
 class TestOwnRobot(RobotContract):
     DRIVER = f"{EXAMPLES / 'own_robot.py'}:OwnRobot"
+    EMULATOR = Board
     SPEED_STEP = 0.001
     COUNT = 0.2e-3 + 0.002
-
-    @pytest.fixture
-    def emulator(self, tmp_path: Path) -> Iterator[Any]:
-        board = Board(tmp_path)
-        yield board
-        board.close()
 
 
 def test_they_are_short() -> None:

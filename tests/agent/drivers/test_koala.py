@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pytest
 
 from mapweave.agent.drivers.robot import Robot
 from tests.agent.drivers.contract import RobotContract, until
@@ -17,14 +14,9 @@ from tests.agent.drivers.emulators import Koala25, KoalaSilver
 
 class TestKoalaSilver(RobotContract):
     DRIVER = "koala"
+    EMULATOR = KoalaSilver
     SPEED_STEP = 0.0045
     COUNT = 0.045e-3 + 0.002
-
-    @pytest.fixture
-    def emulator(self, tmp_path: Path) -> Iterator[Any]:
-        koala = KoalaSilver(tmp_path)
-        yield koala
-        koala.close()
 
     def test_infrared_values_become_distances(self, robot: Robot, emulator: Any) -> None:
         emulator.infrared = [0, 1023, 80, 20] + [5] * 12
@@ -40,14 +32,9 @@ class TestKoalaSilver(RobotContract):
 
 class TestKoala25(RobotContract):
     DRIVER = "koala"
+    EMULATOR = Koala25
     SPEED_STEP = 0.0012
     COUNT = 1.2e-5 + 0.002
-
-    @pytest.fixture
-    def emulator(self, tmp_path: Path) -> Iterator[Any]:
-        koala = Koala25(tmp_path)
-        yield koala
-        koala.close()
 
     def test_ultrasonic_values_become_distances(self, robot: Robot, emulator: Any) -> None:
         # Manual, 4.1: 0 below 25 cm, 25 to 250 cm, 1000 for nothing, 2000 for a sensor that is off.

@@ -9,7 +9,6 @@ import subprocess
 import sys
 import threading
 import tty
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -28,15 +27,10 @@ from tests.waiting import free_port
 
 class TestUgvSerial(RobotContract):
     DRIVER = "waveshare"
+    EMULATOR = UgvSerial
     SPEED_STEP = 0.001
     # Speeds are summed: a change of speed between two answers is half seen.
     COUNT = 0.02
-
-    @pytest.fixture
-    def emulator(self, tmp_path: Path) -> Iterator[Any]:
-        ugv = UgvSerial(tmp_path)
-        yield ugv
-        ugv.close()
 
     def test_it_shortens_the_watchdog_before_it_drives(self, robot: Robot, emulator: Any) -> None:
         drive(robot, Command(0.1, 0.0), 0.2)
@@ -147,11 +141,6 @@ def test_a_driver_in_another_process_is_refused_until_the_first_has_ended(tmp_pa
 
 class TestUgvHttp(RobotContract):
     DRIVER = "waveshare"
+    EMULATOR = UgvHttp
     SPEED_STEP = 0.001
     COUNT = 0.02
-
-    @pytest.fixture
-    def emulator(self, tmp_path: Path) -> Iterator[Any]:
-        ugv = UgvHttp(tmp_path)
-        yield ugv
-        ugv.close()
