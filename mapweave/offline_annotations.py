@@ -34,12 +34,16 @@ class OfflineAnnotations:
     """The annotations of one map. Map files are written; a store is only read, since it is its server's."""
 
     def __init__(
-        self, path: Path, out: Path | None = None, by: str = "a person", settings: MergeSettings | None = None
+        self,
+        path: Path | str,
+        out: Path | None = None,
+        by: str = "a person",
+        settings: MergeSettings | None = None,
     ) -> None:
         """Read a map.
 
         Args:
-            path: of the file or store.
+            path: of the file, store or journal; or the address of a PostgreSQL database.
             out: where the file with new annotations is written; over the old file by default.
             by: says so.
             settings: with which the file was merged.
@@ -49,7 +53,7 @@ class OfflineAnnotations:
         """
         self._by, self._settings = by, settings
         self._opened = open_map(path)
-        self._out = path if out is None and self._opened.source is MapSource.FILE else out
+        self._out = Path(path) if out is None and self._opened.source is MapSource.FILE else out
         self._made = Annotations(self._opened.content.annotations)
         self._images = dict(self._opened.content.images)
 

@@ -90,15 +90,31 @@ class OpenedMap:
             InvalidFile: the measurements determine no poses.
             InvalidValue: a map cannot be merged.
         """
-        # These load the libraries that solve pose graphs: what only looks into a map does without.
+        # This loads the libraries that solve pose graphs: what only looks into a map does without.
         from mapweave.mapserver.map_files import merged_of
+
+        decided = self.source is MapSource.FILE or (
+            len(maps_of(self.content)) < 2 and not ManualConstraints(self.content.constraints).in_force
+        )
+        if decided:
+            return merged_of(self.content, settings)
+        return self.merged_anew(settings, progress)
+
+    def merged_anew(
+        self,
+        settings: MergeSettings | None = None,
+        progress: Callable[[int, int], None] = lambda done, of: None,
+    ) -> MergedMap:
+        """The robots' maps merged as a server merges them, also those of a file.
+
+        Raises:
+            InvalidValue: a map cannot be merged.
+        """
         from mapweave.offline_merge import merge_parts
 
         maps = maps_of(self.content)
         floors = Annotations(self.content.annotations).floors
         constraints = ManualConstraints(self.content.constraints, floors=floors)
-        if self.source is MapSource.FILE or (len(maps) < 2 and not constraints.in_force):
-            return merged_of(self.content, settings)
         of_store = self.path if self.source is MapSource.STORE and isinstance(self.path, Path) else None
         pins = Annotations(self.content.annotations).pins
         marginals = marginal_links(self.content)

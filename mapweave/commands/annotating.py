@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.commands.network import add_network
 
 if TYPE_CHECKING:
@@ -25,10 +26,12 @@ def add_record_options(parser: argparse.ArgumentParser, changes: bool) -> None:
     if changes:
         parser.add_argument("--because", default="", metavar="TEXT", help="why; for those who wonder later")
         parser.add_argument("--by", default="", metavar="NAME", help="your name (default: the login name)")
-        parser.add_argument("-o", "--out", type=Path, metavar="OUT", help="with --map: write there instead")
+        parser.add_argument(
+            "-o", "--out", type=Path, metavar="OUT", help="with --map: write a map file there instead"
+        )
     else:
         parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument("--map", type=Path, metavar="FILE", help="of this map file; no server is asked")
+    parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     add_network(parser)
 
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from mapweave.commands import values
-from mapweave.commands.map_input import opened
+from mapweave.commands.map_input import SOURCES, map_source, opened
 from mapweave.commands.network import add_network, key_holder, network_of, settings_of
 
 if TYPE_CHECKING:
@@ -24,8 +24,13 @@ def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -
     if undo:
         parser.add_argument("--undo", action="store_true", help="take it back")
     parser.add_argument("--check", action="store_true", help="only say what it would do; change nothing")
-    parser.add_argument("--map", type=Path, metavar="FILE", help="in this map file; no server is asked")
-    parser.add_argument("-o", "--out", type=Path, metavar="OUT", help="with --map: write there instead")
+    parser.add_argument(
+        "--map", type=map_source, metavar="FILE", help=f"in {SOURCES}; no server is asked, and only a merged "
+        "map file is changed",
+    )  # fmt: skip
+    parser.add_argument(
+        "-o", "--out", type=Path, metavar="OUT", help="with --map: write a map file there instead"
+    )
     parser.add_argument(
         "--timeout", type=values.seconds, default=20.0, metavar="S", help="longest wait for an answer"
     )
@@ -102,30 +107,35 @@ def _settled(arguments: argparse.Namespace) -> None:
 
 
 def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
-    from mapweave.commands.map_merge import merged_with_progress
+    from mapweave.commands.map_input import merge_progress, merged_with_progress
     from mapweave.hybridmap.annotation import Annotations
     from mapweave.hybridmap.errors import InvalidFile
     from mapweave.hybridmap.manual_constraint import ManualConstraints, event_words
-    from mapweave.mapserver.map_files import map_file_of, merged_of
+    from mapweave.mapserver.map_files import map_file_of
     from mapweave.mapserver.map_history import between
     from mapweave.merge.constraint_checks import check_manual_constraint
-    from mapweave.offline_merge import parts_of
-    from mapweave.opened_map import MapSource, source_of
+    from mapweave.opened_map import MapSource
     from mapweave.refusals import refusals
     from mapweave.storage.atomic_file import check_place
-    from mapweave.storage.map_file import read_map_file, write_map_file
+    from mapweave.storage.map_file import write_map_file
 
-    check_place(arguments.out or arguments.map)
     settings = settings_of(arguments).merge
-    source = source_of(arguments.map)
-    if source is not MapSource.FILE:
+    one = opened(arguments.map)
+    content, of_file = one.content, one.source is MapSource.FILE
+    out = arguments.out
+    if content.kind == "merged":
+        out = out or Path(arguments.map)
+    elif out is None and not arguments.check:
+        kind = "map file of kind agent, not merged," if of_file else one.source
         raise InvalidFile(
-            f"{arguments.map}: is a {source} and is not changed; make a map file of it with "
-            f"`mapweave map merge {arguments.map} -o FILE`, or ask the running server without --map"
+            f"{one.path}: is a {kind} and is not changed: give -o FILE for a merged map with the constraint"
+            f"{'' if of_file else ', or ask the running server without --map'}"
         )
-    content = read_map_file(arguments.map, "merged")
-    before = merged_of(content, settings)
-    earlier = ManualConstraints(content.constraints, floors=Annotations(content.annotations).floors)
+    if out is not None:
+        check_place(out)
+    before = merged_with_progress(one, settings)
+    said = Annotations(content.annotations)
+    earlier = ManualConstraints(content.constraints, floors=said.floors)
     with refusals():
         constraint, effects = check_manual_constraint(before, earlier, constraint, settings=settings)
     words = f"{event_words(constraint)}{f'; {effects}' if effects else ''}"
@@ -133,10 +143,10 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
         print(f"only checked, nothing is changed: {words}")
         return
     print(words)
-    parts = parts_of({arguments.map: content})
-    parts = replace(parts, constraints=parts.constraints + ManualConstraints([constraint]))
-    merged = merged_with_progress(parts, settings)
-    out = arguments.out or arguments.map
-    history = (*parts.history, *between(before, merged, constraint.stamp_ns))
-    write_map_file(out, map_file_of(merged, history, parts.annotations, parts.images))
+    assert out is not None
+    changed = replace(one, content=replace(content, constraints=(*content.constraints, constraint)))
+    with merge_progress() as report:
+        merged = changed.merged_anew(settings, report)
+    history = (*content.history, *between(before, merged, constraint.stamp_ns))
+    write_map_file(out, map_file_of(merged, history, said, content.images))
     print(f"{out}: {merged.summary()}")

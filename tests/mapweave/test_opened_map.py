@@ -28,6 +28,7 @@ from mapweave.cli import main
 from mapweave.hybridmap.annotation import Annotation, Place
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
@@ -153,7 +154,7 @@ def test_every_command_reads_all_three_alike(
 def test_commands_that_change_a_map_refuse_stores_and_journals(
     folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
-    for name in ("store", "journal"):
+    for name in ("store", "journal", "own"):
         copy = tmp_path / name
         shutil.copyfile(folder / name, copy)
         before = copy.read_bytes()
@@ -161,6 +162,37 @@ def test_commands_that_change_a_map_refuse_stores_and_journals(
             assert "and is not changed" in complaint(capfd, "map", *command, "--map", copy)
         assert copy.read_bytes() == before and {path.name for path in tmp_path.iterdir()} == {name}
         copy.unlink()
+
+
+@pytest.mark.parametrize("name", ["store", "merged"])
+def test_a_constraint_on_a_store_goes_into_a_file(
+    folder: Path, tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """They were refused with `-o`, too, while places and closures were taken."""
+    before, out = state(folder), tmp_path / "out.mapweave"
+    command = ("map", "unmerge", "r0.1", "r1.1", "--map", str(folder / name))
+    assert main([*command, "--check"]) == 0 and not out.exists()
+    assert "only checked, nothing is changed: " in capfd.readouterr().out
+    assert main([*command, "-o", str(out), "--because", "two like rooms"]) == 0
+    assert state(folder) == before
+    content = open_map(out).content
+    assert len({component for component, _ in content.poses.values()}) == 2
+    assert content.constraints[0] == SAID and content.constraints[1].because == "two like rooms"
+    assert content.annotations == (KITCHEN,) and EVENT in content.history
+    assert main(["map", "undo", "2", "--map", str(out)]) == 0
+    again = open_map(out)
+    assert len({component for component, _ in again.content.poses.values()}) == 1
+    links = [link.pair for link in again.merged().links]
+    assert links == [link.pair for link in open_map(folder / "merged").merged().links] != []
+
+
+@pytest.mark.parametrize("name", ["journal", "own"])
+def test_a_constraint_on_a_robots_own_map_goes_into_a_file(folder: Path, tmp_path: Path, name: str) -> None:
+    before, out = state(folder), tmp_path / "out.mapweave"
+    assert main(["map", "retire", "r0.1.3", "--map", str(folder / name), "-o", str(out)]) == 0
+    assert state(folder) == before
+    kept = {node for node in HybridMap(LOGS[R0]).nodes if node != NodeId("r0", 1, 3)}
+    assert open_map(out).content.poses.keys() == kept
 
 
 @pytest.mark.slow
