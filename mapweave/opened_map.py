@@ -98,9 +98,9 @@ class OpenedMap:
         )
         if decided:
             return merged_of(self.content, settings)
-        return self.merged_anew(settings, progress)
+        return self.merged_again(settings, progress)
 
-    def merged_anew(
+    def merged_again(
         self,
         settings: MergeSettings | None = None,
         progress: Callable[[int, int], None] = lambda done, of: None,

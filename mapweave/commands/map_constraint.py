@@ -146,7 +146,7 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     assert out is not None
     changed = replace(one, content=replace(content, constraints=(*content.constraints, constraint)))
     with merge_progress() as report:
-        merged = changed.merged_anew(settings, report)
+        merged = changed.merged_again(settings, report)
     history = (*content.history, *between(before, merged, constraint.stamp_ns))
     write_map_file(out, map_file_of(merged, history, said, content.images))
     print(f"{out}: {merged.summary()}")
