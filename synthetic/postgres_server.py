@@ -34,22 +34,34 @@ def binaries() -> Path | None:
 class PostgresServer:
     """One cluster with its own processes."""
 
-    def __init__(self, folder: Path, *options: str, primary: PostgresServer | None = None) -> None:
+    def __init__(
+        self,
+        folder: Path,
+        *options: str,
+        primary: PostgresServer | None = None,
+        template: PostgresServer | None = None,
+    ) -> None:
         """Make a cluster and start it.
 
         Args:
             folder: for all it has; short, since a socket's path is.
             options: for `postgres`.
             primary: of which it is a standby, named `standby`.
+            template: a stopped server whose cluster is copied, which is faster than to make one.
         """
         self.folder, self.data, self._options = folder, folder / "data", options
         self._count = 0
+        self._given: list[str] = []
+        self._returned: list[str] = []
         # PostgreSQL refuses to run as root.
         name = "postgres" if "postgres" in {user.pw_name for user in pwd.getpwall()} else "daemon"
         self.user = name if os.geteuid() == 0 else None
         if self.user:
             os.chown(folder, pwd.getpwnam(name).pw_uid, pwd.getpwnam(name).pw_gid)
-        if primary is None:
+        if template is not None:
+            assert template.process.poll() is not None, "files of a running server are no copy"
+            subprocess.run(["cp", "-a", template.data, self.data], user=self.user, check=True, timeout=120)
+        elif primary is None:
             self.run(
                 "initdb", "-D", str(self.data), "-U", ROLE, "--auth=trust", "--no-sync", "--data-checksums",
                 "--encoding=UTF8", "--locale=C",
@@ -112,14 +124,47 @@ class PostgresServer:
         return f"postgresql://{ROLE}@/{database}?host={self.folder}"
 
     def database(self) -> str:
-        """The address of a new one."""
+        """The address of an empty one, which no other test is given before `take_back`."""
         import psycopg
 
-        self._count += 1
-        name = f"store_{self._count}"
-        with psycopg.connect(self.address(), autocommit=True) as connection:
-            connection.execute(f"CREATE DATABASE {name}")
+        name = next(filter(self._emptied, self._returned), None)
+        if name is not None:
+            self._returned.remove(name)
+        else:
+            self._count += 1
+            name = f"store_{self._count}"
+            with psycopg.connect(self.address(), autocommit=True) as connection:
+                connection.execute(f"CREATE DATABASE {name}")
+        self._given.append(name)
         return self.address(name)
+
+    def take_back(self) -> None:
+        """What was given is no longer used.
+
+        A database is given again once it has no session: to empty one is much faster than to make one.
+        """
+        self._returned += self._given
+        self._given.clear()
+
+    def _emptied(self, name: str) -> bool:
+        """Empty a database that was given before; says whether it is as a new one."""
+        import psycopg
+
+        with psycopg.connect(self.address(name), autocommit=True) as connection:
+            (used,) = connection.execute(
+                "SELECT EXISTS (SELECT FROM pg_stat_activity WHERE datname = current_database()"
+                " AND backend_type = 'client backend' AND pid <> pg_backend_pid())"
+                " OR EXISTS (SELECT FROM pg_class WHERE relnamespace = 'public'::regnamespace)"
+            ).fetchone() or (True,)
+            if used:
+                return False
+            schemas = connection.execute(
+                "SELECT quote_ident(nspname) FROM pg_namespace"
+                " WHERE nspname !~ '^pg_' AND nspname NOT IN ('information_schema', 'public')"
+            ).fetchall()
+            for (schema,) in schemas:
+                connection.execute(f"DROP SCHEMA {schema} CASCADE")
+        return True
 
     def _environment(self) -> dict[str, str]:
         return {"PATH": os.environ["PATH"], "LC_ALL": "C", "PGHOST": str(self.folder), "PGUSER": ROLE}

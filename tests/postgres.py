@@ -5,6 +5,7 @@ from __future__ import annotations
 import shutil
 import tempfile
 from collections.abc import Iterator
+from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -19,10 +20,9 @@ def started(*options: str) -> Iterator[PostgresServer]:
         pytest.skip("the extra `postgres` is not installed")
     if binaries() is None:
         pytest.skip("there is no PostgreSQL: neither Debian's package postgresql nor PyPI's pgserver")
-    # Not below pytest's folder: that is its user's alone.
-    folder = Path(tempfile.mkdtemp(prefix="pg-"))
+    folder = _folder()
     try:
-        server = PostgresServer(folder, *options)
+        server = PostgresServer(folder, *options, template=_template())
         try:
             yield server
         finally:
@@ -32,6 +32,32 @@ def started(*options: str) -> Iterator[PostgresServer]:
 
 
 @pytest.fixture(scope="session")
-def postgres() -> Iterator[PostgresServer]:
-    """One server for all tests of a process; each takes databases of its own."""
+def postgres_server() -> Iterator[PostgresServer]:
+    """One server for all tests of a process."""
     yield from started()
+
+
+@pytest.fixture
+def postgres(postgres_server: PostgresServer) -> Iterator[PostgresServer]:
+    """The same; a test takes databases of its own."""
+    yield postgres_server
+    postgres_server.take_back()
+
+
+def pytest_unconfigure() -> None:
+    """Remove the cluster that the others are copies of."""
+    if _template.cache_info().currsize:
+        shutil.rmtree(_template().folder, ignore_errors=True)
+
+
+@cache
+def _template() -> PostgresServer:
+    """A stopped server, as it is when it is new: to make its cluster costs a second of processor time."""
+    server = PostgresServer(_folder())
+    server.stop()
+    return server
+
+
+def _folder() -> Path:
+    # Not below pytest's folder: that is its user's alone.
+    return Path(tempfile.mkdtemp(prefix="pg-"))
