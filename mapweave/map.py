@@ -24,7 +24,7 @@ from numpy.typing import NDArray
 from mapweave.extras import need
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.constraint_subject import read_ends
+from mapweave.hybridmap.constraint_subject import read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import (
     Explanation,
@@ -244,6 +244,9 @@ class Map(ABC):
         Raises:
             InvalidValue: a node is not there.
         """
+        for name in map(str, (a, b)):
+            if _is_map(name):
+                raise InvalidValue(f"{name} is a map: `explain_maps` is for two maps")
         first, second = self._named(a, b)
         explanation = self._explained(ExplainRequest((first, second)))
         assert isinstance(explanation, PairExplanation), "two nodes were asked for"
@@ -366,3 +369,11 @@ def open(path: str | os.PathLike[str]) -> FileMap:
         return FileMap(opened.content)
     need("server")
     return FileMap(opened.file(opened.merged()))
+
+
+def _is_map(name: str) -> bool:
+    """Whether it is written as a map's name, `r0.1`."""
+    try:
+        return isinstance(read_end(name), MapId)
+    except InvalidValue:
+        return False

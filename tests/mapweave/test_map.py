@@ -136,6 +136,8 @@ def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path: Path) -> No
                 asked.explain(*wrong)
         with pytest.raises(InvalidValue, match="is a node"):
             asked.explain_maps("r0.1.1", "r1.1.1")
+        with pytest.raises(InvalidValue, match=r"r0\.1 is a map: `explain_maps` is for two"):
+            asked.explain("r0.1", "r1.1")
 
     view, _ = take_view(WORLD, TOUR[2] @ mapweave.Pose2(0.1, 0.05, 0.05), np.random.default_rng(5))
     here, there = (asked._answer(view) for asked in (fleet, file))
