@@ -104,6 +104,11 @@ def no_server(fleet: str, holder: Credentials | None = None) -> NotConnected:
     )
 
 
+def router_gone() -> NotConnected:
+    """The error that a router which was there is in reach no more."""
+    return NotConnected("the router is gone: start `mapweave server` there again")
+
+
 def _key_hint(holder: Credentials | None) -> str:
     """A router drops what a key may not do, without a word."""
     if holder is None:

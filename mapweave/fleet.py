@@ -17,7 +17,7 @@ from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 
-from mapweave.connection import ANSWERED, no_server, reach
+from mapweave.connection import ANSWERED, reach
 from mapweave.fleet_annotations import FleetAnnotations
 from mapweave.fleet_constraints import FleetConstraints
 from mapweave.fleet_map import FleetMap
@@ -208,7 +208,7 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             status = decode(reply.payload, AgentStatus)
             robots.append(RobotEntry(status.robot, True, 0.0, status))
         if not robots:
-            raise no_server(self._keys.fleet, self._key_holder)
+            raise self._no_answer()
         return FleetStatus(tuple(sorted(robots, key=lambda entry: entry.robot)))
 
     def _alive(self) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from mapweave.connection import no_server
+from mapweave.connection import no_server, router_gone
 from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
 from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.credentials import Credentials, Role
@@ -30,9 +30,15 @@ class FleetQuestions:
             if not reply.error:
                 return reply.payload
         if not replies:
-            raise no_server(self._keys.fleet, self._key_holder)
+            raise self._no_answer()
         reason = replies[0].error.removeprefix("refused: ")
         raise NotConnected(f"the map server is {reason}") if replies[0].retry_after else Refused(reason)
+
+    def _no_answer(self) -> NotConnected:
+        """The error that nothing answers."""
+        if not self._bus.connected():
+            return router_gone()
+        return no_server(self._keys.fleet, self._key_holder)
 
     @property
     def _sender(self) -> str:

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import argparse
 import math
+import sys
 import time
 from contextlib import nullcontext
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NoReturn
 
 from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_network
@@ -67,12 +68,11 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.terminal import plain_or_terminal, stamped
 
     with fleet_of(arguments) as fleet:
+        if arguments.json and arguments.watch:
+            _watch_json(fleet, arguments)
         if arguments.json:
-            while True:
-                _print_json(fleet.status(), _plan(fleet, arguments))
-                if not arguments.watch:
-                    return 0
-                time.sleep(EVERY)
+            _print_json(fleet.status(), _plan(fleet, arguments))
+            return 0
         # A line a robot where another program reads.
         console = plain_or_terminal(stderr=False)
         if not arguments.watch:
@@ -90,6 +90,22 @@ def run(arguments: argparse.Namespace) -> int:
                     console.print(stamped("status"), highlight=False)
                     console.print(shown)
                 time.sleep(EVERY if live is not None else TABLE_EVERY)
+
+
+def _watch_json(fleet: Fleet, arguments: argparse.Namespace) -> NoReturn:
+    """A line each time until interrupted; on stderr, once, why there is none for a while."""
+    from mapweave.hybridmap.errors import NotConnected
+
+    said = ""
+    while True:
+        try:
+            _print_json(fleet.status(), _plan(fleet, arguments))
+            said = ""
+        except NotConnected as error:  # it may come back
+            if str(error) != said:
+                said = str(error)
+                print(f"mapweave: {said}", file=sys.stderr, flush=True)
+        time.sleep(EVERY)
 
 
 def _plan(fleet: Fleet, arguments: argparse.Namespace) -> PlacedPlan | None:

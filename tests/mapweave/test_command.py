@@ -7,9 +7,10 @@ import json
 import socket
 import time
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
+from contextlib import closing, nullcontext
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from rich.console import Console
@@ -29,6 +30,7 @@ from mapweave.storage.map_file import read_map_file
 from mapweave.wire.bus import Request
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import serve_senders
 from mapweave.wire.zenoh_bus import ZenohBus
@@ -277,6 +279,41 @@ def test_watching_is_live_on_a_terminal_and_tables_elsewhere(
     for words in ("no robot is there", "no map server", "r0.1.7", "2.5 s", f"r0 is not merged: {apart}"):
         assert words in printed
     assert ("\x1b[" in printed) is terminal
+
+
+def test_watching_for_a_script_goes_on_while_no_server_answers(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """With `--json` it ended when the server was started again; the table went on."""
+    gone = NotConnected("no map server")
+    found: list[FleetStatus | NotConnected] = [FleetStatus(), gone, gone, FleetStatus(), gone]
+
+    def answer() -> FleetStatus:
+        if not found:
+            raise KeyboardInterrupt
+        if isinstance(one := found.pop(0), NotConnected):
+            raise one
+        return one
+
+    fleet = SimpleNamespace(status=answer)
+    monkeypatch.setattr(status_command, "fleet_of", lambda arguments: nullcontext(fleet))
+    monkeypatch.setattr(time, "sleep", lambda seconds: None)
+    assert main(["status", "--watch", "--json"]) == INTERRUPTED
+    out, err = capsys.readouterr()
+    assert [json.loads(line) for line in out.splitlines()] == [{"robots": []}] * 2
+    assert err.splitlines() == ["mapweave: no map server"] * 2 + ["mapweave: interrupted"]
+
+
+def test_a_router_that_is_gone_is_not_said_to_be_up() -> None:
+    hub = MemoryHub()
+    with closing(MemoryBus(hub)) as bus, Fleet(bus=bus) as fleet:
+        for ask in (fleet.status, fleet.missions, fleet.annotations):
+            with pytest.raises(NotConnected, match="a router is up, but no map server of fleet demo answers"):
+                ask()
+        hub.cut(bus)
+        for ask in (fleet.status, fleet.missions, fleet.annotations):
+            with pytest.raises(NotConnected, match="the router is gone: start `mapweave server` there again"):
+                ask()
 
 
 def test_a_terminal_of_80_columns_shows_every_column() -> None:
