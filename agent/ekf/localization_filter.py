@@ -139,14 +139,14 @@ class LocalizationFilter:
         ahead = np.minimum(*scales) > NEAREST_SCALE
         slots, rows = slots[ahead], rows[ahead]
         if not len(slots):
-            return self._judge(UpdateReport.blind(ids, "no landmark of the node is in view"))
+            return self._judge(UpdateReport.blind(len(ids), "no landmark of the node is in view"))
         slopes = (pixels[rows] - self._centre) / self._focal
         variances, linear = (self._settings.pixel_sigma / self._focal) ** 2, LINEAR_PX / self._camera.fx
         gate = pixel_gate(self._settings.gate_probability)
         measurement = Measurement(slots, slopes, variances, gate, ITERATIONS, linear)
         fit = iterated_update(self._state, start, measurement, mount)
         if fit is None:
-            return self._judge(UpdateReport.blind(ids, "the pose is too uncertain to be corrected"))
+            return self._judge(UpdateReport.blind(len(ids), "the pose is too uncertain to be corrected"))
         accepted = np.zeros(len(ids), np.bool_)
         # A few that agree among many that do not may as well be the wrong ones.
         if fit.accepted.mean() >= LEAST_AGREEING_SHARE:
@@ -160,7 +160,7 @@ class LocalizationFilter:
             health, reason = Health.DISAGREEMENT, f"{kept} of {len(slots)} landmarks agree"
         elif kept < LEAST_AGREEING:
             health, reason = Health.FEW, f"{kept} of {len(slots)} landmarks agree"
-        return self._judge(UpdateReport(ids, accepted, innovations_px, fit.mean_nis, health, reason))
+        return self._judge(UpdateReport(accepted, innovations_px, fit.mean_nis, health, reason))
 
     def add(self, ids: Ids, points_in_robot: Array, covariances_in_robot: Array) -> NDArray[np.bool_]:
         """Add landmarks that are new to the map, as they are known from the robot's present pose.
@@ -211,17 +211,11 @@ class LocalizationFilter:
         sigma = math.sqrt(float(np.linalg.eigvalsh(self._state.covariance[:2, :2])[-1]))
         return f"position known to {sigma:.1f} m only" if sigma > WIDEST_SIGMA else ""
 
-    def predict_pixels(self, ids: Ids | None = None) -> Array:
-        """(N, 2) px where landmarks are expected now; NaN if behind the camera or not held."""
+    def predict_pixels(self) -> Array:
+        """(N, 2) px where landmarks are expected now; NaN if behind the camera."""
         projected = project_anchored(self._state.pose_vector, self._state.rays, self._camera.mount_forward)
         ahead = (projected.scale > NEAREST_SCALE)[:, None]
-        pixels = np.where(ahead, self._centre + self._focal * projected.rays[:, :2], np.nan)
-        if ids is None:
-            return pixels
-        slots, rows = self._slots(ids)
-        out = np.full((len(ids), 2), np.nan)
-        out[rows] = pixels[slots]
-        return out
+        return np.where(ahead, self._centre + self._focal * projected.rays[:, :2], np.nan)
 
     def landmarks_in_node(self) -> NodeLandmarks:
         """All landmarks as they are known now."""

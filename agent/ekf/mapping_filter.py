@@ -77,7 +77,6 @@ class MappingFilter:
         """
         self.settings = settings or FilterSettings()
         self.ids: Ids = np.zeros(0, np.int64)
-        self.lost = 0
         self._camera = camera
         self._pinhole = Pinhole(camera)
         self._wheels = AdaptiveOdometryNoise(
@@ -98,7 +97,6 @@ class MappingFilter:
         root, aside = self._wheels.root(odometry), self._wheels.side_slip(odometry)
         taken = Step(state, odometry, root, aside, mount, odometry, pose_vector, rays)
         if not stays.all():
-            self.lost += int(np.count_nonzero(~stays))
             self.ids = self.ids[stays]
             taken = taken.kept(stays)
         self._step = taken
@@ -153,7 +151,7 @@ class MappingFilter:
         measurement = ImageMeasurement.of(self.ids, ids, pixels, self._pinhole)
         if not len(measurement.slots):
             self._watch.saw(Health.BLIND, "no landmark of the filter is in view")
-            return UpdateReport.blind(ids, "no landmark of the filter is in view")
+            return UpdateReport.blind(len(ids), "no landmark of the filter is in view")
         by_wheels = self._step
         self._step, innovations = measurement.compared(by_wheels, self._settled, self._noise.variances, s)
         if not innovations.worst <= self._gate:

@@ -57,14 +57,14 @@ class ImageMeasurement(NamedTuple):
     """The landmarks of a filter that an image shows.
 
     Attributes:
-        ids: (N,) what was tracked, as it was given.
+        tracked: how many landmarks were, N.
         slots: (m,) places in the state of what is held and seen.
         rows: (m,) their rows among the ids.
         slopes: (m, 2) where they are seen, (pixel - principal point) / focal length.
         focal: (2,) px.
     """
 
-    ids: Ids
+    tracked: int
     slots: NDArray[np.intp]
     rows: NDArray[np.intp]
     slopes: Array
@@ -82,7 +82,7 @@ class ImageMeasurement(NamedTuple):
         """
         places = slots_of(held, ids)
         rows = np.flatnonzero((places >= 0) & np.isfinite(pixels).all(axis=1))
-        return ImageMeasurement(ids, places[rows], rows, pinhole.slopes(pixels[rows]), pinhole.focal)
+        return ImageMeasurement(len(ids), places[rows], rows, pinhole.slopes(pixels[rows]), pinhole.focal)
 
     def compared(
         self, step: Step | None, settled: MappingState, variances: Array, settings: FilterSettings
@@ -107,6 +107,6 @@ class ImageMeasurement(NamedTuple):
         self, inliers: NDArray[np.bool_], innovations: Array, mean_nis: float, health: Health, reason: str
     ) -> UpdateReport:
         """Report of an update: inliers (m,), innovations (m, 2) slopes measured minus expected."""
-        accepted, innovations_px = np.zeros(len(self.ids), np.bool_), np.full((len(self.ids), 2), np.nan)
+        accepted, innovations_px = np.zeros(self.tracked, np.bool_), np.full((self.tracked, 2), np.nan)
         accepted[self.rows], innovations_px[self.rows] = inliers, innovations * self.focal
-        return UpdateReport(self.ids, accepted, innovations_px, mean_nis, health, reason)
+        return UpdateReport(accepted, innovations_px, mean_nis, health, reason)

@@ -29,21 +29,17 @@ class Triangulation(NamedTuple):
         rays: (N, 3) [a, b, w 1/m] at the reference, as in mapweave.agent.ekf.motion; w <= 0 means that the
             track may as well be at infinity.
         ray_covariances: (N, 3, 3) their covariances, the trajectory taken as true.
-        points_in_robot: (N, 3) m, in the reference's robot frame; NaN for w <= 0.
         depths: (N,) m along the optical axis of the reference; infinite for w <= 0.
         depth_sigmas: (N,) m, to first order; infinite for w <= 0.
         chi2: (N,) squared residuals over their variance and the degrees of freedom: about 1 for a track
             of one fixed point, more for one that slid or moved; NaN without degrees of freedom to spare.
-        seen: (N,) in how many images.
     """
 
     rays: Array
     ray_covariances: Array
-    points_in_robot: Array
     depths: Array
     depth_sigmas: Array
     chi2: Array
-    seen: NDArray[np.int64]
 
 
 def triangulate(
@@ -89,7 +85,7 @@ def triangulate(
     chi2 = np.where(freedom > 0, total / np.where(freedom > 0, freedom, 1.0), np.nan)
     rays[~enough] = np.nan
     solver.covariances[~enough] = np.nan
-    return _answer(rays, solver.covariances, chi2, seen.sum(axis=1), camera)
+    return _answer(rays, solver.covariances, chi2)
 
 
 class _Solver:
@@ -180,14 +176,9 @@ def _camera_motion(poses: Array, reference: Array, camera: Camera) -> tuple[Arra
     return depth_by, right_by
 
 
-def _answer(
-    rays: Array, covariances: Array, chi2: Array, seen: NDArray[np.int64], camera: Camera
-) -> Triangulation:
+def _answer(rays: Array, covariances: Array, chi2: Array) -> Triangulation:
     w = rays[:, 2]
     finite = w > 0
     depths = np.where(finite, 1.0 / np.where(finite, w, 1.0), np.where(np.isnan(w), np.nan, np.inf))
     sigmas = np.sqrt(covariances[:, 2, 2]) * depths**2
-    points = camera.back_project(
-        rays[:, :2] * (camera.fx, camera.fy) + (camera.cx, camera.cy), np.where(finite, depths, np.nan)
-    )
-    return Triangulation(rays, covariances, points, depths, sigmas, chi2, seen)
+    return Triangulation(rays, covariances, depths, sigmas, chi2)

@@ -39,8 +39,7 @@ class UpdateReport:
     """One update by the landmarks of one image.
 
     Attributes:
-        ids: (N,) landmarks that were given, as they were given.
-        accepted: (N,) which of them were accepted; never those that the filter does not hold.
+        accepted: (N,) which of the landmarks given were accepted; never those that the filter does not hold.
         innovations_px: (N, 2) px, measured minus expected before the update; NaN where there is none.
         mean_nis: normalised innovation squared over its degrees of freedom, of the accepted landmarks taken
             jointly; about 1 if the filter is consistent, NaN if nothing was accepted.
@@ -48,7 +47,6 @@ class UpdateReport:
         reason: what is wrong, in words and figures; empty if nothing is.
     """
 
-    ids: NDArray[np.int64]
     accepted: NDArray[np.bool_]
     innovations_px: Array
     mean_nis: float
@@ -61,8 +59,7 @@ class UpdateReport:
         return self.health.held_up
 
     @staticmethod
-    def blind(ids: NDArray[np.int64], reason: str) -> UpdateReport:
-        """The report of an update that had nothing to see."""
-        n = len(ids)
-        none = np.zeros(n, np.bool_)
-        return UpdateReport(ids, none, np.full((n, 2), np.nan), float("nan"), Health.BLIND, reason)
+    def blind(count: int, reason: str) -> UpdateReport:
+        """The report of an update that saw none of so many landmarks."""
+        none = np.zeros(count, np.bool_)
+        return UpdateReport(none, np.full((count, 2), np.nan), float("nan"), Health.BLIND, reason)

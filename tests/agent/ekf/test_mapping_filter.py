@@ -236,7 +236,6 @@ def test_landmarks_that_fall_behind_are_let_go() -> None:
     for _ in range(6):
         filter_.predict(Odometry(0.2, 0.0))
     assert filter_.ids.tolist() == [2]
-    assert filter_.lost == 1
     for _ in range(8):
         filter_.predict(Odometry(0.0, 0.2))
     assert len(filter_.ids) == 0
