@@ -177,15 +177,14 @@ class OccupancyGrid:
             cv2.circle(unknown, (int(column), int(row)), round(radius / self._settings.cell), 0.0, -1)
         return unknown
 
-    def ways(self, start: Array, reach: float, drivable: NDArray[np.bool_] | None = None) -> DistanceField:
+    def ways(self, start: Array, reach: float) -> DistanceField:
         """Shortest ways over drivable cells to everything within reach of a position.
 
         Args:
             start: (2,) m in map.
             reach: longest way, m.
-            drivable: where one may drive; by default where the floor is known to be free.
         """
-        drivable = self.drivable() if drivable is None else drivable
+        drivable = self.drivable()
         # Numbers of cells in a grid with a border that is never entered: a search asks for one at a time.
         width = drivable.shape[1] + 2
         free = np.pad(drivable, 1).tobytes()

@@ -78,8 +78,8 @@ def floor_scale(
         return None
     sigmas = np.hypot(sigmas, FLOOR_FLAT)
     centres = np.arange(-0.6, 0.6, 0.02)
-    density = _kernel(logs - centres[:, None], sigmas, FLOOR_WIDTH).sum(1)
-    below = _kernel(logs - (centres[:, None] - 4.0 * FLOOR_WIDTH), sigmas, FLOOR_WIDTH).sum(1)
+    density = _kernel(logs - centres[:, None], sigmas).sum(1)
+    below = _kernel(logs - (centres[:, None] - 4.0 * FLOOR_WIDTH), sigmas).sum(1)
     plausible = np.exp(-0.5 * (centres / PLAUSIBLE) ** 2)
     mode = float(centres[int(((density - below) * plausible).argmax())])
     numbers, own = np.unique(pairs, return_inverse=True)
@@ -116,7 +116,7 @@ def floor_scale(
     return FloorScale(mode, max(float(np.linalg.norm(blocks)) / stiffness, FLOOR_SIGMA), tracks)
 
 
-def _kernel(off: Array, sigmas: Array, width: float) -> Array:
+def _kernel(off: Array, sigmas: Array) -> Array:
     """Weights of ratios at a distance from the mode."""
-    variance = width**2 + sigmas**2
+    variance = FLOOR_WIDTH**2 + sigmas**2
     return np.asarray(np.exp(-0.5 * off**2 / variance) / np.sqrt(variance))

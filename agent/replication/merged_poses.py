@@ -19,10 +19,14 @@ from mapweave.wire.pose_messages import MergedPose, PoseNews
 log = logging.getLogger(__name__)
 
 
+TIMEOUT = 3.0
+"""How long a question may take, s."""
+
+
 class MergedPoses:
     """Listens to one server. A thread of its own asks when something is missing."""
 
-    def __init__(self, bus: Bus, keys: Keys, agent: str, server: str, timeout: float = 3.0) -> None:
+    def __init__(self, bus: Bus, keys: Keys, agent: str, server: str) -> None:
         """Begin to listen.
 
         Args:
@@ -30,9 +34,8 @@ class MergedPoses:
             keys: of the fleet.
             agent: whose nodes.
             server: whose poses are taken.
-            timeout: how long a question may take, s.
         """
-        self._bus, self._agent, self._timeout = bus, agent, timeout
+        self._bus, self._agent = bus, agent
         self._key = keys.poses(server, agent)
         self._places: dict[NodeId, MergedPose] = {}
         self._run: int | None = None
@@ -58,7 +61,7 @@ class MergedPoses:
         for closing in self._closing:
             closing.close()
         self._work.put(None)
-        self._thread.join(self._timeout + 1.0)
+        self._thread.join(TIMEOUT + 1.0)
 
     def _listen(self) -> None:
         while (item := self._work.get()) is not None:
@@ -82,7 +85,7 @@ class MergedPoses:
 
     def _ask(self) -> None:
         """Ask for all of it. Without an answer it stays as it is: the next news will show the gap again."""
-        for reply in self._bus.ask(self._key, b"", self._timeout):
+        for reply in self._bus.ask(self._key, b"", TIMEOUT):
             if reply.error:
                 log.info("no merged poses: %s", reply.error)
                 continue

@@ -32,12 +32,10 @@ class VisualMotion(NamedTuple):
     Attributes:
         turn: rad, to the left.
         expansion: way over depth; positive forward.
-        points: that were followed.
     """
 
     turn: float
     expansion: float
-    points: int
 
 
 def visual_motion(before: NDArray[np.uint8], now: NDArray[np.uint8], camera: Camera) -> VisualMotion | None:
@@ -69,4 +67,4 @@ def visual_motion(before: NDArray[np.uint8], now: NDArray[np.uint8], camera: Cam
         miss = np.linalg.norm(flow - jacobian @ solution, axis=1)
         spread = max(median(miss), 1e-5)
         weights = 1.0 / (1.0 + (miss / (2.0 * spread)) ** 2)
-    return VisualMotion(float(solution[0]), float(solution[1]), int(good.sum()))
+    return VisualMotion(float(solution[0]), float(solution[1]))
