@@ -87,12 +87,11 @@ class PixelGrid:
     margin_y: int
 
     @staticmethod
-    def of(camera: Camera, finest: int = FINEST_SHIFT) -> PixelGrid:
+    def of(camera: Camera) -> PixelGrid:
         """The grid for a camera's images: as fine as wanted, if it fits into 16 bits."""
         reach = 2 * max(camera.width, camera.height)
-        return PixelGrid(
-            min((65535 // reach).bit_length() - 1, finest), camera.width // 2, camera.height // 2
-        )
+        finest = min((65535 // reach).bit_length() - 1, FINEST_SHIFT)
+        return PixelGrid(finest, camera.width // 2, camera.height // 2)
 
     def round(self, pixels: NDArray[Any]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Steps x and y of (N, 2) px.

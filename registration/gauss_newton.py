@@ -27,6 +27,9 @@ from mapweave.registration.projection import (
 )
 from mapweave.registration.sightings import Sightings
 
+GAUSS_NEWTON_STEPS = 8
+"""Gauss-Newton steps, at most."""
+
 DEPTH_GATE = 11.34
 """Chi-square 99 % point for 3 degrees of freedom."""
 
@@ -102,7 +105,6 @@ def refine(
     pose: Pose2,
     scale_sigma: float,
     prior: PoseGaussian | None,
-    rounds: int,
     shift_sigma: float = 0.0,
 ) -> PlanarFix | None:
     """Refine a pose and compute its covariance.
@@ -116,13 +118,12 @@ def refine(
         pose: where to start.
         scale_sigma: share by which all points, or all measured depths, may be wrong together.
         prior: what else is known of the pose.
-        rounds: of Gauss-Newton at most.
         shift_sigma: px by which all pixels may be off together, to either side.
 
     Returns:
         The pose, or None if the inliers do not determine one.
     """
-    improved = improve(stack, pose, prior, rounds)
+    improved = improve(stack, pose, prior, GAUSS_NEWTON_STEPS)
     if improved is None:
         return None
     pose, moved = improved

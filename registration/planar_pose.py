@@ -15,15 +15,11 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
-from mapweave.registration.gauss_newton import PlanarFix, improve, refine, stack_sightings
+from mapweave.registration.gauss_newton import GAUSS_NEWTON_STEPS, PlanarFix, improve, refine, stack_sightings
 from mapweave.registration.minimal_poses import hypotheses
 from mapweave.registration.planar_ambiguity import mirrored
 from mapweave.registration.projection import Stack
 from mapweave.registration.sightings import Sightings
-
-GAUSS_NEWTON_STEPS = 8
-"""Gauss-Newton steps, at most."""
-
 
 __all__ = ["PlanarFix", "PlanarPoseSettings", "solve_planar_pose", "solve_sightings"]
 
@@ -129,7 +125,7 @@ def solve_sightings(
     if not kept:
         return None
     best = kept[int(_scores(parts, np.stack([pose.vector for pose in kept])).argmax())]
-    fix = refine(stack, best, settings.scale_sigma, prior, rounds=GAUSS_NEWTON_STEPS)
+    fix = refine(stack, best, settings.scale_sigma, prior)
     if fix is None or int(fix.inliers.sum()) < settings.least_inliers:
         return None
     return _weighed(fix, parts, stack, settings, prior)
@@ -157,7 +153,7 @@ def _weighed(
     score, mirror_score = _scores(parts, np.stack([mean.vector, mirror[0].vector])).tolist()
     if mirror_score <= score:
         return replace(fix, rival=max(mirror_score, 0.0) / score if score > 0.0 else 1.0)
-    better = refine(stack, mirror[0], s.scale_sigma, prior, rounds=GAUSS_NEWTON_STEPS)
+    better = refine(stack, mirror[0], s.scale_sigma, prior)
     if better is None or int(better.inliers.sum()) < s.least_inliers:
         return replace(fix, rival=1.0)
     return replace(better, rival=max(score, 0.0) / mirror_score)

@@ -14,7 +14,7 @@ from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.registration.gauss_newton import refine, stack_sightings
-from mapweave.registration.planar_pose import GAUSS_NEWTON_STEPS, PlanarPoseSettings
+from mapweave.registration.planar_pose import PlanarPoseSettings
 from mapweave.registration.recognition import Recognition, of_unknown_scale
 from mapweave.registration.sightings import Sightings
 
@@ -63,9 +63,7 @@ def refine_pose(node: Node, view: View, recognition: Recognition, pose: PlanarPo
         sigma = fresh
         covariances = landmarks.covariances_in_robot(node.camera, sigma, scale_share, tilt_sigma)
         sightings = Sightings.build(points, pixels, view.camera, covariances=covariances, pixel_sigma=sigma)
-        fix = refine(
-            stack_sightings([sightings]), best.mean, pose.scale_sigma, None, GAUSS_NEWTON_STEPS, SHIFT_SIGMA
-        )
+        fix = refine(stack_sightings([sightings]), best.mean, pose.scale_sigma, None, SHIFT_SIGMA)
         if fix is None or int(fix.inliers.sum()) < pose.least_inliers:
             break
         refined = of_unknown_scale(fix.node_from_robot, scale_share, node.camera, view.camera)

@@ -32,16 +32,13 @@ CLOSELY = 16
 """Pairs of maps of a fleet that are examined closely: comparing similar nodes once more takes 50 ms each."""
 
 
-def explain_maps(
-    merged: MergedMap, first: MapId, second: MapId, verification: RecognitionSettings | None = None
-) -> MapsExplanation:
+def explain_maps(merged: MergedMap, first: MapId, second: MapId) -> MapsExplanation:
     """Explain two maps.
 
     Args:
         merged: the merged map.
         first: a map.
         second: another one.
-        verification: as in the merge.
 
     Raises:
         InvalidValue: the same map twice, or one that is not there.
@@ -51,19 +48,16 @@ def explain_maps(
     if first == second:
         raise InvalidValue(f"{first} twice: give two maps")
     pair = min(first, second), max(first, second)
-    return _explained(merged, pair, _between(merged, [pair])[pair], merged.joined(*pair), verification, True)
+    return _explained(merged, pair, _between(merged, [pair])[pair], merged.joined(*pair), True)
 
 
-def explain_fleet(
-    merged: MergedMap, most: int, verification: RecognitionSettings | None = None
-) -> tuple[MapsExplanation, ...]:
+def explain_fleet(merged: MergedMap, most: int) -> tuple[MapsExplanation, ...]:
     """Explain each two maps: those first that are not one, of these those with the most refused links, and
     last those of which one is retired.
 
     Args:
         merged: the merged map.
         most: pairs at most.
-        verification: as in the merge.
     """
     part_of = {map_id: number for number, part in enumerate(joined_maps(merged)) for map_id in part}
     refused: Counter[Pair] = Counter()
@@ -88,7 +82,6 @@ def explain_fleet(
             pair,
             between[pair],
             any(map_id.issuperset(pair) for map_id in components),
-            verification,
             k < CLOSELY,
         )
         for k, pair in enumerate(pairs)
@@ -121,7 +114,6 @@ def _explained(
     pair: Pair,
     between: _Between,
     joined: bool,
-    verification: RecognitionSettings | None,
     closely: bool,
 ) -> MapsExplanation:
     """Of two maps; only a close examination compares similar pairs once more."""
@@ -131,7 +123,7 @@ def _explained(
     else:
         nearest = _strongest(refused)
         if closely and len(nearest) < MOST_NEAR:
-            nearest = (*nearest, *_most_alike(merged, between.unverified, verification))[:MOST_NEAR]
+            nearest = (*nearest, *_most_alike(merged, between.unverified))[:MOST_NEAR]
     reason = (
         _why_joined(merged, *pair, links)
         if joined
@@ -237,11 +229,9 @@ def _near_miss(link: Link, words: str) -> NearMiss:
     return NearMiss(*link.pair, int(link.evidence.get("matches", inliers)), inliers, words)
 
 
-def _most_alike(
-    merged: MergedMap, unverified: Sequence[RefusedLink], verification: RecognitionSettings | None
-) -> tuple[NearMiss, ...]:
+def _most_alike(merged: MergedMap, unverified: Sequence[RefusedLink]) -> tuple[NearMiss, ...]:
     """Pairs without a common pose that share the most similar landmarks, compared once more."""
-    s = verification or RecognitionSettings()
+    s = RecognitionSettings()
     alike: list[tuple[int, NodeId, NodeId, str]] = []
     for refusal in unverified:
         a, b = node_of(merged, refusal.a), node_of(merged, refusal.b)

@@ -80,11 +80,6 @@ class Component(PoseGraph):
         whole = self.factors.information(self.means)
         return sparse.csc_matrix(whole + sparse.diags(held.ravel()))
 
-    @cached_property
-    def chi2(self) -> float:
-        """Of all measurements."""
-        return float(self.factors.strains(self.means).sum())
-
     def relative_rows(self, i: Rows, j: Rows) -> PoseGaussians:
         """Poses `i_from_j` of (K,) rows, by what was measured around them.
 
