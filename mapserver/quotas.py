@@ -113,16 +113,16 @@ class Quotas:
         self._robots: dict[str, _Excess] = {}
         self._totals: dict[str, int] = {}
 
-    def hold_back(self, robot: str, what: str, count: int = 1) -> None:
+    def hold_back(self, robot: str, what: str) -> None:
         """Note that something of a robot is held back, and log it at each power of two."""
         if not robot:
             return
         with self._lock:
             excess = self._excess(robot)
             before = excess.counts.get(what, 0)
-            after = excess.counts[what] = before + count
+            after = excess.counts[what] = before + 1
             excess.last = self.clock()
-            self._totals[what] = self._totals.get(what, 0) + count
+            self._totals[what] = self._totals.get(what, 0) + 1
         if before.bit_length() != after.bit_length():
             words = "%s is over its quota: %d %s held back so far"
             log.warning(words, robot, after, what, extra={"robot": robot})

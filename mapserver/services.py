@@ -105,7 +105,6 @@ class Services:
         self._blockages = blockages
         self._status = status
         self._missions = missions
-        self._roster = roster
         self._relays = relays
         self._nearby = Nearby()
         self._reservations = Reservations(self._nearby.standing)

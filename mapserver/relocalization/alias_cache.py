@@ -58,19 +58,19 @@ class _Entry:
     same: tuple[NodeId, ...]
 
 
+CANDIDATES = 16
+"""How many nodes are compared with one."""
+
+
 class AliasCache:
     """Caches the aliases of each node.
 
     A later node is entered with its aliases as soon as its own aliases are requested.
     """
 
-    def __init__(self, recognition: RecognitionSettings, candidates: int = 16) -> None:
-        """Take when a place counts as recognised, and how many nodes are compared with one."""
-        self._aliased, self._recognition, self._candidates = (
-            AliasedLandmarks(recognition),
-            recognition,
-            candidates,
-        )
+    def __init__(self, recognition: RecognitionSettings) -> None:
+        """Take when a place counts as recognised."""
+        self._aliased, self._recognition = AliasedLandmarks(recognition), recognition
         self._entries: dict[NodeId, _Entry] = {}
 
     def forget(self) -> None:
@@ -142,7 +142,7 @@ class AliasCache:
         s, aliases, same = self._recognition, dict[NodeId, AliasedNode](), []
         marks = node.landmarks
         view = View(marks.pixels, marks.codes, node.camera)
-        ranked = index.query(view, self._candidates + 1)
+        ranked = index.query(view, CANDIDATES + 1)
         if ranked.missing:
             # What is kept of a part of the map would pass for the whole of it later.
             raise IncompleteSearch(ranked.missing)

@@ -156,9 +156,9 @@ class LandmarkIndex:
         if learner is not None:
             learner.join()
 
-    def blocks(self, size: int = AT_ONCE) -> Iterator[Block]:
-        """Landmarks by cells, about `size` at once, as they are when their turn comes; without cells, all."""
-        return self.contents(size)[1]
+    def blocks(self) -> Iterator[Block]:
+        """Landmarks by cells, as they are when their turn comes; without cells, all."""
+        return self.contents()[1]
 
     def contents(self, size: int = AT_ONCE) -> tuple[CoarseQuantizer | None, Iterator[Block]]:
         """What the cells are about, None without cells, and the landmarks in just these, see `blocks`."""
