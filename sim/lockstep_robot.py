@@ -48,9 +48,9 @@ def decode_rendezvous(data: bytes) -> Rendezvous:
 class LockstepRobot(RemoteRobot):
     """A simulated robot behind Zenoh keys."""
 
-    def __init__(self, bus: Bus, fleet: str, name: str, patience: float = PATIENCE) -> None:
+    def __init__(self, bus: Bus, fleet: str, name: str) -> None:
         """Nothing is asked yet; see RemoteRobot."""
-        super().__init__(bus, fleet, name, patience)
+        super().__init__(bus, fleet, name, PATIENCE)
         self._rendezvous_key = SimKeys(fleet).rendezvous(name)
 
     def rendezvous(self) -> None:

@@ -23,7 +23,6 @@ class SimulatedRobot:
     """A robot on the stage.
 
     Attributes:
-        setup: of the robot.
         description: the description that its agent gets.
         body: in the physics.
         rangers: distances at the last call of `measure`.
@@ -43,7 +42,6 @@ class SimulatedRobot:
             seed: of the simulation, and the robot's number.
         """
         base, number = seed
-        self.setup = setup
         self.description: RobotDescription = setup.describe()
         self.body = Body(
             stage.physics, stage.floor, place, self.description, (base, 0xB0D1, number), setup.body

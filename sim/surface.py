@@ -48,7 +48,7 @@ def wall(rng: np.random.Generator, width_px: int, height_px: int, paint: float) 
 
 def concrete(rng: np.random.Generator, width_px: int, height_px: int, paint: float) -> Image:
     """Cast concrete: blotches, pores, and the marks of the boards it was cast in."""
-    blotches = _seamless(clouds(rng, width_px, height_px, 1.6), across=True)
+    blotches = _seamless(clouds(rng, width_px, height_px, 1.6))
     surface = 0.8 * paint + 9 * blotches + 3 * noise(rng, width_px, height_px, 2.0)
     canvas = np.asarray(np.clip(surface, 0, 255), np.uint8)
     _pores(rng, canvas, 4000)
@@ -61,7 +61,7 @@ def cladding(rng: np.random.Generator, width_px: int, height_px: int, paint: flo
     """Trapezoidal sheet metal: upright, equal ribs, on a low concrete plinth, with scratches."""
     rib = np.arange(width_px) / (0.2 * TEXELS_PER_METRE) % 1.0
     shade = np.select([rib < 0.4, rib < 0.5, rib < 0.9], [1.0, 0.8, 0.93], 1.08)
-    surface = paint * shade[None, :] + 4 * _seamless(clouds(rng, width_px, height_px, 1.3), across=True)
+    surface = paint * shade[None, :] + 4 * _seamless(clouds(rng, width_px, height_px, 1.3))
     canvas = np.asarray(np.clip(surface, 0, 255), np.uint8)
     plinth = min(int(0.25 * TEXELS_PER_METRE), height_px // 3)
     canvas[height_px - plinth :] = concrete(rng, width_px, plinth, 0.8 * paint)
@@ -178,14 +178,14 @@ def crate(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
 
 def linoleum(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
     """Almost plain, with flecks that only a near camera sees: what it sees there is worth little."""
-    soft = _seamless(clouds(rng, width_px, height_px, 2.0), across=True, down=True)
+    soft = _seamless(clouds(rng, width_px, height_px, 2.0), down=True)
     surface = 122 + 4 * soft + 2.5 * noise(rng, width_px, height_px, 2.0)
     return np.clip(surface, 0, 255).astype(np.uint8)
 
 
 def screed(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
     """The floor of a hall: concrete with stains, tyre marks and cracks."""
-    blotches = _seamless(clouds(rng, width_px, height_px, 1.7), across=True, down=True)
+    blotches = _seamless(clouds(rng, width_px, height_px, 1.7), down=True)
     canvas = np.clip(128 + 7 * blotches, 0, 255).astype(np.uint8)
     _pores(rng, canvas, 8000)
     area = width_px * height_px / TEXELS_PER_METRE**2
@@ -216,19 +216,18 @@ def tiles(rng: np.random.Generator, width_px: int, height_px: int) -> Image:
 
 
 def _plaster(rng: np.random.Generator, width_px: int, height_px: int, paint: float) -> Image:
-    grain = _seamless(clouds(rng, width_px, height_px, 1.3), across=True)
+    grain = _seamless(clouds(rng, width_px, height_px, 1.3))
     fine = noise(rng, width_px, height_px, 2.0)
     return np.asarray(np.clip(paint + 6 * grain + 1.5 * fine, 0, 255), np.uint8)
 
 
-def _seamless(grain: Field, across: bool, down: bool = False) -> Field:
+def _seamless(grain: Field, down: bool = False) -> Field:
     """Grain that fades out where the next length of wall or floor begins, which has grain of its own."""
-    for axis, wanted in ((1, across), (0, down)):
-        if wanted:
-            size = grain.shape[axis]
-            edge = np.minimum(np.arange(size), np.arange(size)[::-1]) + 0.5
-            ramp = np.minimum(edge / (0.15 * TEXELS_PER_METRE), 1.0).astype(np.float32)
-            grain = grain * (ramp[None, :] if axis else ramp[:, None])
+    for axis in (1, 0) if down else (1,):
+        size = grain.shape[axis]
+        edge = np.minimum(np.arange(size), np.arange(size)[::-1]) + 0.5
+        ramp = np.minimum(edge / (0.15 * TEXELS_PER_METRE), 1.0).astype(np.float32)
+        grain = grain * (ramp[None, :] if axis else ramp[:, None])
     return grain
 
 

@@ -7,7 +7,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2
@@ -85,20 +84,6 @@ class PanelSet:
             [texture for s in sets for texture in s.textures],
         )
 
-    def placed(self, rotation: NDArray[np.float64], position: NDArray[np.float64]) -> PanelSet:
-        """Panels of an object, in the frame of its pose.
-
-        Args:
-            rotation: (3, 3) turns vectors of the object into that frame.
-            position: (3,) m, of the object in that frame.
-        """
-        return PanelSet(
-            self.corner @ rotation.T + position,
-            self.along @ rotation.T,
-            self.down @ rotation.T,
-            self.textures,
-        )
-
 
 def upright_panel(
     start: tuple[float, float], end: tuple[float, float], bottom: float, top: float, texture: Texture
@@ -158,6 +143,12 @@ class Piece:
     movable: bool = True
 
 
+START_CLEARANCE = 0.45
+"""Of a robot that starts, from its middle to walls and furniture, m."""
+ROBOT_CLEARANCE = 0.5
+"""From the middle of a robot to where furniture is put down, m."""
+
+
 @dataclass(frozen=True, eq=False)
 class World:
     """All static things.
@@ -183,13 +174,12 @@ class World:
     start_rooms: tuple[str, ...] = ()
     look_along: bool = False
 
-    def start_poses(self, robots: int, seed: int, clearance: float = 0.45) -> tuple[Pose2, ...]:
+    def start_poses(self, robots: int, seed: int) -> tuple[Pose2, ...]:
         """Free poses, robot i in room i (counted around), where no two robots come close.
 
         Args:
             robots: how many.
             seed: other seeds, other poses.
-            clearance: to walls and furniture, m.
 
         Raises:
             InvalidValue: there is no room to start in, or so many robots do not fit.
@@ -198,11 +188,9 @@ class World:
         rooms = self.start_rooms or tuple(name for name in names if name.startswith("room"))
         if not rooms:
             raise InvalidValue(f"world {self.name} has no room to start in")
-        return spread(self.plan, rooms, robots, clearance, self.look_along, seed)
+        return spread(self.plan, rooms, robots, START_CLEARANCE, self.look_along, seed)
 
-    def rearranged(
-        self, seed: int, share: float, keep_clear: Sequence[Pose2] = (), clearance: float = 0.5
-    ) -> World:
+    def rearranged(self, seed: int, share: float, keep_clear: Sequence[Pose2] = ()) -> World:
         """The same world after people have moved furniture: other places in the same rooms.
 
         Blocks, panels and furniture keep their order and textures, so what did not move is the same object
@@ -212,7 +200,6 @@ class World:
             seed: other seeds, other pieces and places.
             share: of the furniture that moves, 0 to 1, at least one piece; less where there is no place.
             keep_clear: robots, `world_from_robot`, near which nothing is put down.
-            clearance: from the middle of such a robot, m.
 
         Raises:
             InvalidValue: no such share, or nothing that can be moved.
@@ -222,7 +209,7 @@ class World:
         movable = [k for k, piece in enumerate(self.pieces) if piece.movable]
         rng = np.random.default_rng([seed, 0x3E44A])
         wanted = max(1, round(share * len(movable)))
-        plan, moves = rearrange(self.plan, movable, wanted, rng, keep_clear, clearance)
+        plan, moves = rearrange(self.plan, movable, wanted, rng, keep_clear, ROBOT_CLEARANCE)
         if not moves:
             raise InvalidValue(f"world {self.name} has no furniture that can be moved within its room")
         blocks, panels = list(self.blocks), list(self.panels)

@@ -6,8 +6,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from mapweave.sim.world import World
-from mapweave.sim.worlds.build import build_world
 from mapweave.sim.worlds.design import THICKNESS, Design, Furniture, Room, Wall, within
 from mapweave.sim.worlds.furniture import STOCK, furnish
 from mapweave.sim.worlds.layout import plan_of
@@ -48,15 +46,6 @@ def office(parameters: OfficeParameters, seed: int) -> Design:
         for room in (r for r in plan.rooms if r.name.startswith("room")):
             furniture += furnish(rng, plan, room, STOCK, by_wall=4, count=int(rng.integers(4, 7)))
     return Design(f"office-{seed}", seed, rooms=rooms, walls=walls, furniture=tuple(furniture))
-
-
-def make_office(seed: int, rooms: int = 3) -> World:
-    """Build an office.
-
-    Raises:
-        InvalidValue: a number of rooms that cannot be built.
-    """
-    return build_world(office(OfficeParameters(rooms), seed))
 
 
 def _floor(rng: np.random.Generator, rooms: int) -> tuple[tuple[Room, ...], tuple[Wall, ...]]:

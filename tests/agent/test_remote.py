@@ -32,7 +32,7 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
 from mapweave.processes import simulator
 from mapweave.sim.robots import robot_setups
-from mapweave.sim.worlds.office import make_office
+from mapweave.sim.worlds.catalog import make_world
 from mapweave.vision.equidistant import Equidistant
 from mapweave.wire.bus import Request
 from mapweave.wire.keys import Keys
@@ -425,4 +425,4 @@ def test_a_second_simulator_ends_before_it_disturbs_the_first() -> None:
     with pytest.raises(
         DeviceError, match=r"^robot r1 has a base already: stop the other `mapweave sim serve`$"
     ):
-        simulator.run_sim(second, KEYS.fleet, make_office(1), robots, 1, stop)
+        simulator.run_sim(second, KEYS.fleet, make_world("office", 1), robots, 1, stop)

@@ -19,7 +19,7 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World
-from mapweave.sim.worlds.office import make_office
+from mapweave.sim.worlds.catalog import make_world
 from mapweave.wire.codec import encode_body
 
 ROBOT = "r0"
@@ -98,7 +98,7 @@ class Begun:
 def begun(tmp_path_factory: pytest.TempPathFactory) -> Begun:
     """50 seconds of exploration: once around the first place."""
     path = tmp_path_factory.mktemp("begun") / "r0.sqlite"
-    world = make_office(SEED, 3)
+    world = make_world("office", SEED, rooms=3)
     journal = Journal(path, ROBOT)
     life = Life(world, journal)
     life.live(50.0)
@@ -255,7 +255,7 @@ def test_a_kidnapped_explorer_maps_on_and_adds_no_false_edge(begun: Begun, tmp_p
     [pytest.param(s, marks=pytest.mark.slow if s < 6 else pytest.mark.scenario) for s in range(4, 9)],
 )
 def test_kidnapped_again_and_again(tmp_path: Path, seed: int) -> None:
-    world, rng = make_office(seed, 3), np.random.default_rng(seed)
+    world, rng = make_world("office", seed, rooms=3), np.random.default_rng(seed)
     life = Life(world, Journal(tmp_path / "r0.sqlite", ROBOT))
     for _ in range(6):
         life.live(30.0)

@@ -15,7 +15,7 @@ from mapweave.evaluation.map_score import crossed
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.floorplan import FloorPlan, Rectangle
-from mapweave.sim.worlds.office import make_office
+from mapweave.sim.worlds.catalog import make_world
 
 PLAN = FloorPlan(
     rooms=(Rectangle.spanning(0, 0, 8, 4, "hall"),),
@@ -77,7 +77,7 @@ def test_time_to_a_share() -> None:
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_fleet_starts_at_one_place(seed: int) -> None:
-    plan = make_office(seed, 4).plan
+    plan = make_world("office", seed, rooms=4).plan
     poses = gathered(plan, 3, seed)
     assert [p.vector.tolist() for p in poses] == [p.vector.tolist() for p in gathered(plan, 3, seed)]
     assert poses[0].distance(gathered(plan, 3, seed + 1)[0]) > 0.0

@@ -12,7 +12,7 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.sim.floorplan import FloorPlan, Rectangle
 from mapweave.sim.world import Block, PanelSet, World
-from mapweave.sim.worlds.office import make_office
+from mapweave.sim.worlds.catalog import make_world
 from tests.sim.stage import Stage
 
 
@@ -79,7 +79,7 @@ def caster() -> RayCaster:
 @pytest.fixture(scope="session")
 def office() -> World:
     """Three rooms."""
-    return make_office(11, 3)
+    return make_world("office", 11, rooms=3)
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ from mapweave.agent.drivers.messages import StepRequest, encode_step
 from mapweave.agent.drivers.remote import RemoteRobot
 from mapweave.agent.observation import Command, Odometry, RobotDescription
 from mapweave.sim.simulation import Simulation
-from mapweave.sim.worlds.office import make_office
+from mapweave.sim.worlds.catalog import make_world
 from tests.sim.stage import CAMERA, KEYS, TICK_NS, Driver, FakeSimulation, Stage
 from tests.waiting import eventually
 
@@ -163,7 +163,7 @@ def test_nothing_happens_until_all_robots_have_asked(stage: Stage) -> None:
 def drive_real(pace: float) -> list[object]:
     """What two agents see in ten ticks of the real simulation, and where they end."""
     stage = Stage()
-    with Simulation(make_office(2, 3), ["r0", "r1"], 2) as simulation:
+    with Simulation(make_world("office", 2, rooms=3), ["r0", "r1"], 2) as simulation:
         try:
             stage.start(simulation)
             drivers = [Driver(stage.robot("r0"), 10, lambda _: pace)]

@@ -9,7 +9,8 @@ import pytest
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World
-from mapweave.sim.worlds.office import DOOR, make_office
+from mapweave.sim.worlds.catalog import make_world
+from mapweave.sim.worlds.office import DOOR
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
@@ -42,7 +43,7 @@ class Drawing:
 @pytest.fixture(scope="module")
 def offices() -> list[World]:
     """Of three, four and five rooms."""
-    return [make_office(seed, 3 + seed % 3) for seed in SEEDS]
+    return [make_world("office", seed, rooms=3 + seed % 3) for seed in SEEDS]
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -98,7 +99,7 @@ def test_offices_of_different_seeds_differ_and_of_the_same_do_not(offices: list[
     """In their plan and in what hangs on their walls."""
     plans = [world.plan for world in offices]
     assert len({plan.walls for plan in plans}) == len({plan.furniture for plan in plans}) == len(plans)
-    again = make_office(3, 3 + 3 % 3)
+    again = make_world("office", 3, rooms=3 + 3 % 3)
     assert again.plan == plans[3]
     pictures = [world.panels[5].texture.level(0, 0) for world in (offices[3], again, offices[6])]
     assert np.array_equal(pictures[0], pictures[1])
@@ -136,4 +137,4 @@ def test_there_is_enough_to_see(offices: list[World]) -> None:
 def test_offices_that_cannot_be_built_are_refused(rooms: int) -> None:
     """One line says why."""
     with pytest.raises(InvalidValue, match="1 to 32"):
-        make_office(1, rooms)
+        make_world("office", 1, rooms=rooms)

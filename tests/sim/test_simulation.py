@@ -18,7 +18,7 @@ from mapweave.sim.body import BodySettings
 from mapweave.sim.robots import RobotSetup, camera_from_table
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World
-from mapweave.sim.worlds.office import make_office
+from mapweave.sim.worlds.catalog import make_world
 
 RANGE_NOISE = RobotSetup("r0").range_noise
 
@@ -27,7 +27,7 @@ def fingerprint(seed: int) -> str:
     """Digest of all that three robots sense on a short drive."""
     digest = hashlib.sha256()
     rng = np.random.default_rng(seed)
-    with Simulation(make_office(seed, 1), ["r0", "r1", "r2"], seed) as simulation:
+    with Simulation(make_world("office", seed, rooms=1), ["r0", "r1", "r2"], seed) as simulation:
         for tick in range(12):
             commands = {name: Command(*rng.uniform(-0.5, 0.5, 2).tolist()) for name in simulation.robots}
             for name, seen in simulation.step(commands).items():
