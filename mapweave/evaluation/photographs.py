@@ -78,6 +78,8 @@ LEAST_INLIERS, LEAST_SHARE, LEAST_CELLS = 12, 0.5, 4
 """Matches that agree, as a number and as a share of all; cells of the grid with one, in either image."""
 LEAST_EVIDENCE = 20.0
 """How much likelier than chance, nats."""
+SAMPLE, TRIES = 7, 2000
+"""Pairs that a fundamental matrix is made of; how many such samples are drawn at most."""
 
 
 def agreeing(node: Node, view: View) -> NDArray[np.int64] | None:
@@ -90,7 +92,7 @@ def agreeing(node: Node, view: View) -> NDArray[np.int64] | None:
     if len(pairs) < LEAST_INLIERS:
         return None
     node_pixels, view_pixels = node.landmarks.pixels[pairs[:, 0]], view.pixels[pairs[:, 1]]
-    _, mask = cv2.findFundamentalMat(node_pixels, view_pixels, cv2.FM_RANSAC, GATE_PX, 0.999, 2000)
+    _, mask = cv2.findFundamentalMat(node_pixels, view_pixels, cv2.FM_RANSAC, GATE_PX, 0.999, TRIES)
     inside = np.zeros(len(pairs), bool) if mask is None else mask[:, 0].astype(bool)
     count = int(inside.sum())
     if count < max(LEAST_INLIERS, LEAST_SHARE * len(pairs)):
@@ -103,17 +105,15 @@ def agreeing(node: Node, view: View) -> NDArray[np.int64] | None:
     return inlying_pairs
 
 
-def evidence(
-    inliers: int, matches: int, gate_px: float, height_px: int, used: int = 7, tries: int = 2000
-) -> float:
+def evidence(inliers: int, matches: int, gate_px: float, height_px: int) -> float:
     """Nats: Chernoff's bound on so many wrong matches near their lines, without those that made the lines."""
-    inliers, matches = inliers - used, matches - used
+    inliers, matches = inliers - SAMPLE, matches - SAMPLE
     chance = 2.0 * gate_px / height_px
     if matches <= 0 or inliers <= chance * matches:
         return 0.0
     share = inliers / matches
     rest = (1.0 - share) * math.log((1.0 - share) / (1.0 - chance)) if share < 1.0 else 0.0
-    return matches * (share * math.log(share / chance) + rest) - math.log(tries)
+    return matches * (share * math.log(share / chance) + rest) - math.log(TRIES)
 
 
 def rivals(inliers: Mapping[int, int], together: Callable[[int, int], bool], comparable: float) -> list[int]:

@@ -22,7 +22,7 @@ PATIENCE = 5.0
 
 
 def guide(
-    camera: FrameSource, collection: ViewCollection, console: Console, patience: float = PATIENCE
+    camera: FrameSource, collection: ViewCollection, console: Console
 ) -> Iterator[tuple[NDArray[np.uint8], Guidance]]:
     """Look at the newest frames until the views suffice or the stream ends.
 
@@ -35,7 +35,7 @@ def guide(
     stamp_ns, frames = 0, 0
     with Live(console=console, refresh_per_second=8, transient=True) as shown:
         while collection.done is None:
-            frame = camera.newer(stamp_ns, patience)
+            frame = camera.newer(stamp_ns, PATIENCE)
             if frame is None:
                 if not frames:
                     raise DeviceError("the camera delivers no images")

@@ -199,9 +199,9 @@ def accusing(words: Iterable[str], agent: str) -> str:
     return next((one[one.index(accused) :] for one in words if accused in one), "")
 
 
-def difference(one: Pose2, other: Pose2, lever: float = 1.0) -> float:
+def difference(one: Pose2, other: Pose2) -> float:
     """How far two poses are apart, m; a turn counts as what it moves at a metre."""
-    return max(one.distance(other), lever * abs(float(wrap_angle(one.heading - other.heading))))
+    return max(one.distance(other), abs(float(wrap_angle(one.heading - other.heading))))
 
 
 def _frames(merged: MergedMap, maps: Collection[MapId]) -> dict[NodeId, NodeId]:
