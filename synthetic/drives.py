@@ -73,7 +73,7 @@ def drives(rng: np.random.Generator, settings: DriveSettings | None = None) -> I
     for epoch in count(1):
         walk = walk_of(s.floor, rng)
         truth = {NodeId(ROBOT, epoch, k): pose_vector for k, pose_vector in enumerate(walk)}
-        where, pairs = active | truth, _same_places(truth, active, s, rng)
+        where, pairs = active | truth, _same_places(truth, active, s)
         links = [link_between(a, b, where[a].inverse() @ where[b], rng) for a, b in pairs]
         true = frozenset(pairs)
         wanted = round(len(links) * s.false_share / (1.0 - s.false_share))
@@ -87,7 +87,7 @@ def drives(rng: np.random.Generator, settings: DriveSettings | None = None) -> I
 
 
 def _same_places(
-    truth: dict[NodeId, Pose2], active: dict[NodeId, Pose2], s: DriveSettings, rng: np.random.Generator
+    truth: dict[NodeId, Pose2], active: dict[NodeId, Pose2], s: DriveSettings
 ) -> list[tuple[NodeId, NodeId]]:
     """Pairs of nodes that show the same place: of a node the nearest few of each drive."""
     candidates = active | truth

@@ -68,7 +68,7 @@ class House:
         return Pose2.from_vector(rng.uniform(low, [x + width - MARGIN, y + depth - MARGIN, math.pi]))
 
 
-def draw_house(rng: np.random.Generator, *, twins: bool = False, gap: float = 0.2, count: int = 2) -> House:
+def draw_house(rng: np.random.Generator, *, twins: bool = False, count: int = 2) -> House:
     """Rooms in a row. With `twins` the last two look the same."""
     rooms, boxes, x = list[World](), list[tuple[float, float, float, float]](), 0.0
     for k in range(count):
@@ -80,7 +80,7 @@ def draw_house(rng: np.random.Generator, *, twins: bool = False, gap: float = 0.
         else:
             rooms.append(room(x, 0.0, width, depth, round(40 * (width + depth) * 2), rng))
         boxes.append((x, 0.0, width, depth))
-        x += width + gap
+        x += width + 0.2
     return House(tuple(rooms), tuple(boxes))
 
 

@@ -198,7 +198,7 @@ def scale_page(results: Mapping[str, Result]) -> str:
         "## What one of each costs", _table(("what", "cost", "from", "basis"), _costs(costs, results)),
         "## The fleet", _table(("what", "", "", "basis"), _fleet_rows()),
         "## One site", _table(head, _site(costs, plan)),
-        "## All sites", _table(head, _all(costs, plan)), ALONE,
+        "## All sites", _table(head, _all(plan)), ALONE,
         "## One building with all robots", TOGETHER, _table(head, _building(costs, plan)), OTHERS,
         "## What to watch", WATCH,
     ]  # fmt: skip
@@ -271,7 +271,7 @@ def _site(costs: Costs, plan: Plan) -> list[Row]:
     ]  # fmt: skip
 
 
-def _all(costs: Costs, plan: Plan) -> list[Row]:
+def _all(plan: Plan) -> list[Row]:
     cores = SITES * math.ceil(plan.cores)
     return [
         ("map servers", "one a site", f"{SITES}", CHOSEN),

@@ -51,7 +51,7 @@ class Room:
             seed: of its looks.
         """
         rng = np.random.default_rng(seed)
-        self._world, self._x = room(x, 0, 5, 4, 700, rng), x
+        self._world = room(x, 0, 5, 4, 700, rng)
         self._stops = [
             Pose2(x + rng.uniform(1.2, 3.8), rng.uniform(1.2, 2.8), rng.uniform(-math.pi, math.pi))
             for _ in range(NODES)

@@ -25,7 +25,7 @@ from mapweave.agent.mapping.tracking import Tracking
 from mapweave.agent.mapping.view import View
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.servo.image_drive import ImageDrive
-from mapweave.agent.settings import AgentSettings, FilterSettings
+from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.sim.events import Walk
@@ -88,7 +88,6 @@ class MappingDrive:
         ids: (N,) tracks that began at the anchor, ascending.
         points: (N, 3) m, in the anchor's robot frame: where they truly are; NaN if nothing is there.
         flat: (N,) whether the patch of a track is on one surface, so that it is one point.
-        filter_settings: of the filter that ran.
         moments: one a tick; the first is the anchor.
         images: (H, W) by the number of the moment: at the anchor, where a person is in the middle of the
             view or else farthest from the anchor, at the end.
@@ -102,7 +101,6 @@ class MappingDrive:
     ids: NDArray[np.int64]
     points: Array
     flat: NDArray[np.bool_]
-    filter_settings: FilterSettings
     moments: tuple[Moment, ...]
     images: dict[int, NDArray[np.uint8]]
     given_up: str
@@ -182,12 +180,11 @@ class _Run:
         self.robot = simulation.describe(NAME)
         settings, lens = AgentSettings(), Lens(self.robot.camera, self.robot.distortion)
         self.tracking = Tracking(self.robot, lens, settings)
-        self.filter_settings = settings.filter
         # One tick for the wheels to settle on the floor.
         simulation.step({})
         observation = simulation.step({})[NAME]
         self.world_from_anchor = simulation.truth(NAME)
-        self.anchor = self._begin(observation, Sift(lens, settings.sift), settings)
+        self.anchor = self._begin(observation, Sift(lens, settings.sift))
         self.wheels = Pose2()
         self.moments: list[Moment] = []
         self.images: list[NDArray[np.uint8] | None] = []
@@ -234,11 +231,11 @@ class _Run:
         return MappingDrive(
             name, self.robot, self.simulation.world, self.world_from_anchor, self.anchor.tracks,
             self.world_from_anchor.inverse().apply(seen.points),
-            surfaces.flat(self.world_from_anchor, camera, pixels), self.filter_settings,
+            surfaces.flat(self.world_from_anchor, camera, pixels),
             tuple(self.moments), self._telling(), self.given_up,
         )  # fmt: skip
 
-    def _begin(self, observation: Observation, sift: Sift, settings: AgentSettings) -> View:
+    def _begin(self, observation: Observation, sift: Sift) -> View:
         """Make the image the anchor view of an episode, as the mapper does."""
         if observation.image is None:
             raise InvalidValue("the camera gave no first image")

@@ -28,7 +28,6 @@ from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.verification import verify
-from mapweave.scenarios.recording import Recording
 from mapweave.scenarios.run import TrialOptions, run_trial
 from mapweave.scenarios.scenario import Scenario, load_scenario, scenario_path
 from mapweave.scenarios.score import node_truth
@@ -96,8 +95,8 @@ def run_one(scenario: Scenario, seed: int, out: Path) -> Run:
     truth = node_truth(recording)
     whole = HybridMap(recording.merged.changes)
     links = [edge for edge in whole.edges.values() if edge.kind is EdgeKind.MERGED]
-    views = shared_views(recording, scenario, seed, truth)
-    one_side = shared_views(recording, scenario, seed, truth, SIDE)
+    views = shared_views(scenario, seed, truth)
+    one_side = shared_views(scenario, seed, truth, SIDE)
     found = [verify(whole.nodes[a], whole.nodes[b]) for a, b in sorted(sorted(pair) for pair in one_side)]
     right = {frozenset((link.a, link.b)) for link in links if not is_false(link, truth)}
     return Run(
@@ -125,7 +124,6 @@ def run_one(scenario: Scenario, seed: int, out: Path) -> Run:
 
 
 def shared_views(
-    recording: Recording,
     scenario: Scenario,
     seed: int,
     truth: Mapping[NodeId, Pose2],
@@ -134,8 +132,7 @@ def shared_views(
     """Pairs of nodes of different maps whose images truly show the same surfaces.
 
     Args:
-        recording: of the trial; the furniture has stood still.
-        scenario: that was tried.
+        scenario: that was tried; the furniture has stood still.
         seed: of its world.
         truth: `world_from_robot` of each node.
         most_angle: rad, between the lines of sight to what counts as shared.

@@ -60,7 +60,6 @@ class Scene:
         own_map: what the robot has mapped.
         goal: the node at which it shall park.
         world_from_goal: where the robot really stood when it took the goal's image.
-        mapping_s: simulated time that the mapping took, s.
     """
 
     def __init__(self, seed: Sequence[int], one_view: bool) -> None:
@@ -81,7 +80,6 @@ class Scene:
         with self.simulate(_goal(self.plan, rng)) as simulation:
             self.description = simulation.describe(ROBOT)
             self.own_map, self.goal = self._map(simulation, one_view)
-            self.mapping_s = simulation.stamp_ns / 1e9
             self.world_from_goal = simulation.truth_at(ROBOT, self.goal.stamp_ns)
         merger = merger_of({self.goal.id.map: self.own_map.contents()})
         merged = merger.merged()

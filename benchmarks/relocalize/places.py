@@ -95,21 +95,6 @@ def donor_sites(seed: int) -> tuple[Site, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class Query:
-    """A question with its answer.
-
-    Attributes:
-        kind: near, far, person, exposure, blur, furniture, camera, nowhere or twins.
-        picture: what is asked.
-        site: number of the mapped building in which it was taken, -1 in an unmapped one.
-    """
-
-    kind: str
-    picture: Picture
-    site: int
-
-
-@dataclass(frozen=True, eq=False)
 class Place:
     """A node and the truth about it.
 

@@ -23,7 +23,7 @@ MOVED = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Query:
-    """A question and its answer.
+    """A question with its answer.
 
     Attributes:
         kind: one of KINDS, `nowhere` or `twins`.

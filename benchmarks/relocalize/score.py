@@ -28,7 +28,6 @@ class Reply:
     Attributes:
         query: what was asked.
         certainty: of the answer.
-        probability: of its best candidate, 0 without one.
         error_m: of its best candidate; infinite if that is in another building, or there is none.
         error_deg: likewise.
         nees: squared Mahalanobis distance of the truth, 3 expected; NaN without a candidate there.
@@ -38,7 +37,6 @@ class Reply:
 
     query: Query
     certainty: Certainty
-    probability: float
     error_m: float
     error_deg: float
     nees: float
@@ -92,7 +90,7 @@ def spent() -> Array:
 def judged(query: Query, answered: RelocalizeAnswer, truth: Mapping[NodeId, Place]) -> Reply:
     """Compare an answer with the truth."""
     if not answered.candidates:
-        return Reply(query, answered.certainty, 0.0, math.inf, math.inf, math.nan)
+        return Reply(query, answered.certainty, math.inf, math.inf, math.nan)
     best = answered.candidates[0]
     place = truth.get(best.node)
     error_m, error_deg = errors(query, place, best.node_from_robot)
@@ -100,7 +98,7 @@ def judged(query: Query, answered: RelocalizeAnswer, truth: Mapping[NodeId, Plac
     if place is not None and place.site == query.site:
         true = place.world_from_node.inverse() @ query.picture.world_from_robot
         nees = best.node_from_robot.mahalanobis2(true)
-    return Reply(query, answered.certainty, best.probability, error_m, error_deg, nees)
+    return Reply(query, answered.certainty, error_m, error_deg, nees)
 
 
 def errors(query: Query, place: Place | None, node_from_robot: PoseGaussian) -> tuple[float, float]:

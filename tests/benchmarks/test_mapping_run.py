@@ -18,7 +18,6 @@ from benchmarks.mapping_run.scene import MappingDrive, Moment, drive
 from benchmarks.mapping_run.score import LastKnown, figures, landmark_nees, reprojection_errors, track_errors
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.observation import Odometry
-from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.sim.camera import WEBCAM
 from mapweave.sim.robots import RobotSetup
@@ -186,7 +185,7 @@ def test_the_score_of_a_known_error_is_that_error() -> None:
     )  # fmt: skip
     run = MappingDrive(
         "made", robot, make_world("arena", 0), Pose2(), ids, at.apply(true.points_in_robot), np.ones(n, bool),
-        FilterSettings(), (moment, moment), {}, "",
+        (moment, moment), {}, "",
     )  # fmt: skip
     result = figures(run)
     assert result["pose_error_m"] == pytest.approx(0.03)

@@ -111,7 +111,7 @@ def test_the_loss_of_the_index_is_measured_on_the_same_views() -> None:
 
     def replies(recalled: str) -> list[Reply]:
         return [
-            Reply(query, Certainty.FOUND if one == "y" else Certainty.UNKNOWN, 1, 0, 0, 1) for one in recalled
+            Reply(query, Certainty.FOUND if one == "y" else Certainty.UNKNOWN, 0, 0, 1) for one in recalled
         ]
 
     result = lost(replies("yyyyyynnnn"), replies("yyyyynyynn"))
