@@ -46,15 +46,23 @@ class FleetQuestions:
         return "" if self._key_holder is None else self._key_holder.name
 
     def _check_role(self) -> None:
-        """The router drops what a role may not send, without a word, so that is said here.
-
-        Raises:
-            InvalidValue: missions and corrections are not of this role.
-        """
-        role = None if self._key_holder is None else self._key_holder.role
-        if role in (Role.VIEWER, Role.ROBOT):
-            raise InvalidValue(f"this is the key of a {role}: missions and corrections need an operator's")
+        """Raise InvalidValue if one may only look; see `check_role`."""
+        check_role(self._key_holder)
 
     def _ask(self, key: str, payload: bytes, timeout: float) -> list[Reply]:
         """Answers of all who answer and do not refuse."""
         return [reply for reply in self._bus.ask(key, payload, timeout) if not reply.error]
+
+
+def check_role(holder: Credentials | None) -> None:
+    """The router drops what a role may not send, without a word, so that is said here.
+
+    Args:
+        holder: of the key with which one is connected, if there is one.
+
+    Raises:
+        InvalidValue: missions and corrections are not of this role.
+    """
+    role = None if holder is None else holder.role
+    if role in (Role.VIEWER, Role.ROBOT):
+        raise InvalidValue(f"this is the key of a {role}: missions and corrections need an operator's")

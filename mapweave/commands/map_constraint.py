@@ -47,11 +47,13 @@ def constrain(arguments: argparse.Namespace, about: Subject) -> None:
     """
     from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.fleet import author
+    from mapweave.fleet_questions import check_role
     from mapweave.hybridmap.manual_constraint import ManualConstraint
 
     if arguments.out is not None and arguments.map is None:
         raise UsageError("--out goes with --map: a server keeps its own record")
     holder = None if arguments.map is not None else key_holder(network_of(arguments, settings_of(arguments)))
+    check_role(holder)
     by = author(holder, arguments.by or "")
     with arguments_read():
         constraint = ManualConstraint(about, not arguments.undo, by, time.time_ns(), arguments.because)

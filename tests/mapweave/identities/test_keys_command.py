@@ -121,6 +121,20 @@ def test_a_question_with_a_robots_key_is_said_to_need_anothers(keys: Path) -> No
     assert "a robot's" not in str(no_server("f1", replace(robot, role=Role.VIEWER)))
 
 
+@pytest.mark.parametrize("role", ["viewer", "robot"])
+@pytest.mark.parametrize(
+    "words",
+    ["link r0.1.1 r1.1.1", "unmerge r0.1 r1.1", "retire r0.1", "retire r0.1 --undo", "retire r0.1 --check"],
+)
+def test_a_correction_with_a_viewers_key_is_said_to_need_anothers(
+    keys: Path, words: str, role: str, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """The router drops it without a word: it was said that no map server answers."""
+    assert main(["keys", "add", "vic", "--role", role, "--keys", str(keys)]) == 0
+    said = complaint(capfd, "map", *words.split(), "--keys", keys / "vic.key.toml")
+    assert f"this is the key of a {role}: missions and corrections need an operator's" in said
+
+
 def test_mistakes_are_one_line(keys: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
     where = ("--keys", keys)
     assert "there are keys already" in complaint(capfd, "keys", "init", *where)
