@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.network import add_network, network_of, reach, settings_of, stop_on_signals
+from mapweave.commands.network import add_network, key_holder, network_of, reach, settings_of, stop_on_signals
 
 if TYPE_CHECKING:
     import threading
@@ -48,6 +48,7 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Drive until the person quits."""
     from mapweave.commands.usage import UsageError
+    from mapweave.fleet_questions import check_role
     from mapweave.hybridmap.errors import Refused
     from mapweave.teleoperation.gamepad import Gamepad
     from mapweave.teleoperation.keyboard import Keyboard, RawTerminal
@@ -56,9 +57,10 @@ def run(arguments: argparse.Namespace) -> int:
     name: str = arguments.name
     if not 0.1 <= arguments.speed <= 1.0:
         raise UsageError(f"--speed: {arguments.speed:g} is not within 0.1 to 1")
+    network = network_of(arguments, settings_of(arguments))
+    check_role(key_holder(network))
     gamepad = None if arguments.gamepad is None else Gamepad(arguments.gamepad, arguments.speed)
     terminal = RawTerminal() if gamepad is None else None
-    network = network_of(arguments, settings_of(arguments))
     stop = stop_on_signals()
     bus, keys = reach(network)
     try:

@@ -124,14 +124,17 @@ def test_a_question_with_a_robots_key_is_said_to_need_anothers(keys: Path) -> No
 @pytest.mark.parametrize("role", ["viewer", "robot"])
 @pytest.mark.parametrize(
     "words",
-    ["link r0.1.1 r1.1.1", "unmerge r0.1 r1.1", "retire r0.1", "retire r0.1 --undo", "retire r0.1 --check"],
-)
-def test_a_correction_with_a_viewers_key_is_said_to_need_anothers(
+    [
+        "map link r0.1.1 r1.1.1", "map unmerge r0.1 r1.1", "map retire r0.1", "map retire r0.1 --undo",
+        "map retire r0.1 --check", "drive r0 --gamepad /dev/null",
+    ],
+)  # fmt: skip
+def test_a_command_with_a_viewers_key_is_said_to_need_anothers(
     keys: Path, words: str, role: str, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """The router drops it without a word: it was said that no map server answers."""
     assert main(["keys", "add", "vic", "--role", role, "--keys", str(keys)]) == 0
-    said = complaint(capfd, "map", *words.split(), "--keys", keys / "vic.key.toml")
+    said = complaint(capfd, *words.split(), "--keys", keys / "vic.key.toml")
     assert f"this is the key of a {role}: missions and corrections need an operator's" in said
 
 
