@@ -5,11 +5,14 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from typing import Generic, TypeVar
 
 from mapweave.wire.alive_keys import AliveKeys
 from mapweave.wire.bus import Reply, Request, Sample
 from mapweave.wire.dispatch import Dispatcher
 from mapweave.wire.refusal import decode_refusal, encode_refusal
+
+Given = TypeVar("Given")
 
 
 class Declared:
@@ -35,36 +38,30 @@ class Token(Declared):
     """Be alive under a key."""
 
 
-class Subscription(Declared):
-    """Messages to a handler."""
+class _Handled(Declared, Generic[Given]):
+    """Something that a handler is called with."""
 
     def __init__(
         self,
         key: str,
         dispatcher: Dispatcher,
         remove: Callable[[Declared], None],
-        handler: Callable[[Sample], None],
+        handler: Callable[[Given], None],
     ) -> None:
         super().__init__(key, dispatcher, remove)
         self._handler = handler
+
+
+class Subscription(_Handled[Sample]):
+    """Messages to a handler."""
 
     def deliver(self, sample: Sample) -> None:
         """A message has come."""
         self._dispatcher.message(self._handler, sample, self.wanted)
 
 
-class Service(Declared):
+class Service(_Handled[Request]):
     """Questions to a handler."""
-
-    def __init__(
-        self,
-        key: str,
-        dispatcher: Dispatcher,
-        remove: Callable[[Declared], None],
-        handler: Callable[[Request], None],
-    ) -> None:
-        super().__init__(key, dispatcher, remove)
-        self._handler = handler
 
     def deliver(self, request: MemoryRequest) -> None:
         """A question has come."""
