@@ -29,8 +29,6 @@ REACH = 1.5
 """A place counts as mapped if the mapping robot has been this near to it, m,"""
 TURN = math.radians(20.0)
 """and had that heading, within this, rad."""
-NEAR = (LEVELS[-1][0], math.degrees(TURN))
-"""A node is the right place if it is that near, m and degrees."""
 
 
 class DriveMap:

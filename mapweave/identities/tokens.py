@@ -23,8 +23,6 @@ from mapweave.wire.conversion import json_value
 TOKENS = "tokens.json"
 PREFIX = "mapweave_"
 """By which people and scanners know a token when they see one."""
-DAYS = 90
-"""For which a token holds, unless it is said otherwise."""
 
 
 @dataclass(frozen=True)
