@@ -21,8 +21,6 @@ from synthetic.maps import looking_around, map_tours
 from synthetic.world import room
 from tests.mapweave.command_line import commands, parsers
 
-NOWHERE = "tcp/127.0.0.1:1"
-
 CASES: dict[str, list[tuple[int, str]]] = {
     "demo": [(USAGE, "--seed -1"), (USAGE, "--robots 1"), (USAGE, "--rooms x")],
     "sim list": [(USAGE, "--seeds 3")],

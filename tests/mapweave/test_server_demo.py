@@ -34,7 +34,6 @@ from mapweave.wire.memory import MemoryBus, MemoryHub
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.waiting import eventually, free_port
 
-TAB = "return document.querySelector('[role=tab][aria-selected=true]').textContent"
 ROBOT = "const r = mapweave.painter.robots.find(one => one.name === '{}'); return r ? [r.x, r.y] : null"
 TEXT = "return document.getElementById('{}').textContent"
 CLICK = """

@@ -267,9 +267,6 @@ DESIGNS = st.fixed_dictionaries(
 )
 
 
-TOP = st.dictionaries(st.sampled_from([field.name for field in dataclasses.fields(Design)]), ODD, max_size=1)
-
-
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(
     DESIGNS, st.dictionaries(st.sampled_from([f.name for f in dataclasses.fields(Design)]), ODD, max_size=1)

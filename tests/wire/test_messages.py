@@ -40,7 +40,6 @@ from mapweave.wire.messages import decode, decode_view, encode, encode_view
 from mapweave.wire.packing import pack
 
 HERE = PoseGaussian.from_sigmas(Pose2(0.5, -0.25, 0.125), 0.5, 0.25)
-sequences = st.integers(1, 2**53)
 scalars = st.one_of(
     st.booleans(),
     st.integers(-(2**53), 2**53),

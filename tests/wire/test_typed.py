@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
@@ -31,7 +30,6 @@ from mapweave.wire.packing import Limit
 from mapweave.wire.typed import decode, encode, packed, value_of
 
 LIMIT = Limit("sample", 10_000)
-ROW = re.compile(r"^\| `(\w+)` \| ([^|]*) \|$", re.M)
 
 
 @dataclass(frozen=True)

@@ -36,7 +36,6 @@ NAMED = """
 document.getElementById('tab-edit')?.click();
 return document.getElementById('edit-name').checkVisibility()
 """
-EXPLORE = "[...document.querySelectorAll('#selected button')].find(b => b.textContent === 'Explore').click()"
 RETIRE = """
 const body = JSON.stringify({ retire: ["r0.1.5"], because: "a mirror", by: "mallory" });
 fetch("constraints", { method: "POST", headers: { "Content-Type": "application/json" }, body });

@@ -13,8 +13,6 @@ from mapweave.mapserver.http.web import Web
 from tests.mapserver.stub_services import StubServices
 from tests.waiting import eventually
 
-KINDS = {".js": "text/javascript", ".css": "text/css", ".svg": "image/svg+xml", ".html": "text/html"}
-
 
 def test_the_browser_asks_for_all_modules_at_once(served: Web) -> None:
     root = f"http://127.0.0.1:{served.port}"

@@ -12,7 +12,6 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.merge.pose_graph.factors import Factors, Measurement
 
-HUBER = 1.5
 NODES = 6
 
 
