@@ -25,7 +25,8 @@ from synthetic.maps import changes_of, map_tours, numbered
 from synthetic.world import World, room, take_map, take_view
 
 
-def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> None:
+def held_merges(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
+    """Events: a merge has begun, and it may go on."""
     entered, go = threading.Event(), threading.Event()
     real = Merger.merged
 
@@ -35,6 +36,11 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
         return real(merger, use)
 
     monkeypatch.setattr(Merger, "merged", held)
+    return entered, go
+
+
+def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> None:
+    entered, go = held_merges(monkeypatch)
     worker = MergeWorker(LiveSchedule(), 1.0)
     assert worker.settled
     worker.start()
@@ -104,14 +110,7 @@ def mapped_room(agents: tuple[str, ...]) -> tuple[World, list[Pose2], list[Chang
 def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
     world, tour, changes = mapped_room(("a",))
     view, _ = take_view(world, tour[1], np.random.default_rng(3))
-    entered, go, real = threading.Event(), threading.Event(), Merger.merged
-
-    def held(merger: Merger, use: Callable[[MergedMap], object] | None = None) -> MergedMap:
-        entered.set()
-        assert go.wait(20)
-        return real(merger, use)
-
-    monkeypatch.setattr(Merger, "merged", held)
+    entered, go = held_merges(monkeypatch)
     worker = MergeWorker(LiveSchedule(), 1.0)
     worker.start()
     worker.constrain(ManualConstraints())

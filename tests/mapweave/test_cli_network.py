@@ -11,6 +11,7 @@ import sys
 import threading
 import time
 from contextlib import closing
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -240,6 +241,26 @@ def test_the_own_certificate_that_has_expired_is_named_by_an_agent(tmp_path, clo
     assert "`mapweave keys add r0 --role robot` at the server" in said
 
 
+def printed(program: str) -> str:
+    """What a program prints that ends well."""
+    run = [sys.executable, "-c", program]
+    return subprocess.run(run, capture_output=True, text=True, timeout=60, check=True).stdout
+
+
+def status_without_terminal(program: str, gone: Path) -> int:
+    """Exit status of a program whose terminal goes once it is "ready"; then there is the file `gone`."""
+    master, slave = pty.openpty()
+    run = [sys.executable, "-c", program]
+    with subprocess.Popen(run, stdin=slave, stdout=slave, stderr=slave, start_new_session=True) as process:
+        os.close(slave)
+        output = b""
+        while b"ready\r\n" not in output:
+            output += os.read(master, 100)
+        os.close(master)
+        gone.touch()
+        return process.wait(60)
+
+
 def test_an_interrupt_that_a_library_swallows_stops_a_process():
     """While a library in C was imported, Ctrl-C was lost, and the simulator went on."""
     program = """
@@ -254,10 +275,7 @@ except BaseException as error:
     print(type(error).__name__)
 print(stop_on_signals().wait(0.0))
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, timeout=60, check=True
-    )
-    assert done.stdout.split() == ["KeyboardInterrupt", "True"]
+    assert printed(program).split() == ["KeyboardInterrupt", "True"]
 
 
 def test_a_signal_amid_another_stops_a_process():
@@ -272,9 +290,7 @@ with stop._cond:
     signal.raise_signal(signal.SIGTERM)
 print(stop.wait(30))
 """
-    run = [sys.executable, "-c", program]
-    done = subprocess.run(run, capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout == "True\n"
+    assert printed(program) == "True\n"
 
 
 def test_a_process_ends_in_order_with_its_terminal(tmp_path):
@@ -290,15 +306,7 @@ came = stop.wait(30)
 print("ends", flush=True)
 pathlib.Path({str(tmp_path / "written")!r}).write_text(str(came))
 """
-    master, slave = pty.openpty()
-    run = [sys.executable, "-c", program]
-    with subprocess.Popen(run, stdin=slave, stdout=slave, stderr=slave, start_new_session=True) as process:
-        os.close(slave)
-        output = b""
-        while b"ready\r\n" not in output:
-            output += os.read(master, 100)
-        os.close(master)
-        assert process.wait(60) == 0
+    assert status_without_terminal(program, tmp_path / "gone") == 0
     assert (tmp_path / "written").read_text() == "True"
 
 
@@ -319,16 +327,7 @@ print("goes on", flush=True)
 logging.warning("and its log")
 pathlib.Path({str(tmp_path / "written")!r}).write_text(str(stop.is_set()))
 """
-    master, slave = pty.openpty()
-    run = [sys.executable, "-c", program]
-    with subprocess.Popen(run, stdin=slave, stdout=slave, stderr=slave, start_new_session=True) as process:
-        os.close(slave)
-        output = b""
-        while b"ready\r\n" not in output:
-            output += os.read(master, 100)
-        os.close(master)
-        (tmp_path / "gone").touch()
-        assert process.wait(60) == 0
+    assert status_without_terminal(program, tmp_path / "gone") == 0
     assert (tmp_path / "written").read_text() == "False"
 
 
@@ -342,6 +341,4 @@ stop = stop_on_signals()
 signal.raise_signal(signal.SIGHUP)
 print(stop.wait(0.3))
 """
-    run = [sys.executable, "-c", program]
-    done = subprocess.run(run, capture_output=True, text=True, timeout=60, check=True)
-    assert done.stdout == "False\n"
+    assert printed(program) == "False\n"

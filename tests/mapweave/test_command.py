@@ -241,6 +241,20 @@ def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
         assert ("0.4 m to node r1.1.5" in line) is (width == 240)
 
 
+def answer_with(monkeypatch: pytest.MonkeyPatch, found: list[FleetStatus | NotConnected]) -> None:
+    """Let `mapweave status` see one after the other, and then be interrupted."""
+
+    def answer() -> FleetStatus:
+        if not found:
+            raise KeyboardInterrupt
+        if isinstance(one := found.pop(0), NotConnected):
+            raise one
+        return one
+
+    fleet = SimpleNamespace(status=answer)
+    monkeypatch.setattr(status_command, "fleet_of", lambda arguments: nullcontext(fleet))
+
+
 @pytest.mark.parametrize("terminal", [True, False])
 def test_watching_is_live_on_a_terminal_and_tables_elsewhere(
     terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
@@ -255,21 +269,7 @@ def test_watching_is_live_on_a_terminal_and_tables_elsewhere(
     ]  # fmt: skip
     waited: list[float] = []
 
-    class Found:
-        def __enter__(self) -> Found:
-            return self
-
-        def __exit__(self, *_: object) -> None:
-            pass
-
-        def status(self) -> FleetStatus:
-            if not found:
-                raise KeyboardInterrupt
-            if isinstance(one := found.pop(0), NotConnected):
-                raise one
-            return one
-
-    monkeypatch.setattr(status_command, "fleet_of", lambda arguments: Found())
+    answer_with(monkeypatch, found)
     monkeypatch.setattr(time, "sleep", waited.append)
     console = Console(width=100, force_terminal=terminal)
     monkeypatch.setattr("mapweave.terminal.plain_or_terminal", lambda **_: console)
@@ -288,15 +288,7 @@ def test_watching_for_a_script_goes_on_while_no_server_answers(
     gone = NotConnected("no map server")
     found: list[FleetStatus | NotConnected] = [FleetStatus(), gone, gone, FleetStatus(), gone]
 
-    def answer() -> FleetStatus:
-        if not found:
-            raise KeyboardInterrupt
-        if isinstance(one := found.pop(0), NotConnected):
-            raise one
-        return one
-
-    fleet = SimpleNamespace(status=answer)
-    monkeypatch.setattr(status_command, "fleet_of", lambda arguments: nullcontext(fleet))
+    answer_with(monkeypatch, found)
     monkeypatch.setattr(time, "sleep", lambda seconds: None)
     assert main(["status", "--watch", "--json"]) == INTERRUPTED
     out, err = capsys.readouterr()

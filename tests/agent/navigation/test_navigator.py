@@ -10,6 +10,7 @@ import pytest
 from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER
 from mapweave.agent.navigation.blocks import Blocks
+from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.settings import NavigatorSettings
@@ -107,8 +108,8 @@ def test_it_goes_around_by_another_way(home):
     assert nav.tally.edges == 1 and nav.tally.skipped == 0, "it drove to the node in between"
 
 
-def test_endless_parking_is_retried_before_it_is_a_block(home):
-    """Almost at the goal, held there by nothing that could block another robot."""
+def held_at_the_goal(home: World, proximity: np.ndarray = FREE) -> tuple[Navigator, list[WhichWay]]:
+    """A robot that is held almost at the goal until it has asked for a third route; and its questions."""
     eyes = Eyes(home, Pose2(2.5, 2.0))
     settings = NavigatorSettings(blind_distance=1e9, parking_patience=3.0)
     nav = navigator(eyes, NOWHERE, B, settings)
@@ -120,27 +121,21 @@ def test_endless_parking_is_retried_before_it_is_a_block(home):
         routes.append(question)
         return Answer(question.number, RouteAnswer(straight(bare(A), bare(B), step=0.3), "a way"))
 
-    trial = Trial(nav, eyes, fleet, held=True)
+    trial = Trial(nav, eyes, fleet, proximity, held=True)
     trial.run(20.0, lambda: len(routes) == 3)
+    return nav, routes
+
+
+def test_endless_parking_is_retried_before_it_is_a_block(home):
+    """Almost at the goal, held there by nothing that could block another robot."""
+    nav, routes = held_at_the_goal(home)
     assert [question.blocked for question in routes] == [(), (), ((A, B),)], "no robot is informed at first"
     assert nav.tally.blocks == 1 and nav.tally.relocalizations == 2, "then it finds itself rebuilt"
 
 
 def test_what_is_near_at_the_goal_bars_no_other_way_to_it(home):
     """Before, the place right before the robot was the goal itself, and for 15 to 120 s no way led there."""
-    eyes = Eyes(home, Pose2(2.5, 2.0))
-    settings = NavigatorSettings(blind_distance=1e9, parking_patience=3.0)
-    nav = navigator(eyes, NOWHERE, B, settings)
-    routes: list[WhichWay] = []
-
-    def fleet(question: Question) -> Answer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2()))
-        routes.append(question)
-        return Answer(question.number, RouteAnswer(straight(bare(A), bare(B), step=0.3), "a way"))
-
-    trial = Trial(nav, eyes, fleet, WALL_AHEAD, held=True)
-    trial.run(20.0, lambda: len(routes) == 3)
+    _, routes = held_at_the_goal(home, WALL_AHEAD)
     assert routes[-1].blocked == ((A, B),)
     assert [question.obstacles for question in routes] == [()] * 3
 

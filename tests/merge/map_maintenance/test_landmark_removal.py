@@ -143,14 +143,25 @@ def test_expected_landmarks_are_visible_near_and_unoccluded() -> None:
     assert 20 < seen < len(points)
 
 
+def thing_in(world: World) -> np.ndarray:
+    """(K,) points of the eastern wall beyond y = 2.2 m, as of one thing."""
+    return np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))
+
+
+def changed(world: World, thing: np.ndarray, rng: np.random.Generator) -> World:
+    """The same world where these points look differently."""
+    other = replace(world, vectors=world.vectors.copy())
+    other.vectors[thing] = random_vectors(len(thing), rng)
+    return other
+
+
 @pytest.mark.slow
 def test_furniture_that_is_moved_fades_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
     """Landmarks of a thing that stands elsewhere from the second drive on; it returns before the last."""
     rng = np.random.default_rng(2)
     world = room(0, 0, 6, 4, 700, rng)
-    thing = np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))
-    other = replace(world, vectors=world.vectors.copy())
-    other.vectors[thing] = random_vectors(len(thing), rng)
+    thing = thing_in(world)
+    other = changed(world, thing, rng)
     # Nothing is superseded: what has been is linked with no later view.
     monkeypatch.setattr(superseding, "FOUND", 10_000)
     merger = Merger()
@@ -180,8 +191,7 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
     rng = np.random.default_rng(3)
     world = room(0, 0, 6, 4, 1200, rng)
     wall = np.flatnonzero(world.normals[:, 0] < -0.5)
-    other = replace(world, vectors=world.vectors.copy())
-    other.vectors[wall] = random_vectors(len(wall), rng)
+    other = changed(world, wall, rng)
     monkeypatch.setattr(removal, "USUAL", 0.5)
     monkeypatch.setattr(superseding, "FOUND", 10_000)
     merger = Merger()
@@ -209,9 +219,8 @@ def test_views_of_implausible_maps_fade_no_landmarks_of_others(monkeypatch: pyte
     """From when they are found to be so, and until they are not."""
     rng = np.random.default_rng(2)
     world = room(0, 0, 6, 4, 700, rng)
-    thing = np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))
-    other = replace(world, vectors=world.vectors.copy())
-    other.vectors[thing] = random_vectors(len(thing), rng)
+    thing = thing_in(world)
+    other = changed(world, thing, rng)
     monkeypatch.setattr(superseding, "FOUND", 10_000)
     merger = Merger()
     for epoch, now in enumerate([world, *[other] * 6], start=1):
@@ -233,9 +242,7 @@ def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.Mon
     """From drive to drive, superseded nodes included, as a remover that sees only the last map."""
     rng = np.random.default_rng(4)
     world = room(0, 0, 8, 4, 950, rng)
-    thing = np.flatnonzero((world.normals[:, 0] < -0.5) & (world.points[:, 1] > 2.2))
-    b = replace(world, vectors=world.vectors.copy())
-    b.vectors[thing] = random_vectors(len(thing), rng)
+    other = changed(world, thing_in(world), rng)
     monkeypatch.setattr(removal, "MOVED", 0.01)
     merger = Merger()
     judged: list[int] = []
@@ -246,7 +253,7 @@ def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.Mon
 
     monkeypatch.setattr("mapweave.merge.map_maintenance.landmark_removal.presence", counted)
     counts, faded, agree = [], 0, []
-    for epoch, now in enumerate([world, *[b] * 6], start=1):
+    for epoch, now in enumerate([world, *[other] * 6], start=1):
         # The first drives go through all of the room, the last ones through its western end.
         xs = np.arange(1.0, 7.0 if epoch < 5 else 2.5, 0.5)
         tour = [Pose2(x, 2.0 + rng.normal(0, 0.04), rng.normal(0, 0.03)) for x in xs]

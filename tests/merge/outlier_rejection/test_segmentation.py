@@ -1,5 +1,7 @@
 """A robot's own loops and drives are claims: false ones are left out and said so, the only bridge stays."""
 
+from collections.abc import Callable
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -98,17 +100,20 @@ def test_a_loop_closure_off_by_a_bay_is_left_out_with_a_reason(seed: int) -> Non
     assert false in aisles.map.edges
 
 
-def test_good_loops_bring_the_map_nearer_to_the_truth() -> None:
-    with_loops, without = [], []
+@pytest.mark.parametrize("add", [Aisles.loop, Aisles.drive])
+def test_good_loops_and_drives_bring_the_map_nearer_to_the_truth(
+    add: Callable[[Aisles, int, int], EdgeId],
+) -> None:
+    with_them, without = [], []
     for seed in range(6):
         aisles = Aisles(seed)
         without.append(aisles.error(fragments_of({A: aisles.map})[0]))
         for i, j in GOOD:
-            aisles.loop(i, j)
+            add(aisles, i, j)
         [piece] = fragments_of({A: aisles.map})
         assert not piece.refused
-        with_loops.append(aisles.error(piece))
-    assert np.mean(with_loops) < 0.8 * np.mean(without)
+        with_them.append(aisles.error(piece))
+    assert np.mean(with_them) < 0.8 * np.mean(without)
 
 
 def test_a_single_loop_that_agrees_is_enough() -> None:
@@ -164,19 +169,6 @@ def test_a_drive_between_wrong_places_is_left_out_and_bends_nothing(i: int, j: i
     ]
     assert np.array_equal(piece.graph.means, clean.graph.means)
     assert false not in merge_maps({A: aisles.map}, []).union().edges
-
-
-def test_drives_bring_the_map_nearer_to_the_truth_as_loops_do() -> None:
-    with_drives, without = [], []
-    for seed in range(6):
-        aisles = Aisles(seed)
-        without.append(aisles.error(fragments_of({A: aisles.map})[0]))
-        for i, j in GOOD:
-            aisles.drive(i, j)
-        [piece] = fragments_of({A: aisles.map})
-        assert not piece.refused
-        with_drives.append(aisles.error(piece))
-    assert np.mean(with_drives) < 0.8 * np.mean(without)
 
 
 @pytest.mark.parametrize("driven_first", [True, False])
