@@ -5,11 +5,10 @@ from __future__ import annotations
 import math
 import struct
 import time
-from dataclasses import dataclass
 
 from mapweave.agent.drivers.base import BaseReading, WheelCounter, Wheels
 from mapweave.agent.drivers.guarded_base import GuardedBase
-from mapweave.agent.drivers.serial_port import SerialPort
+from mapweave.agent.drivers.serial_port import SerialOptions, SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.drivers.wheel_guard import WheelGuard
 from mapweave.agent.drivers.wheeled import WheeledRobot
@@ -25,17 +24,6 @@ METRES_PER_COUNT = math.pi * 72e-3 / 508.8
 FASTEST_MM = 500
 QUERY = bytes([QUERY_LIST, 6, BUMPS, CHARGE, CAPACITY, MODE, LEFT_COUNTS, RIGHT_COUNTS])
 STOP = struct.pack(">Bhh", DRIVE_DIRECT, 0, 0)
-
-
-@dataclass(frozen=True)
-class CreateOptions:
-    """The table `[robot.options]`.
-
-    Attributes:
-        port: serial device.
-    """
-
-    port: str
 
 
 class CreateBase(GuardedBase):
@@ -99,5 +87,5 @@ class Create(WheeledRobot):
 
     def __init__(self, settings: RobotSettings) -> None:
         """Connect to the port in the options."""
-        options = settings.options_as(CreateOptions)
+        options = settings.options_as(SerialOptions)
         super().__init__(CreateBase(options.port), settings)

@@ -11,7 +11,7 @@ import numpy as np
 
 from mapweave.agent.drivers.base import BaseReading, WheelCounter, Wheels
 from mapweave.agent.drivers.guarded_base import GuardedBase
-from mapweave.agent.drivers.serial_port import SerialPort
+from mapweave.agent.drivers.serial_port import SerialOptions, SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.drivers.wheel_guard import WheelGuard
 from mapweave.agent.drivers.wheeled import WheeledRobot
@@ -93,17 +93,6 @@ KOALA_2_5 = Generation(
         ranger_bearings_deg=(110.0, 70.0, 35.0, 0.0, -35.0, -70.0, -110.0, -160.0, 160.0),
     ),
 )  # fmt: skip
-
-
-@dataclass(frozen=True)
-class KoalaOptions:
-    """The table `[robot.options]`.
-
-    Attributes:
-        port: serial device.
-    """
-
-    port: str
 
 
 class KoalaBase(GuardedBase):
@@ -216,5 +205,5 @@ class Koala(WheeledRobot):
 
     def __init__(self, settings: RobotSettings) -> None:
         """Connect to the port in the options."""
-        options = settings.options_as(KoalaOptions)
+        options = settings.options_as(SerialOptions)
         super().__init__(KoalaBase(options.port), settings)

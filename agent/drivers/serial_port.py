@@ -6,6 +6,7 @@ import contextlib
 import termios
 import time
 from collections.abc import Iterator
+from dataclasses import dataclass
 from typing import Any
 
 import serial
@@ -16,6 +17,17 @@ TIMEOUT = 0.3
 """s; the supported robots answer faster."""
 LONGEST_LINE = 4096
 """Bytes; longer input without an end of line is discarded as noise."""
+
+
+@dataclass(frozen=True)
+class SerialOptions:
+    """The table `[robot.options]` of a robot behind a serial port.
+
+    Attributes:
+        port: serial device.
+    """
+
+    port: str
 
 
 class SerialPort:
