@@ -21,8 +21,6 @@ from mapweave.registration.planar_ambiguity import mirrored
 from mapweave.registration.projection import Stack
 from mapweave.registration.sightings import Sightings
 
-__all__ = ["PlanarFix", "PlanarPoseSettings", "solve_planar_pose", "solve_sightings"]
-
 PREVIEW = 20
 """Sightings, about, on which all hypotheses are scored before the best fifth is scored on all."""
 

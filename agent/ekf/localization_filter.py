@@ -49,9 +49,6 @@ NEAREST = 0.05
 """Landmarks nearer than this to the node's optical centre cannot be anchored at it, m."""
 
 
-__all__ = ["LocalizationFilter", "NodeLandmarks"]
-
-
 class LocalizationFilter:
     """Iterated extended Kalman filter over [node_from_robot (3), landmarks (a, w) x n].
 

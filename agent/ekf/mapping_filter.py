@@ -41,8 +41,6 @@ NEAREST = 0.05
 """Landmarks nearer than this to the optical centre are let go, m."""
 
 
-__all__ = ["FilterSettings", "LandmarkEstimates", "MappingFilter"]
-
 SAME_STEP = (1e-3, 4e-4)
 """m and rad; a step is not linearised again for less: what is then left of second order is below 1e-4 px."""
 
