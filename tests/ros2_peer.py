@@ -177,12 +177,6 @@ class RosPeer:
         replies = self.session.liveliness().get(f"@ros2_lv/{self.domain}/**")
         return [str(reply.ok.key_expr) for reply in replies if reply.ok is not None]
 
-    def withdraw(self) -> None:
-        """Take all tokens and subscriptions back."""
-        for held in self._held:
-            held.undeclare()
-        self._held = []
-
     def close(self) -> None:
         self.session.close()  # type: ignore[no-untyped-call]
 

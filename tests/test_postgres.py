@@ -5,8 +5,9 @@ from __future__ import annotations
 import psycopg
 
 from mapweave.mapserver.log.postgres_store import PostgresStore
+from synthetic.postgres_server import PostgresServer
 from tests.mapserver.log.test_store import MAP, entry
-from tests.postgres import PostgresServer, started
+from tests.postgres import started
 from tests.waiting import eventually
 
 CONTENT = (

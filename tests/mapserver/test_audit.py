@@ -29,7 +29,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.messages import encode
 from mapweave.wire.senders import sent_by
 from mapweave.wire.zenoh_bus import ZenohBus
-from tests.mapserver.conftest import ROBOT, MappedRoom
+from tests.mapserver.house import ROBOT, MappedRoom
 from tests.waiting import eventually, free_port
 
 KEYS = Keys("demo")

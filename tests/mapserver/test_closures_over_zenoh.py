@@ -24,7 +24,7 @@ from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.zenoh_bus import ZenohBus
-from tests.mapserver.conftest import ROBOT, MappedRoom
+from tests.mapserver.house import ROBOT, MappedRoom
 from tests.waiting import eventually, free_port
 
 KEYS = Keys("demo")

@@ -39,8 +39,7 @@ from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode, encode_view
 from synthetic.maps import looking_around, map_tours, write_store
 from synthetic.world import room, take_view
-from tests.mapserver.conftest import MappedRoom
-from tests.mapserver.house import KEYS, House, ask
+from tests.mapserver.house import KEYS, House, MappedRoom, ask
 from tests.waiting import eventually
 
 THERE = NodeId("r0", 1, 3)

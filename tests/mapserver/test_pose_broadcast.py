@@ -22,7 +22,7 @@ from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.pose_messages import PoseNews
-from tests.mapserver.conftest import MappedRoom
+from tests.mapserver.house import MappedRoom
 from tests.waiting import eventually
 from tests.wire.fleets import Fleet, MemoryFleet, ZenohFleet
 

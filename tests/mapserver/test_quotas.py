@@ -20,8 +20,7 @@ from mapweave.mapserver.quotas import BURST, Quotas, QuotaSettings, TokenBucket
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.wire.messages import encode, encode_view
 from mapweave.wire.senders import sent_by
-from tests.mapserver.conftest import ROBOT
-from tests.mapserver.house import KEYS, House
+from tests.mapserver.house import KEYS, ROBOT, House
 
 
 @pytest.fixture(scope="module")

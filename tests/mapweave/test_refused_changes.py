@@ -10,6 +10,7 @@ import pytest
 
 from mapweave.cli import main
 from mapweave.hybridmap.change import ChangeBody, EdgePut
+from mapweave.hybridmap.explanation import MARGINAL
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -21,7 +22,6 @@ from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.own_maps import marginal_links
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.links import Link
-from mapweave.merge.pose_graph.marginalization import MARGINAL
 from mapweave.opened_map import open_map
 from mapweave.storage.map_file import read_map_file, write_map_file
 from mapweave.wire.keys import Keys

@@ -9,7 +9,8 @@ import pytest
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
-from tests.postgres import PostgresServer, started
+from synthetic.postgres_server import PostgresServer
+from tests.postgres import started
 from tests.waiting import eventually, free_port
 
 

@@ -20,6 +20,7 @@ from mapweave.hybridmap.descriptor import encode
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.landmark_tables import landmark_tables
+from mapweave.hybridmap.limits import MAX_LANDMARKS
 from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
@@ -27,7 +28,6 @@ from mapweave.hybridmap.ranges import Ranges
 from mapweave.registration.selection import SelectionSettings, choose
 from mapweave.wire.codec import encode_change
 from mapweave.wire.landmark_codec import (
-    MAX_LANDMARKS,
     MAX_LANDMARKS_BYTES,
     pack_features,
     pack_landmarks,

@@ -17,7 +17,7 @@ from mapweave.mapserver.cluster.settings import ClusterSettings
 from mapweave.mapserver.server import MapServer, ServerSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from tests.mapserver.conftest import MappedRoom
+from tests.mapserver.house import MappedRoom
 from tests.waiting import eventually, free_port
 
 

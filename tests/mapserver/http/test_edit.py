@@ -10,10 +10,11 @@ import cv2
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.annotation import Closure, Floor, Pin, Place, Preference
+from mapweave.hybridmap.annotation import Closure, Floor, Place, Preference
 from mapweave.hybridmap.area import inside
 from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredArea, RetiredMap
 from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web

@@ -19,8 +19,7 @@ from mapweave.mapserver.http.tls import server_context
 from mapweave.mapserver.http.web import Web
 from mapweave.wire.credentials import Role
 from tests.browser import PROGRAMS, Browser, there_is_none
-from tests.mapserver.conftest import MappedRoom
-from tests.mapserver.house import House
+from tests.mapserver.house import House, MappedRoom
 from tests.mapserver.stub_services import StubServices
 from tests.waiting import eventually
 

@@ -28,9 +28,10 @@ from mapweave.mapserver.server import MapServer
 from mapweave.opened_map import open_map
 from mapweave.wire.codec import encode_change
 from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
+from synthetic.postgres_server import PostgresServer
 from tests.mapserver.log.acknowledged_fleet import AGENT, KEYS, ROBOTS, SERVER, life
 from tests.mapserver.log.test_store import MAP, entry
-from tests.postgres import PostgresServer, started
+from tests.postgres import started
 from tests.waiting import eventually
 
 Log = list[tuple[int, bytes]]

@@ -27,8 +27,9 @@ from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.store import Run, Store
 from mapweave.wire.codec import encode_body, encode_change
+from synthetic.postgres_server import PostgresServer
 from tests.mapserver.log.test_store import MAP, OTHER, broken, edge_put, entry, node_put
-from tests.postgres import PostgresServer, started
+from tests.postgres import started
 from tests.waiting import eventually
 
 BODIES: list[ChangeBody] = [

@@ -29,7 +29,7 @@ from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import ROW_BYTES, Run, Store
 from mapweave.wire.codec import encode_body, encode_change
 from mapweave.wire.log_messages import Refusal
-from tests.postgres import PostgresServer
+from synthetic.postgres_server import PostgresServer
 
 MAP, OTHER = MapId("r0", 1), MapId("r1", 1)
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25)
