@@ -11,7 +11,6 @@ place in the code counts once.
 
 from __future__ import annotations
 
-import argparse
 import importlib.util
 import json
 import subprocess
@@ -25,6 +24,8 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
+
+from benchmarks.command_line import command_line
 
 SUMS = ("inputs", "accepted", "crashes", "hangs", "accepted_invalid")
 AT_ONCE = 2
@@ -60,15 +61,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     from benchmarks.fuzz.samples import Samples
     from benchmarks.fuzz.targets import TARGETS
 
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.fuzz", description="Hostile input.")
+    parser = command_line("fuzz", "Hostile input.")
     parser.add_argument("--seconds", type=float, default=60.0, help="altogether, of two processors")
-    parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--targets", nargs="+", choices=sorted(TARGETS), default=sorted(TARGETS))
     parser.add_argument("--keep", type=Path, metavar="DIR", help="keep findings there")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     options = parser.parse_args(argv)
-    if options.seed < 0 or options.seconds <= 0.0:
-        parser.error("give a seed of 0 or more, and seconds above 0")
+    if options.seconds <= 0.0:
+        parser.error("give seconds above 0")
     console = Console(stderr=True)
     share = AT_ONCE * options.seconds / len(options.targets)
     with tempfile.TemporaryDirectory() as temporary, Progress(console=console) as progress:

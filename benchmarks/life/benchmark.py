@@ -23,7 +23,6 @@ from __future__ import annotations
 
 import json
 import math
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
@@ -105,8 +104,7 @@ def main() -> None:
     parser.add_argument("--keep-days", type=float, default=14.0, help="superseded nodes are kept")
     a = parser.parse_args()
     if a.drives < 1 or a.stops < 1 or a.queries < 1 or not 0.0 <= a.moved <= 1.0:
-        print("life: at least one drive, stop and query; a share of 0 to 1", file=sys.stderr)
-        raise SystemExit(2)
+        parser.error("at least one drive, stop and query; a share of 0 to 1")
     console = Console(stderr=a.json)
     figures, drives = run(a.drives, a.seed, a.stops, a.moved, a.queries, a.keep_days, console)
     columns = "drive", "nodes", "superseded", "pruned", "components", "ms a new node", "last merge s"

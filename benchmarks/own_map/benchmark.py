@@ -13,9 +13,7 @@ Memory is that of the process, less what it was after the first drive.
 
 from __future__ import annotations
 
-import argparse
 import json
-import sys
 import time
 from collections.abc import Sequence
 from contextlib import closing
@@ -28,6 +26,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
+from benchmarks.command_line import command_line
 from benchmarks.life.benchmark import APART
 from benchmarks.life.house import House
 from benchmarks.process_usage import held_bytes
@@ -71,17 +70,14 @@ COLUMNS = tuple(field.name for field in fields(Drive))
 
 def main() -> None:
     """Drive, count, ask, print."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.own_map", description=__doc__.splitlines()[0])
+    parser = command_line("own_map", __doc__, "of rooms, stops and noise")
     parser.add_argument("--drives", type=int, default=100, help="through the same rooms (default 100)")
-    parser.add_argument("--seed", type=int, default=0, help="of rooms, stops and noise (default 0)")
     parser.add_argument("--stops", type=int, default=2, help="in a room on every drive (default 2)")
     parser.add_argument("--queries", type=int, default=100, help="views that are asked about (default 100)")
     parser.add_argument("--keep", action="store_true", help="retire nothing")
-    parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     a = parser.parse_args()
-    if a.drives < 1 or a.stops < 1 or a.queries < 1 or a.seed < 0:
-        print("own_map: at least one drive, stop and query; seed 0 or more", file=sys.stderr)
-        raise SystemExit(2)
+    if min(a.drives, a.stops, a.queries) < 1:
+        parser.error("--drives, --stops and --queries must be at least 1")
     console = Console(stderr=a.json)
     drives, recognised = run(a.drives, a.seed, a.stops, a.queries, not a.keep, console)
     table = Table("drive", *COLUMNS, title=f"seed {a.seed}")
