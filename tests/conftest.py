@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import gc
 import os
 import sys
@@ -34,6 +35,13 @@ sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 pytest_plugins = ["tests.postgres"]
+
+# glibc gives free memory back to the kernel, which clears it each time before it gives it again: where images
+# are tracked that was a twentieth of the time. Arrays of 32 MB or more are given back at once nevertheless.
+M_TRIM_THRESHOLD, M_MMAP_THRESHOLD = -1, -3
+if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
+    mallopt(M_TRIM_THRESHOLD, 256 << 20)
+    mallopt(M_MMAP_THRESHOLD, 32 << 20)
 
 # All that is imported and collected stays: to look for what does not takes each process a second, and again
 # whenever all is looked through later.
