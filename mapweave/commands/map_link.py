@@ -31,12 +31,20 @@ def add_to(actions: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Set the constraint, and print its effect."""
     from mapweave.commands.map_ends import names_of, node_of
-    from mapweave.commands.usage import arguments_read
+    from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.hybridmap.constraint_subject import Linked, read_pose
     from mapweave.hybridmap.named_nodes import own_ids_of
 
+    pose = None
+    if arguments.pose is not None:
+        try:
+            numbers = [float(word) for word in arguments.pose.split(",")]
+        except ValueError:
+            raise UsageError(f"--pose {arguments.pose!r}: give X,Y,DEGREES, for example 1.5,0,90") from None
+        with arguments_read():
+            pose = read_pose(numbers)
     a, b = map(node_of, own_ids_of(arguments.nodes, *names_of(arguments)))
     with arguments_read():
-        about = Linked(a, b, None if arguments.pose is None else read_pose(arguments.pose.split(",")))
+        about = Linked(a, b, pose)
     constrain(arguments, about)
     return 0

@@ -113,7 +113,12 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (FAILED, "r0.1.1 r0.1.3 --connect {at}"),
     ],
     "map history": [(USAGE, "--most 0 --map {map}"), (FAILED, "--connect {at}")],
-    "map link": [(USAGE, "r0.1.1"), (NO, "r0.1.1 r9.1.1 --map {map} --check")],
+    "map link": [
+        (USAGE, "r0.1.1"), (USAGE, "r0.1.1 r1.1.1 --pose x --map {map} --check"),
+        (USAGE, "r0.1.1 r1.1.1 --pose 1,0 --map {map} --check"),
+        (USAGE, "r0.1.1 r1.1.1 --pose nan,0,0 --map {map} --check"),
+        (NO, "r0.1.1 r9.1.1 --map {map} --check"),
+    ],
     "map unmerge": [(USAGE, "r0.1 r1.1.1 --map {map} -o {out}"), (NO, "r0.1 r9.1 --map {map} -o {out}")],
     "map retire": [(USAGE, "--map {map}"), (NO, "r9.1 --map {map} -o {out}")],
     "map undo": [(USAGE, "x"), (NO, "7 --map {map} -o {out}")],
