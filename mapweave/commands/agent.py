@@ -112,15 +112,9 @@ def add_robot(parser: argparse.ArgumentParser) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Run the robot until its driver ends or the process is stopped."""
-    from mapweave.agent.drivers.claim import Claim
-    from mapweave.agent.drivers.recorded import RecordedRobot
     from mapweave.agent.drivers.settings import REMOTE
-    from mapweave.commands.map_ends import map_of
     from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.hybridmap.errors import Refused
-    from mapweave.hybridmap.mission_order import MissionKind
-    from mapweave.processes.agent import AgentOptions
-    from mapweave.processes.agent_process import run_agent
     from mapweave.terminal import log_with_time
     from mapweave.wire.keys import check_epoch
 
@@ -131,14 +125,25 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.epoch is not None:
         with arguments_read():
             check_epoch(arguments.epoch)
-    resume = None if arguments.resume is None else map_of(arguments.resume)
-    if resume is not None and not (arguments.data / f"{name}.sqlite").exists():
-        raise Refused(f"{arguments.data}: there is no journal of {name} with a map to resume")
+    resume = None
+    if arguments.resume is not None:
+        from mapweave.commands.map_ends import map_of
+
+        resume = map_of(arguments.resume)
+        if not (arguments.data / f"{name}.sqlite").exists():
+            raise Refused(f"{arguments.data}: there is no journal of {name} with a map to resume")
     settings = settings_of(arguments)
     network = network_of(arguments, settings, name)
     simulated = arguments.lockstep and (arguments.robot or settings.robot.driver) == REMOTE
     if simulated and network.keys and not arguments.body:
         raise UsageError(simulator_beside(network))
+    # The whole pipeline: what is wrong with settings, keys or command line is said before.
+    from mapweave.agent.drivers.claim import Claim
+    from mapweave.agent.drivers.recorded import RecordedRobot
+    from mapweave.hybridmap.mission_order import MissionKind
+    from mapweave.processes.agent import AgentOptions
+    from mapweave.processes.agent_process import run_agent
+
     stop = stop_on_signals()
     bus, keys = connect(network)
     body, claim = bus, None

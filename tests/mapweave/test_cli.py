@@ -195,3 +195,19 @@ def test_help_is_quick():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
     assert (done.returncode, done.stderr) == (0, "")
+
+
+def test_what_is_wrong_with_settings_is_said_before_the_pipeline_is_imported(tmp_path):
+    (tmp_path / "r0.toml").write_text("[agent]\nsped = 1\n")
+    program = (
+        "import sys, mapweave.cli\n"
+        "status = mapweave.cli.main(['agent', 'r0', '--settings', sys.argv[1]])\n"
+        "heavy = {'mapweave.agent.pipeline', 'networkx', 'cv2', 'rosbags'} & set(sys.modules)\n"
+        "sys.exit(', '.join(sorted(heavy)) or status)"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, tmp_path / "r0.toml"], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == FAILED
+    (line,) = done.stderr.splitlines()
+    assert "no setting 'sped'" in line
