@@ -63,6 +63,11 @@ def _subject(arguments: argparse.Namespace) -> Subject:
             (node,) = map(node_of, own_ids_of([anchor], *names_of(arguments)))
             return RetiredArea(Area(node, tuple(map(read_corner, corners.split()))))
         if in_time:
-            window = arguments.begin, arguments.end, time.time_ns(), None
-            return read_window(map_of(arguments.which[0]), *window)
+            which, now = map_of(arguments.which[0]), time.time_ns()
+            if arguments.begin and arguments.end:
+                begin = read_window(which, arguments.begin, "", now, None).begin_ns
+                end = read_window(which, "", arguments.end, now, None).end_ns
+                if begin > end:
+                    raise UsageError(f"--until {arguments.end} is before --from {arguments.begin}")
+            return read_window(which, arguments.begin, arguments.end, now, None)
         return retired_of(arguments.which, *names_of(arguments))

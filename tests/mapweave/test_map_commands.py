@@ -338,6 +338,16 @@ def test_of_an_older_and_a_newer_file_the_newer_counts(
     assert not (tmp_path / "none").exists()
 
 
+def test_a_time_window_that_ends_before_it_begins_is_named_as_it_was_given(
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    """It was said in nanoseconds since 1970."""
+    window = ["--from", "2026-03-01T12:00", "--until", "2026-03-01T11:00"]
+    assert main(["map", "retire", "r0.1", *window]) == USAGE
+    said = "--until 2026-03-01T11:00 is before --from 2026-03-01T12:00"
+    assert capfd.readouterr().err == f"mapweave: {said}\n"
+
+
 def test_mismatched_files_are_reported_in_one_line(
     files: list[Path], capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
