@@ -147,6 +147,11 @@ class ManualConstraints:
         latest = self._last.get(about.key)
         return latest if latest is not None and latest.holds else None
 
+    def taken_back(self, a: NodeId, b: NodeId) -> ManualConstraint | None:
+        """The constraint by which the link by hand of two nodes no longer holds; None if there is none."""
+        latest = self._last.get(Linked(a, b).key)
+        return None if latest is None or latest.holds else latest
+
     def against(self, a: NodeId, b: NodeId) -> ManualConstraint | None:
         """The constraint by which two nodes shall not be linked; None if there is none in force."""
         pair = self._apart.get((a, b) if a <= b else (b, a))

@@ -8,7 +8,7 @@ from collections.abc import Collection, Iterable
 import networkx as nx
 
 from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.manual_constraint import reason_of
+from mapweave.hybridmap.manual_constraint import decided, reason_of
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
@@ -121,7 +121,12 @@ def _lost(part: frozenset[MapId], links: Collection[Link], after: MergedMap) -> 
     reasons_in_words += [f"{_links(count)} gone, since {why}" for why, count in sorted(whys.items())]
     if removed:
         reasons_in_words.append(f"{_links(len(removed))} gone with a node")
-    left = len(pairs) - sum(reasons.values()) - len(removed) - whys.total()
+    seen = {r.pair for r in after.refused} | {*removed}
+    seen |= {pair for pair, which in zip(pairs, away, strict=True) if which is not None}
+    by_hand = [after.constraints.taken_back(*pair) for pair in pairs - seen]
+    backs = Counter(decided(constraint) for constraint in by_hand if constraint is not None)
+    reasons_in_words += [f"{_links(count)} by hand taken back {how}" for how, count in sorted(backs.items())]
+    left = len(pairs) - sum(reasons.values()) - len(removed) - whys.total() - backs.total()
     if left > 0:
         reasons_in_words.append(f"{_links(left)} no longer among the most similar pairs")
     return "; ".join(reasons_in_words) or "a map has fallen into pieces"

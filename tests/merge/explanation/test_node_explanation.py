@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import EdgePut, NodePut, NodeRetired
-from mapweave.hybridmap.constraint_subject import Apart, RetiredMap
+from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredMap
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import Standing
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -325,6 +325,22 @@ def test_a_merge_that_loses_its_support_is_reported() -> None:
     for node in before.maps[B].nodes:
         merger.apply(B, NodeRetired(node))
     assert partings(parts, before.links, merger.merged()) == ()  # a map without nodes is part of nothing
+
+
+def test_a_split_by_a_link_that_is_taken_back_names_the_person() -> None:
+    merger = fleet()
+    linked = Linked.of(NodeId("a", 1, 1), NodeId("c", 1, 1), PoseGaussian.from_sigmas(Pose2(9.0), 0.1, 0.1))
+    by_hand = ManualConstraint(linked, True, "anna", 0, "through the yard")
+    merger.constrain(ManualConstraints([by_hand]))
+    before = merger.merged()
+    assert before.joined(A, C)
+    back = ManualConstraint(linked, False, "berta", 60 * 10**9, "another yard")
+    merger.constrain(ManualConstraints([by_hand, back]))
+    (words,) = partings(joined_maps(before), before.links, merger.merged())
+    assert words == (
+        "a.1+b.1 and c.1 are no longer one map: 1 link by hand taken back by berta on "
+        '1970-01-01 00:01 UTC: "another yard"'
+    )
 
 
 def test_joint_merges_are_listed_map_by_map_and_each_link_once() -> None:
