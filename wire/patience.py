@@ -64,11 +64,13 @@ class BusyServers:
         with self._changed:
             self._begin(timeout)
             while self._open and not self._settled:
-                self._changed.wait(self._again_at - time.monotonic() if self._again_at < end else None)
-                now = time.monotonic()
-                if self._open and not self._settled and self._again_at <= now < end:
+                pause = self._again_at - time.monotonic()
+                if pause > 0.0:
+                    self._changed.wait(pause if self._again_at < end else None)
+                else:
                     self._again_at = math.inf
-                    self._begin(end - now)
+                    if (left := end - time.monotonic()) > 0.0:
+                        self._begin(left)
             return list(self._replies)
 
     def _begin(self, timeout: float) -> None:
