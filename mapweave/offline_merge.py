@@ -57,6 +57,15 @@ class Parts:
     marginals: tuple[Edge, ...] = ()
     refused_changes: Mapping[MapId, str] = field(default_factory=dict)
 
+    def merged(
+        self, settings: MergeSettings | None = None, progress: Progress = lambda done, of: None
+    ) -> MergedMap:
+        """All of it in one map; see `merge_parts`."""
+        return merge_parts(
+            self.maps, self.constraints, progress, settings, pins=self.annotations.pins,
+            marginals=self.marginals, refused_changes=self.refused_changes,
+        )  # fmt: skip
+
 
 def parts_of(files: Mapping[Path, MapFile] | Mapping[Path | str, MapFile]) -> Parts:
     """The robots' own maps in some files, and the manual constraints in any of them.
@@ -178,8 +187,5 @@ def merge_map_files(paths: Iterable[str | PathLike[str]]) -> MapFile:
         InvalidValue: a map cannot be merged.
     """
     parts = parts_of({Path(path): read_map_file(Path(path)) for path in paths})
-    merged = merge_parts(
-        parts.maps, parts.constraints, pins=parts.annotations.pins, marginals=parts.marginals,
-        refused_changes=parts.refused_changes,
-    )  # fmt: skip
+    merged = parts.merged()
     return map_file_of(merged, parts.history, parts.annotations, parts.images)

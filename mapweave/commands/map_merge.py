@@ -5,14 +5,9 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from mapweave.commands.map_input import SOURCES, map_source, opened
-
-if TYPE_CHECKING:
-    from mapweave.merge.pose_graph.merged_map import MergedMap
-    from mapweave.merge.settings import MergeSettings
-    from mapweave.offline_merge import Parts
+from mapweave.commands.map_input import SOURCES, map_source, merge_progress, opened
 
 
 def add_to(actions: Any) -> None:
@@ -47,7 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
     check_place(arguments.out)
     settings = settings_of(arguments).merge
     parts = parts_of({one.path: one.content for one in map(opened, arguments.files)})
-    merged = merged_with_progress(parts, settings)
+    with merge_progress() as report:
+        merged = parts.merged(settings, report)
     write_map_file(arguments.out, map_file_of(merged, parts.history, parts.annotations, parts.images))
     joined = joinings((), merged)
     apart = [explanation.reason for explanation in explain_fleet(merged, 20) if not explanation.joined]
@@ -70,15 +66,3 @@ def run(arguments: argparse.Namespace) -> int:
         for words in (*parts.notes, *joined, *apart):
             print(f"  {words}")
     return 0
-
-
-def merged_with_progress(parts: Parts, settings: MergeSettings | None = None) -> MergedMap:
-    """Merge, with a bar on stderr for people."""
-    from mapweave.commands.map_input import merge_progress
-    from mapweave.offline_merge import merge_parts
-
-    with merge_progress() as report:
-        return merge_parts(
-            parts.maps, parts.constraints, report, settings, pins=parts.annotations.pins,
-            marginals=parts.marginals, refused_changes=parts.refused_changes,
-        )  # fmt: skip

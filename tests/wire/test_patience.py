@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from itertools import pairwise
 from unittest.mock import ANY
 
@@ -15,19 +15,24 @@ from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.patience import BusyServers, ask_patiently
 
 
-def test_a_busy_server_is_asked_again_at_its_time() -> None:
-    hub = MemoryHub()
-    server, person = MemoryBus(hub), MemoryBus(hub)
-    asked: list[float] = []
+def busy_twice(asked: list[float], answer: bytes) -> Callable[[Request], None]:
+    """A server that answers the third question; `asked` has when each came, s."""
 
-    def answer(request: Request) -> None:
+    def handle(request: Request) -> None:
         asked.append(time.monotonic())
         if len(asked) < 3:
             request.refuse("busy", 0.1)
         else:
-            request.reply(b"because")
+            request.reply(answer)
 
-    closing = server.serve("why", answer)
+    return handle
+
+
+def test_a_busy_server_is_asked_again_at_its_time() -> None:
+    hub = MemoryHub()
+    server, person = MemoryBus(hub), MemoryBus(hub)
+    asked: list[float] = []
+    closing = server.serve("why", busy_twice(asked, b"because"))
     assert ask_patiently(person, "why", b"", 20.0) == [Reply(b"because")]
     assert len(asked) == 3 and asked[1] - asked[0] >= 0.1
     # Not beyond the time that the person gives.
@@ -43,14 +48,14 @@ def test_a_busy_server_is_asked_again_at_its_time() -> None:
 def silent(hub: MemoryHub) -> Iterator[MemoryBus]:
     """A server that takes questions and answers none, as one that is stopped."""
     bus, end = MemoryBus(hub), threading.Event()
-    bus.serve("where", lambda request: void(end.wait(30.0)))
+
+    def hold(request: Request) -> None:
+        end.wait(30.0)
+
+    bus.serve("where", hold)
     yield bus
     end.set()
     bus.close()
-
-
-def void(_: object) -> None:
-    """A handler's result."""
 
 
 def answered(reply: Reply) -> bool:
@@ -61,15 +66,7 @@ def answered(reply: Reply) -> bool:
 def test_a_busy_server_is_asked_again_while_another_says_nothing(hub: MemoryHub, silent: MemoryBus) -> None:
     server, robot = MemoryBus(hub), MemoryBus(hub)
     asked: list[float] = []
-
-    def answer(request: Request) -> None:
-        asked.append(time.monotonic())
-        if len(asked) < 3:
-            request.refuse("busy", 0.1)
-        else:
-            request.reply(b"here")
-
-    server.serve("where", answer)
+    server.serve("where", busy_twice(asked, b"here"))
     began = time.monotonic()
     replies = BusyServers(robot, "where", b"", answered).ask(20.0)
     assert time.monotonic() - began < 5.0
@@ -83,7 +80,12 @@ def test_a_busy_server_alone_is_not_asked_again(hub: MemoryHub) -> None:
     """The robot goes on, and asks again at the time that the server names."""
     server, robot = MemoryBus(hub), MemoryBus(hub)
     asked: list[Request] = []
-    server.serve("where", lambda request: (asked.append(request), request.refuse("busy", 0.01))[1])
+
+    def refuse(request: Request) -> None:
+        asked.append(request)
+        request.refuse("busy", 0.01)
+
+    server.serve("where", refuse)
     assert BusyServers(robot, "where", b"", answered).ask(20.0) == [Reply(error="busy", retry_after=ANY)]
     assert len(asked) == 1
     server.close()
