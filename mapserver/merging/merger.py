@@ -45,7 +45,8 @@ class Merger:
     A new node is compared with its best candidates when it comes; the merged map is made when it is requested
     and something has changed, and then only where it has. New nodes are not compared with nodes superseded on
     another day, and which of two nodes of one place supersedes the other depends on what was superseded
-    before. Except for that the result depends on the maps, not on the order of changes.
+    before. In a large place database (see LandmarkIndexSettings) cells are searched, which depend on what was
+    there when they were learned. Except for that the result depends on the maps, not on the order of changes.
     """
 
     def __init__(

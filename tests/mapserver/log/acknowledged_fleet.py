@@ -33,8 +33,8 @@ HERE = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
 ROBOTS = ("r0", "r1", "r2")
 
 
-def node(map_id: MapId, number: int, rng: np.random.Generator) -> NodePut:
-    count = int(rng.integers(0, 200))
+def node(map_id: MapId, number: int, rng: np.random.Generator, landmarks: int = 200) -> NodePut:
+    count = int(rng.integers(0, landmarks))
     seen = Landmarks(
         rng.uniform(0, 230, (count, 2)).astype(np.float32), rng.integers(0, 9, (count, 32)).astype(np.uint8),
         rng.uniform(0.5, 5, count).astype(np.float32), np.full(count, 0.05, np.float32),
@@ -47,21 +47,21 @@ def edge(map_id: MapId, number: int, a: int, b: int) -> EdgePut:
     return EdgePut(Edge(NodeId(*map_id, number), *ends, HERE, EdgeKind.MAPPED))
 
 
-def life(map_id: MapId, rng: np.random.Generator, length: int) -> list[ChangeBody]:
-    """Nodes with edges; some are put again, some are retired."""
+def life(map_id: MapId, rng: np.random.Generator, length: int, landmarks: int = 200) -> list[ChangeBody]:
+    """Nodes with fewer landmarks than this, and edges; some are put again, some are retired."""
     changes: list[ChangeBody] = []
     nodes: list[int] = []
     edges: list[int] = []
     for number in range(1, length):
         draw = rng.random()
         if len(nodes) < 3 or not edges or draw < 0.5:
-            changes.append(node(map_id, number, rng))
+            changes.append(node(map_id, number, rng, landmarks))
             nodes.append(number)
             if len(nodes) > 1:
                 edges.append(1000 + number)
                 changes.append(edge(map_id, edges[-1], nodes[-2], number))
         elif draw < 0.7:
-            changes.append(node(map_id, int(rng.choice(nodes)), rng))
+            changes.append(node(map_id, int(rng.choice(nodes)), rng, landmarks))
         elif draw < 0.8:
             a, b = rng.choice(nodes, 2, replace=False)
             changes.append(edge(map_id, int(rng.choice(edges)), int(a), int(b)))
