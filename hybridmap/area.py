@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import combinations, pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +20,8 @@ FARTHEST = 1e4
 """Of a corner from its anchor, m."""
 ROUND = 16
 """Corners of the polygon around a circle; it reaches 2 % beyond the circle at its corners."""
+SLIVER = 1e-6
+"""m; what is narrower comes of rounding: a corner that touches another side may lie on either side of it."""
 
 Floats = NDArray[np.float64]
 
@@ -39,7 +42,9 @@ class Area:
         """Refuse what encloses nothing.
 
         Raises:
-            InvalidValue: too few or too many corners, one that is far away, or all on one line.
+            InvalidValue: too few or too many corners, one that is far away, or all on one line. An outline
+                that crosses itself is not refused here, so that what was kept before can be read;
+                see `check_outline`.
         """
         if not LEAST_CORNERS <= len(self.corners) <= MOST_CORNERS:
             raise InvalidValue(
@@ -76,6 +81,10 @@ class Area:
         anchor_from_merged = merged_from_anchor.inverse()
         within = (anchor_from_merged @ Pose2(x, y) for x, y in corners)
         return Area(anchor, tuple((pose.x, pose.y) for pose in within))
+
+    def check_outline(self) -> None:
+        """Refuse an outline that crosses itself (InvalidValue)."""
+        check_outline(self.corners)
 
     @property
     def size(self) -> float:
@@ -139,6 +148,77 @@ def _side(a: Floats, b: Floats, point: Floats) -> Floats:
     """Positive if a point lies to the left of the line from a to b."""
     along, to = b - a, point - a
     return np.asarray(along[..., 0] * to[..., 1] - along[..., 1] * to[..., 0])
+
+
+def check_outline(corners: Sequence[tuple[float, float]]) -> None:
+    """Refuse an outline that crosses itself: what lies inside would not be what a person means.
+
+    It may touch itself, and end with its first corner.
+
+    Args:
+        corners: (x, y) in order, m.
+
+    Raises:
+        InvalidValue: it crosses itself, and where.
+    """
+    outline = np.array(corners, dtype=float)
+    crossings = _crossings(outline)
+    if not _encloses_twice(outline, crossings):
+        return
+    sides = [f"from corner {k + 1} to {(k + 1) % len(outline) + 1}" for pair in crossings for k in pair]
+    where = f" (its side {sides[0]} and that {sides[1]})" if sides else ""
+    raise InvalidValue(f"the outline of the area crosses itself{where}: give the corners in order around it")
+
+
+def _crossings(outline: Floats) -> dict[tuple[int, int], float]:
+    """The sides that cross each other within both, by their first corners, with the y of the crossing.
+
+    Args:
+        outline: (C, 2) corners in order.
+    """
+    a, b = outline, np.roll(outline, -1, axis=0)
+    along = b - a
+    found = {}
+    for i, j in combinations(range(len(outline)), 2):
+        turn = along[i, 0] * along[j, 1] - along[i, 1] * along[j, 0]
+        if turn == 0.0:
+            continue
+        to = a[j] - a[i]
+        on_first = (to[0] * along[j, 1] - to[1] * along[j, 0]) / turn
+        on_second = (to[0] * along[i, 1] - to[1] * along[i, 0]) / turn
+        if 0.0 < on_first < 1.0 and 0.0 < on_second < 1.0:
+            found[i, j] = float(a[i, 1] + on_first * along[i, 1])
+    return found
+
+
+def _encloses_twice(outline: Floats, crossings: Mapping[tuple[int, int], float]) -> bool:
+    """Whether an outline goes more than once around something, or around two things in opposite directions.
+
+    That is so wherever it crosses itself, also at a corner.
+
+    Args:
+        outline: (C, 2) corners in order.
+        crossings: of its sides.
+    """
+    (x1, y1), (x2, y2) = outline.T, np.roll(outline, -1, axis=0).T
+    levels = np.unique([*outline[:, 1], *crossings.values()])
+    turns = {0}
+    for low, high in pairwise(levels):
+        if high - low <= SLIVER:
+            continue
+        # Between two levels no side begins, ends or crosses another.
+        y = (low + high) / 2.0
+        across = (np.minimum(y1, y2) < y) & (y < np.maximum(y1, y2))
+        up, x = (
+            y2[across] > y1[across],
+            (x1 + (y - y1) / np.where(y2 == y1, 1.0, y2 - y1) * (x2 - x1))[across],
+        )
+        order = np.argsort(x)
+        around = np.cumsum(np.where(up[order], 1, -1))[:-1]
+        turns.update(around[np.diff(x[order]) > SLIVER].tolist())
+        if max(turns) - min(turns) > 1:
+            return True
+    return False
 
 
 def read_corner(word: str) -> tuple[float, float]:

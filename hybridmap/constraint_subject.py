@@ -252,9 +252,16 @@ class RetiredWindow:
     end_ns: Stamp
 
     def __post_init__(self) -> None:
-        """Refuse an end before the beginning (InvalidValue)."""
-        if not 0 <= self.begin_ns <= self.end_ns:
-            raise InvalidValue(f"a time window ends after it begins: {self.begin_ns} to {self.end_ns} ns")
+        """Refuse an end before the beginning, and what is no time (InvalidValue)."""
+        if not (0 <= self.begin_ns <= MAX_STAMP_NS and 0 <= self.end_ns <= MAX_STAMP_NS):
+            raise InvalidValue(f"a time window is between 0 and {MAX_STAMP_NS} ns since 1970")
+        if self.begin_ns > self.end_ns:
+            begin, end = _time(self.begin_ns), _time(self.end_ns)
+            if begin == end:
+                begin, end = f"{begin} ({self.begin_ns} ns)", f"{end} ({self.end_ns} ns)"
+            raise InvalidValue(
+                f"a time window ends after it begins: its end, {end}, is before its beginning, {begin}"
+            )
 
     @property
     def key(self) -> tuple[str, ...]:

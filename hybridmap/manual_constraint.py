@@ -63,6 +63,11 @@ class ConstraintRequest:
     constraint: ManualConstraint
     check: bool = False
 
+    def __post_init__(self) -> None:
+        """Refuse an area whose outline crosses itself (InvalidValue); one that was kept is taken back."""
+        if self.constraint.holds and isinstance(self.constraint.about, RetiredArea):
+            self.constraint.about.area.check_outline()
+
 
 @dataclass(frozen=True, slots=True)
 class ConstraintList:

@@ -7,7 +7,7 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor
+from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor, Place, Preference
 from mapweave.hybridmap.constraint_subject import nodes_in_words
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan
@@ -181,6 +181,8 @@ def check_annotation(
     if before is not None and before.body == annotation.body:
         raise InvalidValue(f"that is known already: {before.words}")
     body = annotation.body
+    if isinstance(body, Place | Closure | Preference) and body.area is not None:
+        body.area.check_outline()
     if isinstance(body, Closure) and body.end_ns is not None and body.end_ns <= annotation.stamp_ns:
         raise InvalidValue(f"the closure is over already: {body.words}")
     anchor = body.anchor

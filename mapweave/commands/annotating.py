@@ -51,10 +51,12 @@ def area_fields(arguments: argparse.Namespace) -> dict[str, object]:
     """The options of `add_area_options` as fields of an annotation.
 
     Raises:
-        UsageError: a corner is no position, there are too few or too many, or the radius is no length.
+        UsageError: a corner is no position, there are too few or too many, their outline crosses itself, or
+            the radius is no length.
     """
     from mapweave.commands.usage import UsageError
-    from mapweave.hybridmap.area import FARTHEST, LEAST_CORNERS, MOST_CORNERS
+    from mapweave.hybridmap.area import FARTHEST, LEAST_CORNERS, MOST_CORNERS, check_outline
+    from mapweave.hybridmap.errors import InvalidValue
 
     fields: dict[str, object] = {}
     if arguments.radius is not None:
@@ -67,6 +69,10 @@ def area_fields(arguments: argparse.Namespace) -> dict[str, object]:
         if None in corners or not LEAST_CORNERS <= len(corners) <= MOST_CORNERS:
             many = f"{LEAST_CORNERS} to {MOST_CORNERS}"
             raise UsageError(f"--corners: give {many} positions, as 3.1,-2.0 4,-2 4,1.5")
+        try:
+            check_outline([corner for corner in corners if corner is not None])
+        except InvalidValue as error:
+            raise UsageError(f"--corners: {error}") from None
         fields["corners"] = corners
     if arguments.near:
         fields["near"] = arguments.near

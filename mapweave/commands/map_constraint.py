@@ -14,7 +14,7 @@ from mapweave.commands.network import add_network, key_holder, network_of, setti
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.constraint_subject import Subject
-    from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+    from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint, ManualConstraints
 
 
 def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -> None:
@@ -48,7 +48,7 @@ def constrain(arguments: argparse.Namespace, about: Subject) -> None:
     from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.fleet import author
     from mapweave.fleet_questions import check_role
-    from mapweave.hybridmap.manual_constraint import ManualConstraint
+    from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
 
     if arguments.out is not None and arguments.map is None:
         raise UsageError("--out goes with --map: a server keeps its own record")
@@ -57,8 +57,9 @@ def constrain(arguments: argparse.Namespace, about: Subject) -> None:
     by = author(holder, arguments.by or "")
     with arguments_read():
         constraint = ManualConstraint(about, not arguments.undo, by, time.time_ns(), arguments.because)
+        request = ConstraintRequest(constraint, arguments.check)
     if arguments.map is None:
-        _send_to_server(arguments, constraint, "" if holder is None else holder.name)
+        _send_to_server(arguments, request, "" if holder is None else holder.name)
     else:
         _rewrite(arguments, constraint)
         arguments.map = arguments.map if arguments.check else arguments.out or arguments.map
@@ -78,14 +79,12 @@ def constraints_of(arguments: argparse.Namespace) -> ManualConstraints:
     )
 
 
-def _send_to_server(arguments: argparse.Namespace, constraint: ManualConstraint, sender: str) -> None:
+def _send_to_server(arguments: argparse.Namespace, request: ConstraintRequest, sender: str) -> None:
     from mapweave.commands.map_ends import ask
-    from mapweave.hybridmap.manual_constraint import ConstraintRequest
     from mapweave.wire.log_messages import decode_record
     from mapweave.wire.messages import encode
     from mapweave.wire.senders import sent_by
 
-    request = ConstraintRequest(constraint, arguments.check)
     for reply in ask(arguments, lambda keys: sent_by(keys.any_constrain(), sender), encode(request)):
         print(decode_record(reply.payload)["said"])
     if not arguments.check:

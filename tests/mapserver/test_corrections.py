@@ -15,18 +15,20 @@ import pytest
 
 from mapweave import Fleet
 from mapweave.cli import main
-from mapweave.exit_status import NO
+from mapweave.exit_status import NO, USAGE
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.constraint_subject import Linked, RetiredArea, RetiredNodes
 from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
 from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
 from mapweave.storage.map_file import MapFile
 from mapweave.wire.keys import Keys
+from mapweave.wire.messages import encode
 from synthetic.maps import LOG_ID, entries_of, map_tours, write_store
 from synthetic.world import room
 from tests.waiting import eventually
@@ -247,6 +249,74 @@ def test_a_closure_of_an_edge_that_is_none_is_refused_and_others_say_how_much_th
     assert capfd.readouterr().err.startswith("mapweave: no edge joins a.1.1 and b.1.5 (")
     assert main(["close", "a.1.1", "a.1.3", "--map", str(path)]) == 0
     assert re.search(r"; it closes \d+ ways? of robots$", capfd.readouterr().out.strip())
+
+
+def test_an_outline_that_crosses_itself_is_refused_by_every_way_to_give_one(
+    small: Asking, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A bow tie was taken, and closed two corners of the floor that was meant."""
+    words = [(0.0, 0.0), (2.0, 2.0), (2.0, 0.0), (0.0, 2.0)]
+    line = (
+        "the outline of the area crosses itself (its side from corner 1 to 2 and that from corner 3 to 4): "
+    )
+    line += "give the corners in order around it"
+    bow_tie, corners = Area(FIRST, tuple(words)), [list(corner) for corner in words]
+    fleet, area = small.fleet, {"anchor": str(FIRST), "corners": corners}
+    for kind, more in (("place", {}), ("closure", {}), ("preference", {"factor": 2.0})):
+        for field in ({"area": area}, {"corners": corners}):
+            with pytest.raises(Refused, match=f"^{re.escape(line)}$"):
+                fleet.annotate(kind, "hall", **field, **more)
+    with pytest.raises(InvalidValue, match=f"^{re.escape(line)}$"):
+        fleet.retire(area=bow_tie)
+    assert small.http("POST", {"area": area}) == (400, {"error": line})
+    # As a client that does not check sends it.
+    raw = encode(ConstraintRequest(ManualConstraint(RetiredArea(bow_tie), False, "anna", 1)))
+    unchecked = raw.replace(b"\xa5holds\xc2", b"\xa5holds\xc3")
+    assert unchecked != raw
+    (reply,) = fleet._bus.ask(fleet._keys.any_constrain(), unchecked, 10.0)
+    assert line in reply.error
+    path = tmp_path / "both.mapweave"
+    fleet.save(path)
+    before = path.read_bytes()
+    capfd.readouterr()
+    at = [f"{x:g},{y:g}" for x, y in words]
+    for where in (small.at, ["--map", str(path)]):
+        for command in (["place", "add", "hall"], ["close"], ["avoid"]):
+            assert main([*command, "--corners", *at, *where]) == USAGE
+            assert capfd.readouterr().err == f"mapweave: --corners: {line}\n"
+        assert main(["map", "retire", "--area", str(FIRST), " ".join(at), *where]) == USAGE
+        assert capfd.readouterr().err == f"mapweave: {line}\n"
+    assert not fleet.annotations().made and not fleet.constraints() and path.read_bytes() == before
+    # The same corners in order, the first of them again at the end.
+    square = [corners[0], corners[2], corners[1], corners[3], corners[0]]
+    assert "4.0 m²" in fleet.annotate("place", "hall", area={**area, "corners": square})
+    fleet.withdraw("place", "hall")
+
+
+@pytest.mark.parametrize(
+    ("begin", "end", "words"),
+    [
+        (
+            "2026-03-01T12:05", "2026-03-01T13:00+01:00",
+            "its end, 2026-03-01 12:00:00 UTC, is before its beginning, 2026-03-01 12:05:00 UTC",
+        ),
+        (
+            1_772_366_700_000_000_009, 1_772_366_700_000_000_005,
+            "its end, 2026-03-01 12:05:00 UTC (1772366700000000005 ns), is before its beginning, "
+            "2026-03-01 12:05:00 UTC (1772366700000000009 ns)",
+        ),
+        (5, -5, "between 0 and 9223372036854775807 ns since 1970"),
+        (-(10**30), 5, "between 0 and 9223372036854775807 ns since 1970"),
+    ],
+)  # fmt: skip
+def test_a_time_window_that_ends_before_it_begins_is_refused_with_times_that_people_read(
+    small: Asking, begin: str | int, end: str | int, words: str
+) -> None:
+    status, answer = small.http("POST", {"window": {"map": "a.1", "begin": begin, "end": end}, "check": True})
+    assert status == 400 and answer["error"].count("\n") == 0
+    assert words in answer["error"]
+    with pytest.raises(InvalidValue, match=re.escape(words)):
+        small.fleet.retire("a.1", begin=begin, end=end)
 
 
 @pytest.fixture(scope="module")

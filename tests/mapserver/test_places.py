@@ -132,6 +132,10 @@ def test_places_over_http(house: House) -> None:
             (b'{"name": "x", "body": {"kind": "place", "colour": 1}}', "a place has no colour"),
             (b'{"name": "x", "body": {"kind": "place", "node": 5}}', "Expected `array"),
             (b'{"name": "x", "body": {"kind": "place", "node": "50,50"}}', "nothing is mapped within 2 m"),
+            (
+                b'{"name": "x", "body": {"kind": "place", "corners": [[0, 0], [2, 2], [2, 0], [0, 2]]}}',
+                "crosses itself",
+            ),
             (b'{"name": "r0.1.1", "body": {"kind": "place", "node": "r0.1.3"}}', "looks like a node"),
             (b'{"name": "x", "body": {"kind": "place", "radius": 1}}', "Expected `array"),
             (b'{"name": "x", "body": {"kind": "place", "radius": 1, "node": ["r0"]}}', "Expected `array`"),
