@@ -1,4 +1,4 @@
-"""Goals in a person's words: a node, a named place, a position in the merged map, home."""
+"""Goals, and places on the way, in a person's words: a node, a named place, a position, home."""
 
 from __future__ import annotations
 
@@ -10,13 +10,14 @@ HOME = "home"
 FORMS = "give a node (r0.1.17), a named place, a position in the merged map (3.1,-2.0) or home"
 
 
-def node_of_goal(goal: str, map_id: MapId, places: Places) -> NodeId:
-    """The node where a robot shall park.
+def node_of_goal(goal: str, map_id: MapId, places: Places, name: str = "goal") -> NodeId:
+    """The node where a robot shall park, or which it shall pass.
 
     Args:
         goal: in a person's words.
         map_id: the map that the robot makes.
         places: of the merged map.
+        name: what errors call it.
 
     Raises:
         InvalidValue: there is no such goal, or the robot's map is not joined with it.
@@ -34,13 +35,13 @@ def node_of_goal(goal: str, map_id: MapId, places: Places) -> NodeId:
             node = NodeId.parse(goal)
         except InvalidValue:
             raise InvalidValue(
-                f"goal {goal!r} is no place of this map{places.alike(goal)}: {FORMS}"
+                f"{name} {goal!r} is no place of this map{places.alike(goal)}: {FORMS}"
             ) from None
-        if node.map == map_id and not router.closed_goal(node):
+        if node.map == map_id and not router.closed_goal(node, name):
             return node  # the robot knows best
     else:
         node = places.resolve(goal, (merged.component_of(own[0]) or 0) if own else 0).node
     # A robot that has mapped nothing yet may find itself on the map of another.
-    if missing := router.missing(min(own, default=node), node):
-        raise InvalidValue(f"goal {goal}: {missing}" if named else missing)
+    if missing := router.missing(min(own, default=node), node, ("start", name)):
+        raise InvalidValue(f"{name} {goal}: {missing}" if named else missing)
     return node

@@ -196,7 +196,7 @@ class MissionRelay:
             map_id = MapId(robot, 0 if status is None else status.epoch)
             places = self._places()
             node = node_of_goal(request.goal, map_id, places)
-            via = tuple(node_of_goal(word, map_id, places) for word in request.via)
+            via = tuple(node_of_goal(word, map_id, places, "via point") for word in request.via)
         order = MissionOrder(
             request.id, robot, request.kind, request.stamp_ns, request.by, node, request.goal, via
         )

@@ -194,9 +194,15 @@ class Router:
         entry = replace(answer.legs[0], previous_from_node=known @ answer.legs[0].previous_from_node)
         return replace(answer, legs=(entry, *answer.legs[1:]))
 
-    def missing(self, start: NodeId, goal: NodeId) -> str:
-        """Why no route can exist, in words; empty if there may be one."""
-        for name, node in (("start", start), ("goal", goal)):
+    def missing(self, start: NodeId, goal: NodeId, names: tuple[str, str] = ("start", "goal")) -> str:
+        """Why no route can exist, in words; empty if there may be one.
+
+        Args:
+            start: where it begins.
+            goal: where it ends.
+            names: what the words call the two.
+        """
+        for name, node in zip(names, (start, goal), strict=True):
             if node not in self.merged.poses:
                 retired = self.merged.constraints.retires(node)
                 apart = self.merged.set_apart.get(node.map)
@@ -206,7 +212,7 @@ class Router:
         parts = self.merged.component_of(start), self.merged.component_of(goal)
         if parts[0] != parts[1] and not (portals := self.portals).lead(start, goal):
             return portals.apart(start, goal)
-        return self.closed_goal(goal)
+        return self.closed_goal(goal, names[1])
 
     def _nearest(self, node: NodeId) -> str:
         """Which maps or nodes there are instead of one that is not there."""
@@ -216,10 +222,12 @@ class Router:
             return f": {error}"
         return ""
 
-    def closed_goal(self, goal: NodeId) -> str:
-        """Why a goal is closed, in words; empty if it is not."""
+    def closed_goal(self, goal: NodeId, name: str = "goal") -> str:
+        """Why a goal, which the words call `name`, is closed; empty if it is not."""
         closure = self.rules.closure_at(goal)
-        return "" if closure is None else f"goal {goal} is in {closure.name}, which is {rule_words(closure)}"
+        return (
+            "" if closure is None else f"{name} {goal} is in {closure.name}, which is {rule_words(closure)}"
+        )
 
     def choices(self, start: NodeId, goal: NodeId) -> Iterator[Mapping[NodeId, Pose2]]:
         """Sets of nodes over which a way is searched, one after the other.

@@ -359,7 +359,7 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             if not taken and replies:
                 raise Refused(replies[0].error.removeprefix("refused: "))
             if not taken:
-                nodes = tuple(node for word in via if (node := _node(word)) is not None)
+                nodes = tuple(node for word in via if (node := _node(word, "via point")) is not None)
                 report = self._direct(robot, kind, _node(goal), goal, nodes)
                 break
             report = decode(taken[0].payload, MissionReport)
@@ -393,8 +393,9 @@ def _key(report: MissionReport) -> tuple[str, str]:
     return report.order.robot, report.order.id
 
 
-def _node(goal: str) -> NodeId | None:
+def _node(goal: str, name: str = "goal") -> NodeId | None:
     try:
         return NodeId.parse(goal) if goal else None
     except InvalidValue:
-        raise InvalidValue(f"goal {goal!r}: without a map server give a node, r0.1.17 for example") from None
+        advice = "without a map server give a node, r0.1.17 for example"
+        raise InvalidValue(f"{name} {goal!r}: {advice}") from None

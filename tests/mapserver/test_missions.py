@@ -101,6 +101,27 @@ def test_a_goal_that_does_not_exist_is_refused_at_once(house: House, goal: str, 
     link.close()
 
 
+@pytest.mark.parametrize(
+    ("via", "reason"),
+    [
+        ("r9.1.1", "^via point r9.1.1 is not in the merged map: there is no map r9.1; known are: "),
+        ("kitchen", "^via point 'kitchen' is no place of this map: give a node"),
+        ("50,50", "^nothing is mapped within 2 m of 50,50"),
+    ],
+)
+def test_a_place_on_the_way_that_does_not_exist_is_not_called_the_goal(
+    house: House, via: str, reason: str
+) -> None:
+    link, control = house.robot()
+    with pytest.raises(InvalidValue, match=reason):
+        house.person.go("r0", str(THERE), via=[str(THERE), via])
+    assert control.report is None and house.person.missions() == ()
+    link.close()
+    house.stop_server()
+    with pytest.raises(InvalidValue, match=r"^via point 'kitchen': without a map server give a node"):
+        house.person.go("r0", str(THERE), via=["kitchen"])
+
+
 def test_a_position_leads_to_the_nearest_node(house: House) -> None:
     link, _ = house.robot()
     merged = house.server._worker.current().merged
