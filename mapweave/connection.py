@@ -39,15 +39,20 @@ def reach(settings: BusSettings, advice: str = "give the endpoint of its router 
     from mapweave.wire.zenoh_bus import ZenohBus
 
     bus = ZenohBus(replace(settings, attempt=SOON / len(settings.endpoints)))
-    found = bus.wait_connected(UNHEARD)
-    if not found and not all(map(_refused, settings.endpoints)):
-        found = bus.wait_connected(SOON - UNHEARD)
-    if not found:
+    if not found_soon(bus, settings):
         bus.close()
         where = ", ".join(settings.endpoints)
         refused = not_let_in(settings)
         raise NotConnected(f"no router at {where}: {refused or f'start `mapweave server`, or {advice}'}")
     return bus
+
+
+def found_soon(bus: ZenohBus, settings: BusSettings) -> bool:
+    """Wait until a connection is there, for less time where nothing listens; returns whether it is."""
+    found = bus.wait_connected(UNHEARD)
+    if not found and not all(map(_refused, settings.endpoints)):
+        found = bus.wait_connected(SOON - UNHEARD)
+    return found
 
 
 def not_let_in(settings: BusSettings) -> str:

@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 import threading
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -23,7 +24,7 @@ from mapweave.commands.network import (
     stop_on_signals,
     warn_without_router,
 )
-from mapweave.connection import SOON
+from mapweave.connection import found_soon
 from mapweave.extras import need
 
 if TYPE_CHECKING:
@@ -137,27 +138,29 @@ def run(arguments: argparse.Namespace) -> int:
     simulated = arguments.lockstep and (arguments.robot or settings.robot.driver) == REMOTE
     if simulated and network.keys and not arguments.body:
         raise UsageError(simulator_beside(network))
-    # The whole pipeline: what is wrong with settings, keys or command line is said before.
-    from mapweave.agent.drivers.claim import Claim
-    from mapweave.agent.drivers.recorded import RecordedRobot
-    from mapweave.hybridmap.mission_order import MissionKind
-    from mapweave.processes.agent import AgentOptions
-    from mapweave.processes.agent_process import run_agent
-
-    stop = stop_on_signals()
     bus, keys = connect(network)
-    body, claim = bus, None
+    opened, body, beside, claim = time.monotonic(), bus, network, None
     robot: Robot | None = None
     try:
         if arguments.body:
-            body, _ = connect(replace(network, endpoints=(arguments.body,), keys=""))
-        if body.wait_connected(SOON):
+            beside = replace(network, endpoints=(arguments.body,), keys="")
+            body, _ = connect(beside)
+        # The whole pipeline, while the router is looked for. What is wrong with settings, keys or command
+        # line is said before.
+        from mapweave.agent.drivers.claim import Claim
+        from mapweave.agent.drivers.recorded import RecordedRobot
+        from mapweave.hybridmap.mission_order import MissionKind
+        from mapweave.processes.agent import AgentOptions
+        from mapweave.processes.agent_process import run_agent
+
+        stop = stop_on_signals()
+        if found_soon(body, client_settings(beside)):
             claim = Claim(body, keys, name)
         robot, synchronization = checked, _ = open_robot(
             arguments, settings.robot, body, network.fleet, name, arguments.lockstep
         )
         # After what is wrong with settings and driver, which then is the only line.
-        warn_without_router(bus, name, client_settings(network))
+        warn_without_router(bus, name, client_settings(network), opened)
         if arguments.record is not None:
             robot = RecordedRobot(robot, arguments.record, print_line=print_error)
         # A stop signal ends the wait for the robot.

@@ -216,21 +216,28 @@ def reach(network: NetworkSettings, advice: str = "give --connect") -> tuple[Zen
     return connection.reach(client_settings(network), advice), Keys(network.fleet)
 
 
-def warn_without_router(bus: ZenohBus, name: str, settings: BusSettings) -> None:
+def warn_without_router(bus: ZenohBus, name: str, settings: BusSettings, since: float | None = None) -> None:
     """Say on stderr if no router is reached soon or for long, and when one is found then; does not wait.
 
     A router that is only restarted is not reported.
+
+    Args:
+        bus: the connection.
+        name: who looks for a router.
+        settings: of the connection.
+        since: when it was opened, by `time.monotonic`; None: now.
     """
     from mapweave.connection import not_let_in
     from mapweave.terminal import stamped
 
     where = ", ".join(settings.endpoints)
+    opened = time.monotonic() if since is None else since
 
     def say(words: str) -> None:
         print(stamped(f"{name} {words}"), file=sys.stderr, flush=True)
 
     def look() -> None:
-        patience, since = SOON, time.monotonic()
+        patience, since = SOON, opened
         while not bus.closed:
             if bus.connected():
                 patience, since = LOST, time.monotonic()

@@ -92,9 +92,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Play the recording to its end."""
     from mapweave.agent.drivers.replay import Replay
     from mapweave.agent.recordings.incomplete import NoOdometry
-    from mapweave.hybridmap.mission_order import MissionKind
-    from mapweave.processes.agent import AgentOptions
-    from mapweave.processes.agent_process import run_agent
 
     try:
         robot = Replay(arguments.recording, arguments.robot, options=options_of(arguments))
@@ -105,23 +102,27 @@ def run(arguments: argparse.Namespace) -> int:
     name = name_of(arguments)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
-    options = AgentOptions(
-        name=name,
-        data=arguments.data,
-        epoch=arguments.epoch,
-        fresh=True,  # a recording begins where it began, not where another has ended
-        mission=MissionKind.CARRIED,
-        server=network.server,
-        total=len(robot),
-        recorded=True,
-        patience=0.0 if arguments.offline else arguments.timeout,
-        calibration=calibration_of(arguments, name),
-        rerun=arguments.rerun,
-    )
-    stop = stop_on_signals()
     bus, keys = _bus(network, name, arguments.offline)
     try:
-        run_agent(robot, bus, keys, settings.agent, options, stop)
+        # The whole pipeline, while the router is looked for.
+        from mapweave.hybridmap.mission_order import MissionKind
+        from mapweave.processes.agent import AgentOptions
+        from mapweave.processes.agent_process import run_agent
+
+        options = AgentOptions(
+            name=name,
+            data=arguments.data,
+            epoch=arguments.epoch,
+            fresh=True,  # a recording begins where it began, not where another has ended
+            mission=MissionKind.CARRIED,
+            server=network.server,
+            total=len(robot),
+            recorded=True,
+            patience=0.0 if arguments.offline else arguments.timeout,
+            calibration=calibration_of(arguments, name),
+            rerun=arguments.rerun,
+        )
+        run_agent(robot, bus, keys, settings.agent, options, stop_on_signals())
     finally:
         bus.close()
     return _report(robot.damage)

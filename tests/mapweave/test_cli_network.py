@@ -21,6 +21,7 @@ from mapweave import connection
 from mapweave.cli import main
 from mapweave.commands import network
 from mapweave.exit_status import USAGE
+from mapweave.hybridmap.errors import NotConnected
 from mapweave.settings import NetworkSettings
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.zenoh_bus import ZenohBus
@@ -85,6 +86,53 @@ def test_where_nothing_listens_no_command_waits_for_a_router(capfd, closed, port
     listens = f"tcp/127.0.0.1:{port}"
     complaint(capfd, "status", "--connect", closed, listens)
     assert sum(waits[1:]) == connection.SOON, "it may be a busy router"
+
+
+@pytest.mark.parametrize("command", ["agent", "replay"])
+def test_a_router_is_looked_for_while_the_pipeline_is_imported(command, recording, closed):
+    """That there is none was said after 2.3 to 3.6 s on a busy machine: one wait came after the other."""
+    program = (
+        "import sys, mapweave.cli\n"
+        "from mapweave.wire.zenoh_bus import ZenohBus\n"
+        "def opened(self, settings):\n"
+        "    print('mapweave.agent.pipeline' in sys.modules)\n"
+        "    sys.exit(7)\n"
+        "ZenohBus.__init__ = opened\n"
+        "mapweave.cli.main(sys.argv[1:])\n"
+    )
+    which = "r0" if command == "agent" else recording
+    run = [sys.executable, "-c", program, command, which, "--connect", closed]
+    done = subprocess.run(run, capture_output=True, text=True, check=False, timeout=60)
+    assert (done.returncode, done.stdout, done.stderr) == (7, "False\n", "")
+
+
+def test_an_agent_counts_from_when_it_began_to_look_for_a_router(capfd, closed, monkeypatch, tmp_path):
+    waits, looked = [], []
+
+    def wait(self, timeout):
+        waits.append((timeout, time.monotonic()))
+        return False
+
+    def warn(bus, name, settings, since):
+        looked.append((name, settings.endpoints, since))
+        raise NotConnected("seen")
+
+    monkeypatch.setattr(ZenohBus, "wait_connected", wait)
+    monkeypatch.setattr("mapweave.commands.agent.warn_without_router", warn)
+    begin = time.monotonic()
+    assert "seen" in complaint(capfd, "agent", "r0", "--connect", closed, "--data", tmp_path)
+    ((timeout, waited),) = waits
+    ((name, endpoints, since),) = looked
+    assert (name, endpoints, timeout) == ("r0", (closed,), connection.UNHEARD)
+    assert begin < since < waited
+
+
+def test_a_router_that_was_looked_for_long_enough_is_reported_at_once(closed, capfd, monkeypatch):
+    monkeypatch.setattr(network, "SOON", 1000.0)
+    settings = BusSettings(endpoints=(closed,))
+    with closing(ZenohBus(settings)) as bus:
+        network.warn_without_router(bus, "r0", settings, time.monotonic() - 1001.0)
+        eventually(lambda: f"r0 finds no router at {closed}" in capfd.readouterr().err)
 
 
 def test_asking_about_an_image(capfd, recording, tmp_path, closed):
