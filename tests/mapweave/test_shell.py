@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import io
 import os
 import re
@@ -13,6 +14,7 @@ import time
 from pathlib import Path
 
 import pytest
+from argcomplete.finders import CompletionFinder
 from rich.console import Console
 
 from mapweave.cheat_sheet import as_markdown
@@ -69,6 +71,26 @@ def test_bash_completes_commands_options_and_choices(tmp_path: Path) -> None:
         ["bash", "-c", script], env=environment, capture_output=True, text=True, check=True, timeout=60
     )
     assert done.stdout.split() == ["show", "--json", "carried"], done.stderr
+
+
+def completed(*words: str) -> set[str]:
+    """What is offered for the last word; a parser that has completed once is spent."""
+    finder = CompletionFinder(parser.__wrapped__(), always_complete_options=True)
+    return {word.strip() for word in finder._get_completions(["mapweave", *words[:-1]], words[-1], "", None)}
+
+
+@pytest.mark.parametrize("words", ["", *parsers()])
+def test_all_of_every_command_is_completed(words: str) -> None:
+    """As its help names it: options, commands below it, and what may stand behind an option."""
+    command = parsers()[words] if words else parser()
+    shown = [action for action in command._actions if action.help != argparse.SUPPRESS]
+    options = {option for action in shown for option in action.option_strings}
+    assert completed(*words.split(), "-") == options >= {"-h", "--help"}
+    for action in shown:
+        if action.choices is not None:
+            choices = {str(choice) for choice in action.choices}
+            offered = completed(*words.split(), *action.option_strings[-1:], "")
+            assert offered - options == choices, action.dest
 
 
 @pytest.mark.parametrize("shell", SHELLS)
