@@ -5,6 +5,7 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 EXTRA ?= dev
 VENV := .venv
 BIN := $(VENV)/bin
+AUDIT := $(VENV)/audit
 STAMP := $(VENV)/.installed-$(EXTRA)
 # Python compiles a module when it is first imported. Compiling all of them doubles the time of the installation.
 PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt
@@ -43,7 +44,7 @@ test: setup
 	@$(COMPILE)
 	$(BIN)/python -m pytest -m "not slow and not scenario" -n $(WORKERS) --maxprocesses 4 --dist worksteal
 
-slow: setup
+slow: setup $(AUDIT)/.installed
 	@$(COMPILE)
 	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal
 
@@ -61,17 +62,25 @@ check: setup
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
+# The tools of `make sbom` and `make audit`, apart from all else: what they bring for checking addresses takes 1.6 s to
+# import, and each process of a Ray cluster would import it.
+$(AUDIT)/.installed: constraints.txt | $(STAMP)
+	@$(BIN)/python -m venv $(AUDIT)
+	@$(AUDIT)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt \
+	  cyclonedx-bom pip-audit
+	@touch $@
+
 # What Mapweave is installed with, exactly, as CycloneDX: the same file each time.
 SBOM := out/sbom.json
-sbom: setup
+sbom: $(AUDIT)/.installed
 	@mkdir -p $(dir $(SBOM))
-	@$(BIN)/cyclonedx-py requirements constraints.txt --pyproject pyproject.toml --output-reproducible --no-validate \
+	@$(AUDIT)/bin/cyclonedx-py requirements constraints.txt --pyproject pyproject.toml --output-reproducible --no-validate \
 	  --of JSON -o $(SBOM)
 	@echo "written: $(SBOM)"
 
 # Known vulnerabilities of these versions, by the advisories of PyPI. One that cannot be looked up is an error.
-audit: setup
-	$(BIN)/pip-audit --strict --no-deps --disable-pip -r constraints.txt
+audit: $(AUDIT)/.installed
+	$(AUDIT)/bin/pip-audit --strict --no-deps --disable-pip -r constraints.txt
 
 bench: setup
 	@for b in $$(dirname benchmarks/*/__main__.py); do \

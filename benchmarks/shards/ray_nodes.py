@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import secrets
 import signal
@@ -17,6 +18,8 @@ from mapweave.scenarios.children import free_port
 
 START = 180.0
 """Longest wait for a node, s."""
+STARTED = b"Ray runtime started"
+"""What Ray says once a node has joined the cluster."""
 STORE_BYTES = 80_000_000
 """Of a node's object store: the least that Ray takes is 75 MB."""
 
@@ -38,6 +41,7 @@ class RayNodes:
         """
         self._count, self._folder = nodes, folder
         self._nodes: list[subprocess.Popen[bytes]] = []
+        self._numbers = itertools.count()
         self._port = free_port()
         self.address = f"127.0.0.1:{self._port}"
         self.token = {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}
@@ -73,31 +77,30 @@ class RayNodes:
         mine = {pid for node in self._nodes for pid in descendants(node.pid)}
         return sorted(pid for pid in mine if _title(pid).startswith(title))
 
-    def _start(self, *how: str, attempts: int = 3) -> None:
-        """Start a node; on a busy machine Ray gives up waiting for its own processes."""
-        with (self._folder / f"ray{len(self._nodes)}.log").open("ab") as output:
-            node = subprocess.Popen(
-                [
-                    sys.executable, "-m", "ray.scripts.scripts", "start", *how, "--node-ip-address=127.0.0.1",
-                    "--num-cpus=1", f"--object-store-memory={STORE_BYTES}", "--block",
-                    "--disable-usage-stats",
-                ],
-                stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
-                start_new_session=True, env={**os.environ, **self.token},
-            )  # fmt: skip
-        if "--head" in how:
-            self._nodes.insert(0, node)
-        else:
-            self._nodes.append(node)
+    def _start(self, *how: str) -> None:
+        """Start a node, again if Ray gives up waiting for its own processes, as on a busy machine."""
         end = time.monotonic() + START
-        while not any(_title(pid).rsplit("/", 1)[-1].startswith("raylet") for pid in descendants(node.pid)):
-            if node.poll() is not None and attempts > 1:
-                self._nodes.remove(node)
-                self._start(*how, attempts=attempts - 1)
-                return
-            if node.poll() is not None or time.monotonic() > end:
-                raise SystemExit(f"a node of the cluster does not start: see {output.name}")
-            time.sleep(0.2)
+        while True:
+            path = self._folder / f"ray{len(self._nodes)}-{next(self._numbers)}.log"
+            with path.open("wb") as output:
+                node = subprocess.Popen(
+                    [
+                        sys.executable, "-m", "ray.scripts.scripts", "start", *how,
+                        "--node-ip-address=127.0.0.1", "--num-cpus=1",
+                        f"--object-store-memory={STORE_BYTES}", "--block", "--disable-usage-stats",
+                    ],
+                    stdin=subprocess.DEVNULL, stdout=output, stderr=subprocess.STDOUT,
+                    start_new_session=True, env={**os.environ, **self.token},
+                )  # fmt: skip
+            while node.poll() is None and time.monotonic() < end:
+                if STARTED in path.read_bytes():
+                    self._nodes.insert(0 if "--head" in how else len(self._nodes), node)
+                    return
+                time.sleep(0.2)
+            self._end(node)
+            if time.monotonic() >= end:
+                words = path.read_text(errors="replace").strip().splitlines()[-1:]
+                raise SystemExit(f"a node of the cluster does not start in {START:g} s: {' '.join(words)}")
 
     def _end(self, node: subprocess.Popen[bytes], how: signal.Signals = signal.SIGTERM) -> None:
         known = list(descendants(node.pid))
