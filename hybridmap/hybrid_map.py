@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Iterable, Iterator
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.ids import EdgeId, NodeId
@@ -20,42 +21,68 @@ class HybridMap:
     Attributes:
         nodes: by id, in the order in which they first came.
         edges: by id; both ends are nodes of this map or, for links between maps, of another.
-        graph: networkx multigraph over node ids; each edge's key is its edge id.
     """
 
     def __init__(self, changes: Iterable[ChangeBody] = ()) -> None:
         """Replay the changes."""
-        import networkx as nx
-
         self.nodes: dict[NodeId, Node] = {}
         self.edges: dict[EdgeId, Edge] = {}
-        self.graph: nx.MultiGraph = nx.MultiGraph()
+        # As networkx keeps a multigraph: what stands at each node, and the edges from each to each, by their
+        # keys. Both directions of a pair have the same ones.
+        self._ends: dict[NodeId, dict[str, Any]] = {}
+        self._between: dict[NodeId, dict[NodeId, dict[EdgeId, dict[str, Any]]]] = {}
         for body in changes:
             self.apply(body)
+
+    @cached_property
+    def graph(self) -> nx.MultiGraph:
+        """A networkx multigraph over node ids; each edge's key is its edge id. It changes with the map."""
+        # A robot needs none of its algorithms, and importing it takes a quarter of all that an agent imports.
+        import networkx as nx
+
+        graph = nx.MultiGraph()
+        graph._node, graph._adj = self._ends, self._between
+        return graph
 
     def apply(self, change: ChangeBody) -> None:
         """Apply one change. Retiring what is not there is no error: a log may be replayed from anywhere."""
         match change:
             case NodePut(node):
                 self.nodes[node.id] = node
-                self.graph.add_node(node.id)
+                self._enter(node.id)
             case NodeRetired(node_id):
                 self.nodes.pop(node_id, None)
-                if node_id in self.graph:
-                    for _, _, edge_id in list(self.graph.edges(node_id, keys=True)):
+                for other, edge_ids in self._between.pop(node_id, {}).items():
+                    for edge_id in edge_ids:
                         self.edges.pop(edge_id, None)
-                    self.graph.remove_node(node_id)
+                    if other != node_id:
+                        del self._between[other][node_id]
+                self._ends.pop(node_id, None)
             case EdgePut(edge):
                 self._forget_edge(edge.id)
                 self.edges[edge.id] = edge
-                self.graph.add_edge(edge.a, edge.b, key=edge.id)
+                self._enter(edge.a)
+                self._enter(edge.b)
+                between = self._between[edge.a].setdefault(edge.b, {})
+                self._between[edge.b][edge.a] = between
+                between[edge.id] = {}
             case EdgeRetired(edge_id):
                 self._forget_edge(edge_id)
 
+    def _enter(self, end: NodeId) -> None:
+        self._ends.setdefault(end, {})
+        self._between.setdefault(end, {})
+
     def _forget_edge(self, edge_id: EdgeId) -> None:
         edge = self.edges.pop(edge_id, None)
-        if edge is not None and self.graph.has_edge(edge.a, edge.b, key=edge_id):
-            self.graph.remove_edge(edge.a, edge.b, key=edge_id)
+        between = self._between.get(edge.a, {}).get(edge.b, {}) if edge is not None else {}
+        if edge is None or edge_id not in between:
+            return
+        del between[edge_id]
+        if not between:
+            del self._between[edge.a][edge.b]
+            if edge.a != edge.b:
+                del self._between[edge.b][edge.a]
 
     def contents(self) -> Iterator[ChangeBody]:
         """The shortest log that makes this map again: every node, then every edge."""
@@ -66,16 +93,25 @@ class HybridMap:
 
     def components(self) -> list[set[NodeId]]:
         """Connected components over nodes that are really there, largest first."""
-        import networkx as nx
+        found, seen = list[set[NodeId]](), set[NodeId]()
+        for node in self._between:
+            if node in self.nodes and node not in seen:
+                found.append(reached(node, lambda at: (to for to in self._between[at] if to in self.nodes)))
+                seen |= found[-1]
+        return sorted(found, key=len, reverse=True)
 
-        present = self.graph.subgraph(self.nodes)
-        return sorted(nx.connected_components(present), key=len, reverse=True)
+    def edges_at(self, node: NodeId) -> list[Edge]:
+        """Edges that begin or end at a node; none of one that is not there."""
+        return [self.edges[key] for keys in self._between.get(node, {}).values() for key in keys]
+
+    def edges_between(self, start: NodeId, end: NodeId) -> list[Edge]:
+        """Edges between two nodes, whichever way they lead."""
+        return [self.edges[key] for key in self._between.get(start, {}).get(end, ())]
 
     def edge_between(self, start: NodeId, end: NodeId) -> PoseGaussian | None:
         """Pose `start_from_end` by the most certain edge between two nodes, or None without an edge."""
         best: PoseGaussian | None = None
-        for edge_id in self.graph.get_edge_data(start, end) or ():
-            edge = self.edges[edge_id]
+        for edge in self.edges_between(start, end):
             relative = edge.a_from_b if edge.a == start else edge.a_from_b.inverse()
             if best is None or relative.covariance.trace() < best.covariance.trace():
                 best = relative
@@ -84,10 +120,19 @@ class HybridMap:
     def dropped_by(self, body: ChangeBody) -> Iterator[Edge]:
         """Edges that a change would take away or replace."""
         match body:
-            case NodeRetired(node_id) if node_id in self.graph:
-                for _, _, edge_id in self.graph.edges(node_id, keys=True):
-                    yield self.edges[edge_id]
+            case NodeRetired(node_id):
+                yield from self.edges_at(node_id)
             case EdgePut(edge) if edge.id in self.edges:
                 yield self.edges[edge.id]
             case EdgeRetired(edge_id) if edge_id in self.edges:
                 yield self.edges[edge_id]
+
+
+def reached(start: NodeId, neighbours: Callable[[NodeId], Iterable[NodeId]]) -> set[NodeId]:
+    """What can be reached from a node, itself included."""
+    found, left = {start}, [start]
+    while left:
+        fresh = {node for node in neighbours(left.pop()) if node not in found}
+        found |= fresh
+        left += fresh
+    return found

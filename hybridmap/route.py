@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass
-from itertools import pairwise
-from typing import Any
+from collections.abc import Collection, Iterator, Mapping
+from dataclasses import dataclass, field
+from heapq import heappop, heappush
+from itertools import count, pairwise
 
-import networkx as nx
-
-from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.hybrid_map import HybridMap, reached
 from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2
@@ -51,6 +49,19 @@ class Route:
     reason: str
 
 
+@dataclass(slots=True)
+class _Hop:
+    """What joins two nodes.
+
+    Attributes:
+        barred: whether a robot cannot drive between them now.
+        choices: cost and id of each edge.
+    """
+
+    barred: bool
+    choices: list[tuple[float, EdgeId]] = field(default_factory=list)
+
+
 class Ways:
     """All ways through a map at one time: made once, asked from several starts."""
 
@@ -87,7 +98,7 @@ class Ways:
         factors = factors or {}
         # An edge may cost less than its length: the heuristic must stay below.
         self._least = min((1.0, *factors.values()))
-        self._graph: nx.Graph = nx.Graph()
+        self._hops: dict[NodeId, dict[NodeId, _Hop]] = {}
         # In the order of ids, so that of ways of equal cost the same one is found in any order of insertion.
         for edge in sorted(hybrid_map.edges.values(), key=lambda edge: edge.id):
             barred = frozenset((edge.a, edge.b)) in self._barred
@@ -98,19 +109,15 @@ class Ways:
             cost = edge_cost(edge, self._places, poses is not None, s)
             cost *= factors.get(frozenset((edge.a, edge.b)), 1.0) if factors else 1.0
             cost += max((penalties or {}).get(edge.id, 0.0), 0.0)
-            if not self._graph.has_edge(edge.a, edge.b):
-                self._graph.add_edge(edge.a, edge.b, choices=[], barred=barred)
-            self._graph.edges[edge.a, edge.b]["choices"].append((cost, edge.id))
+            self._hop(edge.a, edge.b, barred).choices.append((cost, edge.id))
         for edge_id, (a, b) in sorted((portals or {}).items()):
             barred = frozenset((a, b)) in self._barred
             if a not in self._places or b not in self._places or (barred and toll is None):
                 continue
             cost = s.per_portal * factors.get(frozenset((a, b)), 1.0)
-            if not self._graph.has_edge(a, b):
-                self._graph.add_edge(a, b, choices=[], barred=barred)
-            self._graph.edges[a, b]["choices"].append((cost, edge_id))
+            self._hop(a, b, barred).choices.append((cost, edge_id))
         self._portals = tuple((portals or {}).values())
-        one_frame = poses is not None or len({node_id.map for node_id in self._graph}) <= 1
+        one_frame = poses is not None or len({node_id.map for node_id in self._hops}) <= 1
         self._comparable = one_frame and not portals
 
     def find(self, start: NodeId, goal: NodeId) -> Route:
@@ -122,21 +129,61 @@ class Ways:
                 return Route((), (), 0.0, f"{name} {node_id} has no pose in the merged map")
         if start == goal:
             return Route((start,), (), 0.0, "already there")
-        try:
-            nodes = nx.astar_path(self._graph, start, goal, heuristic=self._distance, weight=self._weight)
-        except (nx.NetworkXNoPath, nx.NodeNotFound):
+        nodes = self._cheapest_nodes(start, goal)
+        if not nodes:
             return Route((), (), 0.0, self._why_not(start, goal))
-        hops = [self._cheapest(self._graph.edges[pair]) for pair in pairwise(nodes)]
+        hops = [self._cheapest(self._hops[a][b]) for a, b in pairwise(nodes)]
         cost = sum(hop[0] for hop in hops if hop is not None)
         edges = tuple(hop[1] for hop in hops if hop is not None)
         return Route(tuple(nodes), edges, cost, f"{len(edges)} edges, {cost:.1f} m")
 
-    def _cheapest(self, hop: Mapping[str, Any]) -> tuple[float, EdgeId] | None:
-        """The cheapest open edge between two nodes; whether one is closed is asked only on the way."""
-        choices = sorted(hop["choices"], key=lambda choice: choice[0])
+    def _hop(self, a: NodeId, b: NodeId, barred: bool) -> _Hop:
+        """What joins two nodes, in either direction; made if there is nothing yet."""
+        ahead, back = self._hops.setdefault(a, {}), self._hops.setdefault(b, {})
+        back[a] = ahead.setdefault(b, _Hop(barred))
+        return ahead[b]
+
+    def _cheapest_nodes(self, start: NodeId, goal: NodeId) -> list[NodeId]:
+        """The nodes of the cheapest way, by A* (Hart, Nilsson and Raphael 1968); none if there is no way."""
+        # Of ways that cost the same, the one that was found first.
+        order = count()
+        queue: list[tuple[float, int, NodeId, float, NodeId | None]] = [(0.0, next(order), start, 0.0, None)]
+        found: dict[NodeId, tuple[float, float]] = {}
+        before: dict[NodeId, NodeId | None] = {}
+        while queue:
+            _, _, node, so_far, came_from = heappop(queue)
+            if node in before:
+                continue
+            before[node] = came_from
+            if node == goal:
+                break
+            for neighbour, hop in self._hops.get(node, {}).items():
+                best = None if neighbour in before else self._cheapest(hop)
+                if best is None:
+                    continue
+                cost = so_far + best[0]
+                known = found.get(neighbour)
+                if known is not None and known[0] <= cost:
+                    continue
+                left = self._distance(neighbour, goal) if known is None else known[1]
+                found[neighbour] = cost, left
+                heappush(queue, (cost + left, next(order), neighbour, cost, node))
+        way: list[NodeId] = []
+        at: NodeId | None = goal if goal in before else None
+        while at is not None:
+            way.append(at)
+            at = before[at]
+        return way[::-1]
+
+    def _cheapest(self, hop: _Hop) -> tuple[float, EdgeId] | None:
+        """The cheapest open edge between two nodes; whether one is closed is asked only on the way.
+
+        None if nothing there can be driven.
+        """
+        choices = sorted(hop.choices, key=lambda choice: choice[0])
         free = (
             None
-            if hop["barred"]
+            if hop.barred
             else next((option for option in choices if option[1] not in self._closed), None)
         )
         if free is None and self._toll is not None:
@@ -144,23 +191,26 @@ class Ways:
             return cost + self._toll, edge_id
         return free
 
-    def _weight(self, _: NodeId, __: NodeId, hop: Mapping[str, Any]) -> float | None:
-        """What it costs from node to node; None, as networkx wants it, if nothing there can be driven."""
-        best = self._cheapest(hop)
-        return None if best is None else best[0]
-
     def _distance(self, node: NodeId, target: NodeId) -> float:
         return self._least * self._places[node].distance(self._places[target]) if self._comparable else 0.0
 
     def _why_not(self, start: NodeId, goal: NodeId) -> str:
-        present = self._map.graph.subgraph(self._map.nodes)
-        if self._portals:
-            present = present.copy()
-            present.add_edges_from(self._portals)
-        if not nx.has_path(present, start, goal):
+        there = self._map.nodes
+
+        def joined(node: NodeId, closed: Collection[EdgeId]) -> Iterator[NodeId]:
+            for edge in self._map.edges_at(node):
+                if edge.a in there and edge.b in there and edge.id not in closed:
+                    yield edge.b if edge.a == node else edge.a
+            for a, b in self._portals:
+                if node in (a, b):
+                    yield b if node == a else a
+
+        def is_joined(closed: Collection[EdgeId]) -> bool:
+            return goal in reached(start, lambda node: joined(node, closed))
+
+        if not is_joined(()):
             return f"{start} and {goal} are in parts of the map that nothing joins"
-        ties = [hop for hop in present.edges(keys=True) if hop[2] in self._closed]
-        if not nx.has_path(nx.restricted_view(present, [], ties), start, goal):
+        if not is_joined(self._closed):
             return f"what joins {start} and {goal} only ties poses: nothing there could be driven"
         if self._barred:
             return f"every way from {start} to {goal} is blocked ({len(self._barred)} pairs)"

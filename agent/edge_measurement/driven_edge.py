@@ -81,5 +81,5 @@ def agree(a: PoseGaussian, b: PoseGaussian) -> bool:
 
 def _driven(own_map: HybridMap, traverse: Traverse) -> Edge | None:
     """The edge of earlier drives between the same nodes."""
-    between = own_map.graph.get_edge_data(traverse.start, traverse.end) or ()
-    return next((e for e in map(own_map.edges.__getitem__, between) if e.kind is EdgeKind.DRIVEN), None)
+    between = own_map.edges_between(traverse.start, traverse.end)
+    return next((edge for edge in between if edge.kind is EdgeKind.DRIVEN), None)

@@ -94,8 +94,7 @@ class NodeRetirement:
 
     def _edges(self, node: NodeId) -> list[tuple[Edge, Node]]:
         """Edges at a node, each with the own node at its other end."""
-        edges = [self._map.edges[edge_id] for _, _, edge_id in self._map.graph.edges(node, keys=True)]
-        ends = [(edge, edge.b if edge.a == node else edge.a) for edge in edges]
+        ends = [(edge, edge.b if edge.a == node else edge.a) for edge in self._map.edges_at(node)]
         return [(edge, self._map.nodes[end]) for edge, end in ends if end != node and end in self._map.nodes]
 
     def _successor(self, node: Node, now_ns: int) -> Node | None:

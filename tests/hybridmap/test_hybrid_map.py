@@ -1,6 +1,10 @@
 """The map as the replay of its log."""
 
+import sys
+
+import networkx as nx
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -9,6 +13,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.route import find_route
 from synthetic.world import CAMERA
 
 
@@ -52,6 +57,83 @@ def test_applying_a_change_twice_changes_nothing_more(log: list[ChangeBody], bod
     assert set(once.nodes) == set(twice.nodes)
     assert once.edges == twice.edges
     assert once.graph.number_of_edges() == twice.graph.number_of_edges()
+
+
+def replayed(log: list[ChangeBody]) -> nx.MultiGraph:
+    """The reachability graph by networkx alone."""
+    graph: nx.MultiGraph = nx.MultiGraph()
+    for body in log:
+        keys = {key: (a, b) for a, b, key in graph.edges(keys=True)}
+        match body:
+            case NodePut(one):
+                graph.add_node(one.id)
+            case NodeRetired(node_id) if node_id in graph:
+                graph.remove_node(node_id)
+            case EdgePut(one):
+                if one.id in keys:
+                    graph.remove_edge(*keys[one.id], key=one.id)
+                graph.add_edge(one.a, one.b, key=one.id)
+            case EdgeRetired(edge_id) if edge_id in keys:
+                graph.remove_edge(*keys[edge_id], key=edge_id)
+    return graph
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.lists(bodies, max_size=40), st.booleans())
+def test_the_graph_is_that_of_networkx(log: list[ChangeBody], asked_early: bool) -> None:
+    hybrid_map = HybridMap()
+    if asked_early:
+        assert not hybrid_map.graph
+    for body in log:
+        dropped = list(hybrid_map.dropped_by(body))
+        before = set(hybrid_map.edges.values())
+        hybrid_map.apply(body)
+        assert before - set(hybrid_map.edges.values()) <= set(dropped) <= before
+    expected, graph = replayed(log), hybrid_map.graph
+    # In the same order: what is found first of several that are alike is found by both.
+    assert list(graph.nodes) == list(expected.nodes)
+    assert list(graph.edges(keys=True)) == list(expected.edges(keys=True))
+    for node_id in expected:
+        at = [key for _, _, key in expected.edges(node_id, keys=True)]
+        assert [one.id for one in hybrid_map.edges_at(node_id)] == at
+        for other in expected:
+            between = expected.get_edge_data(node_id, other) or ()
+            assert [one.id for one in hybrid_map.edges_between(node_id, other)] == [*between]
+    present = expected.subgraph(hybrid_map.nodes)
+    components = hybrid_map.components()
+    assert {frozenset(part) for part in components} == {*map(frozenset, nx.connected_components(present))}
+    assert sorted(map(len, components), reverse=True) == [*map(len, components)]
+
+
+def test_edges_of_others_count_in_graph_and_map() -> None:
+    """A merged map adds links to the graph by itself."""
+    hybrid_map = HybridMap([NodePut(node(1)), NodePut(node(2)), NodePut(node(3)), EdgePut(edge(8, 1, 2))])
+    link = edge(9, 2, 3)
+    hybrid_map.edges[link.id] = link
+    hybrid_map.graph.add_edge(link.a, link.b, key=link.id)
+    assert len(hybrid_map.components()) == 1
+    assert hybrid_map.edges_at(node(3).id) == [link]
+    hybrid_map.apply(NodeRetired(node(2).id))
+    assert not hybrid_map.edges and not hybrid_map.graph.edges
+    copy = hybrid_map.graph.copy()
+    copy.add_edge(node(1).id, node(3).id, key=link.id)
+    assert not hybrid_map.graph.edges, "a copy is one"
+
+
+def test_what_robots_ask_of_their_map_loads_no_networkx(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "networkx", None)
+    hybrid_map = HybridMap(
+        [*(NodePut(node(k)) for k in range(4)), EdgePut(edge(8, 0, 1)), EdgePut(edge(9, 1, 2))]
+    )
+    first, third, lonely = (node(k).id for k in (0, 2, 3))
+    assert len(find_route(hybrid_map, first, third).edges) == 2
+    assert "nothing joins" in find_route(hybrid_map, first, lonely).reason
+    assert "blocked" in find_route(hybrid_map, first, third, blocked=[(node(1).id, third)]).reason
+    assert len(hybrid_map.components()) == 2
+    hybrid_map.apply(NodeRetired(node(1).id))
+    assert not hybrid_map.edges
+    with pytest.raises(ImportError):
+        _ = hybrid_map.graph
 
 
 def test_retiring_a_node_takes_its_edges_along() -> None:

@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.route import RouteSettings, edge_cost, find_route
+from mapweave.hybridmap.route import RouteSettings, Ways, edge_cost, find_route
 from synthetic.maps import changes_of
 from synthetic.world import CAMERA
 
@@ -127,6 +127,50 @@ def test_reasons() -> None:
     assert "nothing joins" in find_route(one, nodes[0].id, lonely.id).reason
     assert "not in the map" in find_route(one, nodes[0].id, NodeId("r9", 1, 1)).reason
     assert "no pose" in find_route(one, nodes[0].id, nodes[1].id, poses={nodes[0].id: Pose2()}).reason
+
+
+@settings(max_examples=100, deadline=None)
+@given(st.integers(0, 10**6))
+def test_there_is_a_way_or_a_reason_as_networkx_finds_it(seed: int) -> None:
+    """With portals between maps of different frames, closed edges, blocked pairs and a toll for these."""
+    rng = np.random.default_rng(seed)
+    hybrid_map = random_map(seed, m=16)
+    ids = [*hybrid_map.nodes]
+    portals = {EdgeId("p", 1, k): (ids[k], ids[int(rng.integers(5, 14))]) for k in range(rng.integers(0, 3))}
+    blocked = [(ids[a], ids[b]) for a, b in rng.integers(0, 14, (4, 2))]
+    closed = {edge_id for edge_id in hybrid_map.edges if rng.random() < 0.3}
+    toll = 5.0 if rng.random() < 0.3 else None
+    factors = {frozenset((e.a, e.b)): float(rng.uniform(0.3, 2.0)) for e in hybrid_map.edges.values()}
+    poses = {i: n.map_from_robot.mean for i, n in hybrid_map.nodes.items()}
+    s, barred = RouteSettings(), {frozenset(pair) for pair in blocked}
+    whole: nx.MultiGraph = nx.MultiGraph()
+    whole.add_nodes_from(ids)
+    for e in hybrid_map.edges.values():
+        cost = edge_cost(e, poses, True, s) * factors[frozenset((e.a, e.b))]
+        whole.add_edge(e.a, e.b, key=e.id, weight=cost)
+    for key, (a, b) in portals.items():
+        whole.add_edge(a, b, key=key, weight=s.per_portal * factors.get(frozenset((a, b)), 1.0))
+    ties = [(a, b, key) for a, b, key in whole.edges(keys=True) if key in closed]
+    drivable, free = nx.restricted_view(whole, [], ties), nx.MultiGraph()
+    free.add_nodes_from(ids)
+    for a, b in whole.edges():
+        costs = {key: data["weight"] for key, data in whole[a][b].items()}
+        open_ones = [] if frozenset((a, b)) in barred else [costs[key] for key in costs.keys() - closed]
+        if open_ones or toll is not None:
+            free.add_edge(a, b, weight=min(open_ones) if open_ones else min(costs.values()) + (toll or 0.0))
+    ways = Ways(
+        hybrid_map, poses=poses, blocked=blocked, closed=closed, toll=toll, factors=factors, portals=portals
+    )
+    for goal in ids[1:]:
+        route = ways.find(ids[0], goal)
+        if nx.has_path(free, ids[0], goal):
+            assert route.cost == pytest.approx(nx.dijkstra_path_length(free, ids[0], goal))
+        elif not nx.has_path(whole, ids[0], goal):
+            assert "nothing joins" in route.reason
+        elif not nx.has_path(drivable, ids[0], goal):
+            assert "only ties poses" in route.reason
+        else:
+            assert "blocked" in route.reason
 
 
 @settings(max_examples=40, deadline=None)
