@@ -42,7 +42,6 @@ from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAn
 from mapweave.map_reading import MapReading
 from mapweave.merge.settings import MergeSettings
 from mapweave.node_table import NodeTable
-from mapweave.opened_map import MapSource, open_map
 from mapweave.storage.map_file import MapFile, write_map_file
 
 if TYPE_CHECKING:
@@ -362,6 +361,9 @@ def open(path: str | os.PathLike[str]) -> FileMap:
         InvalidFile: it cannot be read, is damaged, in use, or none of these.
         MissingExtra: several maps are merged with the extra "server".
     """
+    # A fleet's map comes over the network: who connects need not wait for what reads stores and journals.
+    from mapweave.opened_map import MapSource, open_map
+
     opened = open_map(os.fspath(path))
     for complaint in opened.complaints.values():
         warnings.warn(complaint, stacklevel=2)
