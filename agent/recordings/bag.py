@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.recordings.damaged_bag import DamagedBag
+from mapweave.agent.recordings.damaged_bag import DamagedBag, standard_messages
 from mapweave.agent.recordings.incomplete import CameraGiven, Incomplete, complete
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
@@ -129,13 +129,12 @@ class WholeBag:
             Exception: whatever a damaged file leads to.
         """
         from rosbags.highlevel import AnyReader
-        from rosbags.typesys import Stores, get_typestore
 
-        from mapweave.wire.ros2.messages import typestore
-
-        self._reader = AnyReader([path], default_typestore=typestore())
+        ros1 = path.suffix == ".bag"
+        self._standard = standard_messages(ros1)
+        # A bag of ROS 1 always has its own definitions.
+        self._reader = AnyReader([path], default_typestore=None if ros1 else self._standard)
         self._reader.open()
-        self._standard = typestore() if self._reader.is2 else get_typestore(Stores.ROS1_NOETIC)
         weakref.finalize(owner, self._reader.close)
         self.topics: dict[str, tuple[str, int]] = {}
         for connection in self._reader.connections:

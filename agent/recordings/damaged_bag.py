@@ -11,6 +11,7 @@ import sqlite3
 import struct
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -22,6 +23,16 @@ Item = tuple[int, str, str] | tuple[int, int, bytes]
 MCAP_MAGIC, ROS1_MAGIC = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
 MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE, MCAP_CHUNK, MCAP_DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
 ROS1_MESSAGE, ROS1_CHUNK, ROS1_CONNECTION = 0x02, 0x05, 0x07
+
+
+@cache
+def standard_messages(ros1: bool) -> Any:
+    """The messages as ROS 1 or ROS 2 defines them; a type is compiled once, when it is first read."""
+    from rosbags.typesys import Stores, get_typestore
+
+    from mapweave.wire.ros2.messages import typestore
+
+    return get_typestore(Stores.ROS1_NOETIC) if ros1 else typestore()
 
 
 class DamagedBag:
@@ -38,13 +49,9 @@ class DamagedBag:
         Raises:
             DeviceError: there is no message in it.
         """
-        from rosbags.typesys import Stores, get_typestore
-
-        from mapweave.wire.ros2.messages import typestore
-
         self._path = path
         self._items, ros1 = _format_of(path)
-        store = get_typestore(Stores.ROS1_NOETIC) if ros1 else typestore()
+        store = standard_messages(ros1)
         self._decode: Callable[[bytes, str], Any] = store.deserialize_ros1 if ros1 else store.deserialize_cdr
         topics: dict[int, tuple[str, str]] = {}
         counts: Counter[int] = Counter()
