@@ -65,10 +65,10 @@ class Area:
             radius: m.
 
         Raises:
-            InvalidValue: the radius is not positive.
+            InvalidValue: the radius is not positive, or too great.
         """
         if not 0.0 < radius < FARTHEST:
-            raise InvalidValue(f"radius {radius:g}: give metres, more than 0")
+            raise InvalidValue(f"radius {radius:g}: give metres, more than 0 and less than {FARTHEST:g}")
         reach = radius / math.cos(math.pi / ROUND)
         angles = [2.0 * math.pi * k / ROUND for k in range(ROUND)]
         return Area(

@@ -18,8 +18,11 @@ from mapweave.hybridmap.constraint_subject import (
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import Stamp
+from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.wall_time import utc_words
 
+FARTHEST = 1e4
+"""Between two nodes that are linked by hand, m."""
 MOST_WORDS = 300
 """Characters of a reason."""
 FEW = 4
@@ -64,9 +67,21 @@ class ConstraintRequest:
     check: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse an area whose outline crosses itself (InvalidValue); one that was kept is taken back."""
-        if self.constraint.holds and isinstance(self.constraint.about, RetiredArea):
-            self.constraint.about.area.check_outline()
+        """Refuse what a person cannot mean; what was kept is taken back all the same.
+
+        Raises:
+            InvalidValue: an area whose outline crosses itself, or nodes of one place that are far apart.
+        """
+        if not self.constraint.holds:
+            return
+        match self.constraint.about:
+            case RetiredArea(area):
+                area.check_outline()
+            # Written so that NaN fails.
+            case Linked(pose=Pose2(x=x, y=y)) if not (abs(x) <= FARTHEST and abs(y) <= FARTHEST):
+                raise InvalidValue(
+                    f"a pose of {x:g},{y:g}: nodes that see one place are at most {FARTHEST:g} m apart"
+                )
 
 
 @dataclass(frozen=True, slots=True)

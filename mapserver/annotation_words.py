@@ -12,6 +12,7 @@ from mapweave.hybridmap.annotation import BODIES, Annotation, Annotations, Body,
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.named_nodes import Resolve
 from mapweave.hybridmap.query import Resolved, ResolveRequest
 from mapweave.hybridmap.wall_time import read_time
@@ -119,6 +120,9 @@ def _area(corners: Any, near: str, resolve: Resolve) -> Area:
     points = value_of(corners, list[tuple[float, float]])
     if not points:
         raise InvalidValue("an area has 3 corners or more")
+    # Written so that NaN fails.
+    if not all(abs(v) <= MAX_POSITION for corner in points for v in corner):
+        raise InvalidValue(f"corners are at most {MAX_POSITION:g} m from the origin of the map")
     x, y = np.mean(points, axis=0)
     found = _found(f"{x:.3f},{y:.3f}", near, resolve, ANYWHERE)
     return Area.of_merged(found.node, found.merged_from_node, points)

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
     from mapweave.mapserver.routes import Router
     from mapweave.merge.pose_graph.merged_map import MergedMap
 
+FAR = 1e6
+"""m; of a longer distance the digits say nothing."""
 NEARBY = 1.5
 """A place that is a node reaches so far, m: a robot there sees the same as from the node."""
 FORMS = "give a node (r0.1.17), the name of a place, or a position in the merged map (3.1,-2.0)"
@@ -200,9 +202,10 @@ class Places:
         x, y = position
         distance, node = min((math.hypot(poses[n].x - x, poses[n].y - y), n) for n in members)
         if distance > reach:
+            away = f"{distance:.1f}" if distance < FAR else f"{distance:.0e}"
             raise InvalidValue(
                 f"nothing is mapped within {reach:g} m of {what or f'{x:g},{y:g}'}: the nearest node is "
-                f"{node}, {distance:.1f} m away at {poses[node].x:.1f},{poses[node].y:.1f}"
+                f"{node}, {away} m away at {poses[node].x:.1f},{poses[node].y:.1f}"
             )
         return Resolved(node, poses[node], component)
 

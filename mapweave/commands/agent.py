@@ -56,7 +56,12 @@ def add_to(commands: Any) -> None:
         "--without-rangers", action="store_true",
         help="a robot without proximity sensors may explore, slowly, by its camera and by touch",
     )  # fmt: skip
-    parser.add_argument("--data", type=Path, default=Path("out/agents"), help="folder for the robot's map")
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=Path("out/agents"),
+        help="folder for the robot's map (default: out/agents)",
+    )
     parser.add_argument(
         "--epoch", type=int, help="least number of a new map (default: the next one, as the server knows it)"
     )
@@ -78,7 +83,9 @@ def add_to(commands: Any) -> None:
         help="tell Prometheus about the robot at http://127.0.0.1:PORT/metrics, on this machine alone "
         "(docs/monitoring.md; default: off)",
     )  # fmt: skip
-    parser.add_argument("--seed", type=values.seed, default=0, help="of the random choices in exploration")
+    parser.add_argument(
+        "--seed", type=values.seed, default=0, help="of the random choices in exploration (default: 0)"
+    )
     parser.add_argument(
         "--lockstep", action="store_true", help="wait for answers between ticks: repeatable simulation"
     )
@@ -138,6 +145,11 @@ def run(arguments: argparse.Namespace) -> int:
     simulated = arguments.lockstep and (arguments.robot or settings.robot.driver) == REMOTE
     if simulated and network.keys and not arguments.body:
         raise UsageError(simulator_beside(network))
+    calibration = calibration_of(arguments, name)
+    if arguments.record is not None:
+        from mapweave.agent.recordings.mcap_writer import check_new
+
+        check_new(arguments.record)
     bus, keys = connect(network)
     opened, body, beside, claim = time.monotonic(), bus, network, None
     robot: Robot | None = None
@@ -177,7 +189,7 @@ def run(arguments: argparse.Namespace) -> int:
             seed=arguments.seed,
             synchronization=synchronization,
             server=network.server,
-            calibration=calibration_of(arguments, name),
+            calibration=calibration,
             ros2=None if arguments.ros2 is None else ros2_link(arguments, settings.robot),
             rerun=arguments.rerun,
             metrics=arguments.metrics,
@@ -206,8 +218,16 @@ def add_calibration(parser: argparse.ArgumentParser) -> None:
 
 
 def calibration_of(arguments: argparse.Namespace, name: str) -> Path:
-    """The file of what was measured of a robot."""
+    """The file of what was measured of a robot.
+
+    Raises:
+        SettingsError: what should be the folder is a file.
+    """
+    from mapweave.hybridmap.errors import SettingsError
+
     folder: Path = arguments.calibration
+    if folder.exists() and not folder.is_dir():
+        raise SettingsError(f"--calibration {folder}: is a file; give the folder in which it is")
     return folder / f"{name}.toml"
 
 

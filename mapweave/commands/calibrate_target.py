@@ -21,9 +21,19 @@ def add_to(actions: Any) -> None:
         "100 %, check the rulers, and glue it to something flat.",
     )
     add_target(parser)
-    parser.add_argument("--paper", choices=["a4", "a3", "letter", "legal"], default="a4")
     parser.add_argument(
-        "-o", "--out", type=Path, default=Path("board.pdf"), metavar="FILE", help="(default: %(default)s)"
+        "--paper",
+        choices=["a4", "a3", "letter", "legal"],
+        default="a4",
+        help="size of the sheet (default: a4)",
+    )
+    parser.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        default=Path("board.pdf"),
+        metavar="FILE",
+        help="the PDF (default: board.pdf)",
     )
     parser.set_defaults(run=run)
 
@@ -31,15 +41,25 @@ def add_to(actions: Any) -> None:
 def add_target(parser: argparse.ArgumentParser) -> None:
     """Declare the target; the defaults fit on A4 and on letter paper."""
     which = parser.add_argument_group("target")
-    which.add_argument("--pattern", choices=["charuco", "chessboard"], default="charuco")
+    which.add_argument(
+        "--pattern",
+        choices=["charuco", "chessboard"],
+        default="charuco",
+        help="kind of target (default: charuco)",
+    )
     which.add_argument(
         "--squares", metavar="WxH", default="7x10", help="squares across and down (default: %(default)s)"
     )
-    which.add_argument("--square-mm", type=float, metavar="MM", default=24.0, help="(default: %(default)s)")
     which.add_argument(
-        "--marker-mm", type=float, metavar="MM", help="of ChArUco (default: three quarters of a square)"
+        "--square-mm", type=float, metavar="MM", default=24.0, help="side of a square (default: 24)"
     )
-    which.add_argument("--dictionary", default="4X4_50", help="of ChArUco (default: %(default)s)")
+    which.add_argument(
+        "--marker-mm",
+        type=float,
+        metavar="MM",
+        help="side of a marker of ChArUco (default: three quarters of a square)",
+    )
+    which.add_argument("--dictionary", default="4X4_50", help="of the markers of ChArUco (default: 4X4_50)")
 
 
 def target_of(arguments: argparse.Namespace) -> CalibrationTarget:

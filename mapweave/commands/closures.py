@@ -44,7 +44,7 @@ def add_to(commands: Any) -> None:
     add_record_options(reopen, changes=True)
     reopen.set_defaults(run=lambda arguments: _withdraw(arguments, "closure"))
 
-    for verb, factor, words in (("prefer", 0.5, "below 1"), ("avoid", 4.0, "above 1")):
+    for verb, factor, words in (("prefer", 0.5, "0.1 to 1"), ("avoid", 4.0, "1 to 100")):
         parser: argparse.ArgumentParser = commands.add_parser(
             verb,
             help=f"let robots {verb} a way or an area",
@@ -98,8 +98,11 @@ def run_prefer(arguments: argparse.Namespace) -> int:
     """Prefer or avoid a way, or withdraw that."""
     from mapweave.commands.usage import UsageError
 
-    if (arguments.factor < 1.0) != (arguments.verb == "prefer"):
-        raise UsageError(f"--factor {arguments.factor:g}: below 1 prefers a way, above 1 avoids it")
+    least, most = (0.1, 1.0) if arguments.verb == "prefer" else (1.0, 100.0)
+    # Written so that NaN fails.
+    if not least <= arguments.factor <= most or arguments.factor == 1.0:
+        words = "0.1 to 1 prefers a way, 1 to 100 avoids it, and 1 itself does neither"
+        raise UsageError(f"--factor {arguments.factor:g}: {words}")
     if arguments.undo:
         return _withdraw(arguments, "preference")
     with record_of(arguments) as record:

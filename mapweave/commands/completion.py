@@ -18,7 +18,7 @@ def add_to(commands: Any) -> None:
         "~/.config/fish/completions/mapweave.fish; for zsh put `source <(mapweave completion zsh)` into "
         "~/.zshrc, after compinit.",
     )
-    parser.add_argument("shell", choices=SHELLS)
+    parser.add_argument("shell", choices=SHELLS, help="which shell")
     parser.set_defaults(run=run)
 
 

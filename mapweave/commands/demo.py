@@ -24,7 +24,11 @@ def add_to(commands: Any) -> None:
     parser.add_argument("--robots", type=int, default=3, help="how many (default: 3)")
     parser.add_argument("--rooms", type=int, default=3, help="rooms along the corridor (default: 3)")
     parser.add_argument(
-        "-o", "--out", type=Path, default=Path("out/demo"), help="folder for map.png, report.json ..."
+        "-o",
+        "--out",
+        type=Path,
+        default=Path("out/demo"),
+        help="folder for map.png, report.json ... (default: out/demo)",
     )
     parser.add_argument("--json", action="store_true", help="print the report as one JSON object")
     parser.set_defaults(run=run)

@@ -38,7 +38,12 @@ def add_to(commands: Any) -> None:
         help="its driver, or FILE.py:CLASS, as of `agent` (default: that of the settings file)",
     )
     parser.add_argument("--name", type=values.name, help="of the robot in the fleet (default: r0)")
-    parser.add_argument("--data", type=Path, default=Path("out/agents"), help="folder for the robot's map")
+    parser.add_argument(
+        "--data",
+        type=Path,
+        default=Path("out/agents"),
+        help="folder for the robot's map (default: out/agents)",
+    )
     parser.add_argument(
         "--drive", action="store_true",
         help="let the robot drive 20 cm forward and turn 45 degrees, to compare encoders and image; else you "

@@ -134,6 +134,6 @@ def add_examples(parser: argparse.ArgumentParser) -> None:
         lines = [f"  {example}" for example in EXAMPLES.get(words, ())]
         title = "examples:" if len(lines) > 1 else "example:"
         command.epilog = "\n".join(
-            [*([command.epilog] if command.epilog else []), *([title, *lines] if lines else [])]
+            [*([command.epilog, ""] if command.epilog else []), *([title, *lines] if lines else [])]
         )
         command.formatter_class = ExampleHelp

@@ -20,7 +20,13 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "source", nargs="*", help="further video files or streams, as [robot.camera] source takes them"
     )
-    parser.add_argument("-o", "--out", type=Path, default=Path("out/cameras"), help="folder for the frames")
+    parser.add_argument(
+        "-o",
+        "--out",
+        type=Path,
+        default=Path("out/cameras"),
+        help="folder for the frames (default: out/cameras)",
+    )
     parser.add_argument("--width", type=values.count, default=640, help="asked of devices, px (default: 640)")
     parser.add_argument(
         "--height", type=values.count, default=480, help="asked of devices, px (default: 480)"

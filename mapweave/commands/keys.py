@@ -19,7 +19,7 @@ def add_to(commands: Any) -> None:
         description="Without keys the map server listens on its own machine alone. With keys it serves a "
         "network: each robot, server and person has a key file, and the router lets each do what its role "
         "may: a robot writes its own map and asks, a viewer reads, an operator gives missions and corrects.",
-        epilog="example: mapweave keys init --at 192.168.1.10; mapweave keys add r0; "
+        epilog="In order: mapweave keys init --at 192.168.1.10; mapweave keys add r0; "
         "mapweave server --keys keys; on the robot: mapweave agent r0 --keys r0.key.toml",
     )
     actions = parser.add_subparsers(dest="action", metavar="ACTION", required=True, title="actions")
@@ -61,7 +61,7 @@ def add_to(commands: Any) -> None:
     listing.set_defaults(run=_list)
 
     revoke = _action(actions, "revoke", "admit an identity no more, at once")
-    revoke.add_argument("name", metavar="NAME")
+    revoke.add_argument("name", metavar="NAME", help="who has a key, see `mapweave keys list`")
     revoke.add_argument("--because", default="", metavar="TEXT", help="why; the router's log says it")
     revoke.add_argument("--tokens", action="store_true", help="only the tokens for HTTP; the key stays good")
     revoke.add_argument(
@@ -70,7 +70,7 @@ def add_to(commands: Any) -> None:
     revoke.set_defaults(run=_revoke)
 
     bundle = _action(actions, "bundle", "the one file to copy to a robot or person")
-    bundle.add_argument("name", metavar="NAME")
+    bundle.add_argument("name", metavar="NAME", help="who has a key, see `mapweave keys list`")
     bundle.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="where to")
     bundle.set_defaults(run=_bundle)
 

@@ -32,7 +32,11 @@ def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -
         "-o", "--out", type=Path, metavar="OUT", help="with --map: write a map file there instead"
     )
     parser.add_argument(
-        "--timeout", type=values.seconds, default=20.0, metavar="S", help="longest wait for an answer"
+        "--timeout",
+        type=values.seconds,
+        default=20.0,
+        metavar="S",
+        help="longest wait for an answer (default: 20)",
     )
     add_network(parser)
 

@@ -20,14 +20,18 @@ def add_to(actions: Any) -> None:
         "are one or are not, with every number behind it; without ends, of each two maps. A running server "
         "is asked, or a map file. A named place may be given instead of a node.",
     )
-    parser.add_argument("ends", nargs="*", metavar="NODE|MAP", help="two nodes or two maps")
+    parser.add_argument("ends", nargs="*", metavar="NODE|PLACE|MAP", help="two nodes or two maps")
     parser.add_argument(
         "--map", type=map_source, metavar="FILE", help=f"explain {SOURCES}; no server is asked"
     )
     parser.add_argument("--draw", type=values.png, metavar="PNG", help="draw the landmarks of the two nodes")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument(
-        "--timeout", type=values.seconds, default=20.0, metavar="S", help="longest wait for an answer"
+        "--timeout",
+        type=values.seconds,
+        default=20.0,
+        metavar="S",
+        help="longest wait for an answer (default: 20)",
     )
     add_network(parser)
     parser.set_defaults(run=run)

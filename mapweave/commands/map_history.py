@@ -29,7 +29,11 @@ def add_to(actions: Any) -> None:
     parser.add_argument("--most", type=int, default=40, metavar="N", help="the newest so many (default: 40)")
     parser.add_argument("--json", action="store_true", help="print one JSON object, with all")
     parser.add_argument(
-        "--timeout", type=values.seconds, default=20.0, metavar="S", help="longest wait for an answer"
+        "--timeout",
+        type=values.seconds,
+        default=20.0,
+        metavar="S",
+        help="longest wait for an answer (default: 20)",
     )
     add_network(parser)
     parser.set_defaults(run=run)

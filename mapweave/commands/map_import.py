@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 from pathlib import Path
 from typing import Any
 
@@ -30,21 +31,29 @@ def run(arguments: argparse.Namespace) -> int:
     from dataclasses import replace
 
     import gtsam  # noqa: F401, where it is missing this says so before a file is read
+    import numpy as np
 
     from mapweave.commands.usage import UsageError
     from mapweave.formats.g2o import read_g2o, write_g2o
     from mapweave.formats.g2o_optimum import optimum_of
+    from mapweave.hybridmap.errors import InvalidFile
 
     if arguments.out.suffix == ".mapweave":
         raise UsageError(f"{arguments.out}: what is written is a pose graph, no map; end its name with .g2o")
     graph = read_g2o(arguments.file)
+    with np.errstate(all="ignore"):
+        before = graph.chi2()
+    if not math.isfinite(before):
+        raise InvalidFile(
+            f"{arguments.file}: its numbers are too large to be added up: give metres and radians"
+        )
     poses = optimum_of(graph)
     write_g2o(arguments.out, replace(graph, poses=poses))
     outcome = {
         "out": str(arguments.out),
         "vertices": len(poses),
         "edges": len(graph.edges),
-        "chi2_before": graph.chi2(),
+        "chi2_before": before,
         "chi2": graph.chi2(poses),
     }
     if arguments.json:

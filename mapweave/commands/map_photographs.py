@@ -33,7 +33,11 @@ def add_to(actions: Any) -> None:
     )
     parser.add_argument("--send", action="store_true", help="hand the map over to a running server")
     parser.add_argument(
-        "--timeout", type=values.seconds, default=20.0, metavar="S", help="longest wait for the server"
+        "--timeout",
+        type=values.seconds,
+        default=20.0,
+        metavar="S",
+        help="longest wait for the server (default: 20)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(parser)

@@ -22,7 +22,7 @@ def add_to(actions: Any) -> None:
         "listed.",
     )
     parser.add_argument("node", nargs="?", metavar="NODE|PLACE", help="a node, or a place")
-    parser.add_argument("pose", nargs="?", metavar="X,Y,DEG", help="its pose (default: as it is now)")
+    parser.add_argument("pose", nargs="?", metavar="X,Y,DEGREES", help="its pose (default: as it is now)")
     parser.add_argument("--undo", action="store_true", help="take the pin out")
     add_record_options(parser, changes=True)
     parser.add_argument("--json", action="store_true", help="print one JSON object")

@@ -47,7 +47,7 @@ def add_to(actions: Any) -> None:
         description="Remove a portal: `mapweave map portal remove 'east lift'`. `mapweave map history` still "
         "shows it; `map portal add` brings it back. For a time: `mapweave close A B`.",
     )
-    remove.add_argument("name", metavar="NAME")
+    remove.add_argument("name", metavar="NAME", help="of the portal")
     add_record_options(remove, changes=True)
     remove.set_defaults(run=run_remove)
 

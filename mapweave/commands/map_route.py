@@ -37,13 +37,21 @@ def add_to(actions: Any) -> None:
         help="as if a robot could not get through between these two; may be given again",
     )  # fmt: skip
     parser.add_argument(
-        "--via", action="append", default=[], metavar="PLACE", help="pass this first; may be given again"
+        "--via",
+        action="append",
+        default=[],
+        metavar="PLACE",
+        help="pass this first: a node, a place or a position; may be given again, in the order of the way",
     )
     parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     parser.add_argument("--draw", type=values.png, metavar="PNG", help="draw the way on the map")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument(
-        "--timeout", type=values.seconds, default=20.0, metavar="S", help="longest wait for an answer"
+        "--timeout",
+        type=values.seconds,
+        default=20.0,
+        metavar="S",
+        help="longest wait for an answer (default: 20)",
     )
     add_network(parser)
     parser.set_defaults(run=run)

@@ -18,7 +18,9 @@ def add_to(actions: Any) -> None:
         "again, until it is withdrawn with --undo. Who did so, when and why is kept and shown by "
         "`mapweave map explain`.",
     )
-    parser.add_argument("ends", nargs="+", metavar="NODE|MAP", help="the link: two nodes, or two maps")
+    parser.add_argument(
+        "ends", nargs="+", metavar="NODE|PLACE|MAP", help="the link: two nodes or places, or two maps"
+    )
     add_constraint_options(parser)
     parser.set_defaults(run=run)
 

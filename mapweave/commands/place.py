@@ -53,7 +53,7 @@ def add_to(commands: Any) -> None:
         description="Remove the name of a place: `mapweave place remove kitchen`. `mapweave map history` "
         "still shows it; `place add` brings it back.",
     )
-    remove.add_argument("name", metavar="NAME")
+    remove.add_argument("name", metavar="NAME", help="of the place")
     add_record_options(remove, changes=True)
     remove.set_defaults(run=run_remove)
 

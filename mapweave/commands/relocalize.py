@@ -53,7 +53,11 @@ def add_to(commands: Any) -> None:
     )  # fmt: skip
     add_plan_option(parser)
     parser.add_argument(
-        "--timeout", type=values.seconds, default=5.0, metavar="S", help="longest wait for an answer"
+        "--timeout",
+        type=values.seconds,
+        default=5.0,
+        metavar="S",
+        help="longest wait for an answer (default: 5)",
     )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(parser)

@@ -44,11 +44,17 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--name", type=values.name, help="in the fleet (default: the robot's, else the folder's)"
     )
-    parser.add_argument("--data", type=Path, default=Path("out/replay"), help="folder for the map")
+    parser.add_argument(
+        "--data", type=Path, default=Path("out/replay"), help="folder for the map (default: out/replay)"
+    )
     parser.add_argument("--epoch", type=int, help="least number of the new map (default: the next one)")
     parser.add_argument("--offline", action="store_true", help="do not connect to a router or a server")
     parser.add_argument(
-        "--timeout", type=values.seconds, default=20.0, metavar="S", help="longest wait for the server"
+        "--timeout",
+        type=values.seconds,
+        default=20.0,
+        metavar="S",
+        help="longest wait for the server (default: 20)",
     )
     add_calibration(parser)
     add_rerun(parser)
@@ -100,7 +106,7 @@ def run(arguments: argparse.Namespace) -> int:
     for note in robot.recording.notes:
         print(note)
     name = name_of(arguments)
-    settings = settings_of(arguments)
+    settings, calibration = settings_of(arguments), calibration_of(arguments, name)
     network = network_of(arguments, settings)
     bus, keys = _bus(network, name, arguments.offline)
     try:
@@ -119,7 +125,7 @@ def run(arguments: argparse.Namespace) -> int:
             total=len(robot),
             recorded=True,
             patience=0.0 if arguments.offline else arguments.timeout,
-            calibration=calibration_of(arguments, name),
+            calibration=calibration,
             rerun=arguments.rerun,
         )
         run_agent(robot, bus, keys, settings.agent, options, stop_on_signals())

@@ -95,7 +95,7 @@ def _add_batch(kinds: Any) -> None:
         "batch",
         help="try a scenario with many seeds",
         description="Run a scenario once a seed and show the median and the worst of every figure. Exit "
-        "status 0: every trial met its expectations; 2: not; 1: the scenario could not be read.",
+        "status 0: every trial met its expectations; 4: not; 1: the scenario could not be read.",
     )
     _add_scenario(parser)
     parser.add_argument("--seeds", type=values.count, default=10, metavar="N", help="how many (default: 10)")
@@ -214,6 +214,8 @@ def run_serve(arguments: argparse.Namespace) -> int:
     network = network_of(arguments, settings)
     if network.keys and not arguments.listen:
         raise UsageError(simulator_beside(network))
+    # Before PyBullet is loaded, which prints a line of its own.
+    scenario = _scenario(arguments)
     from mapweave.processes.simulator import run_sim
     from mapweave.terminal import log_with_time
     from mapweave.wire.bus_settings import BusSettings
@@ -222,7 +224,6 @@ def run_serve(arguments: argparse.Namespace) -> int:
     # Which robots time waits for, and which agents have gone.
     log_with_time(arguments.log_format)
     logging.getLogger("mapweave.sim").setLevel(logging.INFO)
-    scenario = _scenario(arguments)
     seed = scenario.seed if arguments.seed is None else arguments.seed
     stop = stop_on_signals()
     if arguments.listen:

@@ -29,6 +29,9 @@ def endpoint(text: str) -> str:
 
     if not ENDPOINT.fullmatch(text):
         raise UsageError(f"endpoints look like {DEFAULT_ENDPOINT}")
+    port = text.partition("#")[0].partition("?")[0].rpartition(":")[2]
+    if len(port) > 5 or int(port) > 65535:
+        raise UsageError("a port is at most 65535")
     return text
 
 

@@ -22,6 +22,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.hybridmap.manual_constraint import (
+    ConstraintRequest,
     ManualConstraint,
     ManualConstraints,
     event_words,
@@ -47,6 +48,15 @@ def test_what_it_is_about_is_put_in_order() -> None:
 def test_words_that_are_no_line_are_refused(who: str, why: str) -> None:
     with pytest.raises(InvalidValue):
         ManualConstraint(Apart((A, B)), True, who, 0, why)
+
+
+@pytest.mark.parametrize(("x", "y"), [(2e4, 0.0), (0.0, -1e308), (float("nan"), 0.0), (0.0, float("nan"))])
+def test_no_link_by_hand_joins_nodes_that_are_far_apart(x: float, y: float) -> None:
+    """Their maps could not be merged, and were set apart; a link of before can be taken back."""
+    link = Linked(NodeId("r0", 1, 1), NodeId("r1", 1, 1), Pose2(x, y, 0.0))
+    with pytest.raises(InvalidValue, match="nodes that see one place are at most 10000 m apart"):
+        ConstraintRequest(ManualConstraint(link, True, "anna", 1))
+    assert not ConstraintRequest(ManualConstraint(link, False, "anna", 1)).constraint.holds
 
 
 def test_a_constraint_on_maps_holds_for_all_their_nodes() -> None:

@@ -136,6 +136,18 @@ def test_places_over_http(house: House) -> None:
                 b'{"name": "x", "body": {"kind": "place", "corners": [[0, 0], [2, 2], [2, 0], [0, 2]]}}',
                 "crosses itself",
             ),
+            (
+                b'{"name": "x", "body": {"kind": "place", "corners": [[1e308, 0], [1e308, 1], [-1e308, 0]]}}',
+                "corners are at most 1e+06 m from the origin of the map",
+            ),
+            (
+                b'{"name": "x", "body": {"kind": "place", "node": "r0.1.3", "radius": 1e4}}',
+                "radius 10000: give metres, more than 0 and less than 10000",
+            ),
+            (
+                b'{"name": "x", "body": {"kind": "place", "node": "1e308,0"}}',
+                "nothing is mapped within 2 m of 1e+308,0: the nearest node is r0.1.1, 1e+308 m away at ",
+            ),
             (b'{"name": "r0.1.1", "body": {"kind": "place", "node": "r0.1.3"}}', "looks like a node"),
             (b'{"name": "x", "body": {"kind": "place", "radius": 1}}', "Expected `array"),
             (b'{"name": "x", "body": {"kind": "place", "radius": 1, "node": ["r0"]}}', "Expected `array`"),

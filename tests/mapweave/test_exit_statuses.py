@@ -29,7 +29,8 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (USAGE, "office --view 99999"), (FAILED, "{tmp}/none.toml"),
     ],
     "sim batch": [(USAGE, "nosuch"), (USAGE, "office --seeds 0"), (USAGE, "office --first -1")],
-    "sim serve": [(USAGE, "nosuch"), (USAGE, "office --connect nowhere"), (USAGE, "office --listen nowhere")],
+    "sim serve": [(USAGE, "nosuch"), (USAGE, "office --connect nowhere"), (USAGE, "office --listen nowhere"),
+                  (USAGE, "office --set robots=-1")],
     "server": [
         (USAGE, "--listen nowhere"), (USAGE, "--name S0"), (USAGE, "--fleet a/b"), (USAGE, "--http x"),
         (USAGE, "--http 0.0.0.0:8080"), (USAGE, "--demo --data {tmp}"), (USAGE, "--store x"),
@@ -39,12 +40,17 @@ CASES: dict[str, list[tuple[int, str]]] = {
     "router": [(USAGE, "--listen nowhere"), (USAGE, "--fleet a/b"), (FAILED, "--keys {tmp}/none")],
     "agent": [
         (USAGE, "R0"), (USAGE, "r0 --connect nowhere"), (USAGE, "r0 --body nowhere"), (USAGE, "r0 --seed -1"),
+        (USAGE, "r0 --connect tcp/127.0.0.1:65536"),
         (USAGE, "r0 --epoch -1"), (USAGE, "r0 --metrics 99999"), (USAGE, "r0 --robot nosuch --connect {at}"),
         (USAGE, "r0 --robot create --lockstep --connect {at}"), (NO, "r0 --resume r0.1 --data {tmp}/agents"),
-        (FAILED, "r0 --settings {tmp}/none.toml"),
+        (FAILED, "r0 --settings {tmp}/none.toml"), (FAILED, "r0 --record {map}/x --connect {at}"),
+        (FAILED, "r0 --calibration {map} --connect {at}"),
     ],
     "drive": [(USAGE, "R0"), (USAGE, "r0 --speed 7")],
-    "status": [(USAGE, "--connect nowhere"), (USAGE, "--fleet a/b"), (FAILED, "--connect {at}")],
+    "status": [
+        (USAGE, "--connect nowhere"), (USAGE, "--connect tcp/127.0.0.1:99999999999"), (USAGE, "--fleet a/b"),
+        (FAILED, "--connect {at}"),
+    ],
     "go": [(USAGE, "R0 r0.1.1"), (USAGE, "r0 r0.1.1 --wait --timeout 0"), (FAILED, "r0 home --connect {at}")],
     "explore": [(USAGE, "R0"), (USAGE, "r0 --timeout x"), (FAILED, "r0 --connect {at}")],
     "stop": [(USAGE, ""), (USAGE, "r0 --all"), (USAGE, "R0"), (FAILED, "r0 --connect {at}")],
@@ -61,8 +67,18 @@ CASES: dict[str, list[tuple[int, str]]] = {
     "plan remove": [(USAGE, ""), (NO, "office --map {map} -o {out}")],
     "close": [(USAGE, "r0.1.1 --until 99:99 --map {map}"), (NO, "r0.1.1 r0.1.999 --map {map} -o {out}")],
     "reopen": [(USAGE, ""), (NO, "kitchen --map {map} -o {out}")],
-    "prefer": [(USAGE, "r0.1.1 r0.1.3 --factor x"), (NO, "r0.1.1 r9.1.3 --map {map} -o {out}")],
-    "avoid": [(USAGE, "r0.1.1 r0.1.3 --factor x"), (NO, "r0.1.1 r9.1.3 --map {map} -o {out}")],
+    "prefer": [
+        (USAGE, "r0.1.1 r0.1.3 --factor x"), (USAGE, "r0.1.1 r0.1.3 --factor 0.01 --map {map} -o {out}"),
+        (USAGE, "r0.1.1 r0.1.3 --factor 2 --map {map} -o {out}"),
+        (USAGE, "r0.1.1 --radius 1e4 --map {map} -o {out}"),
+        (NO, "r0.1.1 r9.1.3 --map {map} -o {out}"),
+    ],
+    "avoid": [
+        (USAGE, "r0.1.1 r0.1.3 --factor x"), (USAGE, "r0.1.1 r0.1.3 --factor 1e9 --map {map} -o {out}"),
+        (USAGE, "r0.1.1 r0.1.3 --factor nan --map {map} -o {out}"),
+        (USAGE, "r0.1.1 r0.1.3 --factor 1 --map {map} -o {out}"),
+        (NO, "r0.1.1 r9.1.3 --map {map} -o {out}"),
+    ],
     "closures": [(USAGE, "--timeout 3"), (FAILED, "--map {tmp}/none.mapweave")],
     "floor": [(USAGE, "ground"), (NO, "ground r9.1.1 --map {map} -o {out}")],
     "portal done": [(USAGE, "R0"), (FAILED, "r0 --connect {at}")],
@@ -117,6 +133,7 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (USAGE, "r0.1.1"), (USAGE, "r0.1.1 r1.1.1 --pose x --map {map} --check"),
         (USAGE, "r0.1.1 r1.1.1 --pose 1,0 --map {map} --check"),
         (USAGE, "r0.1.1 r1.1.1 --pose nan,0,0 --map {map} --check"),
+        (USAGE, "r0.1.1 r1.1.1 --pose 2e4,0,0 --because x --map {map} --check"),
         (NO, "r0.1.1 r9.1.1 --map {map} --check"),
     ],
     "map unmerge": [(USAGE, "r0.1 r1.1.1 --map {map} -o {out}"), (NO, "r0.1 r9.1 --map {map} -o {out}")],
@@ -139,7 +156,10 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (USAGE, "R0 -o {tmp}/drive"), (USAGE, "r0 --robot nosuch -o {tmp}/drive --connect {at}"),
         (FAILED, "r0 -o {tmp}/drive --connect {at}"),
     ],
-    "replay": [(USAGE, "{recording} --name R0"), (FAILED, "{tmp}/none --offline")],
+    "replay": [
+        (USAGE, "{recording} --name R0"), (FAILED, "{tmp}/none --offline"),
+        (FAILED, "{recording} --offline --data {tmp}/replay --calibration {map}"),
+    ],
     "info": [(USAGE, ""), (FAILED, "{tmp}/none")],
     "relocalize": [
         (USAGE, "{images}/0.png --timeout 0"), (USAGE, "{map}"), (USAGE, "{images}/0.png --draw x.gif"),
@@ -189,7 +209,10 @@ def test_a_command_ends_with_the_status_of_what_was_wrong(
             ended = main(shlex.split(line))
         except SystemExit as exit_:
             ended = exit_.code  # argparse's own
-        assert ended == status, f"{line}: {capfd.readouterr().err}"
+        said = capfd.readouterr().err
+        assert ended == status, f"{line}: {said}"
+        # An answer "no" may be all of stdout.
+        assert len(said.splitlines()) == 1 or (status == NO and not said), f"{line}: {said}"
 
 
 def test_one_word_is_one_thing_in_all_commands() -> None:

@@ -233,6 +233,18 @@ def test_the_back_end_finds_gtsam_s_optimum_of_others_graphs(
     assert read_g2o(tmp_path / "out.g2o").chi2() == pytest.approx(result["chi2"])
 
 
+def test_a_graph_whose_numbers_are_too_large_is_refused_in_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "in.g2o"
+    edge = "EDGE_SE2 0 1 1 0 0 1e308 0 0 1 0 1\n"
+    path.write_text(f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1e308 0 0\n{edge}")
+    assert main(["map", "import", str(path), "-o", str(tmp_path / "out.g2o")]) == 1
+    words = "its numbers are too large to be added up: give metres and radians"
+    assert capfd.readouterr().err == f"mapweave: {path}: {words}\n"
+    assert not (tmp_path / "out.g2o").exists()
+
+
 def test_vertices_without_a_line_are_placed_along_edges(tmp_path: Path) -> None:
     graph = square(0.0, 0)
     path = tmp_path / "edges.g2o"

@@ -40,6 +40,18 @@ def test_every_command_says_what_it_does_with_examples_that_parse(words: str) ->
         assert program == "mapweave" and parsed.command.startswith(f"mapweave {words}")
 
 
+@pytest.mark.parametrize("words", parsers())
+def test_every_argument_has_its_help_and_every_default_is_named(words: str) -> None:
+    for action in parsers()[words]._actions:
+        if isinstance(action, argparse._SubParsersAction):
+            continue
+        assert action.help, action.dest
+        if action.option_strings and action.nargs != 0 and action.default not in (None, "", []):
+            _, _, named = (action.help % vars(action)).rpartition("default: ")
+            default = "here" if action.default == Path() else str(action.default).removesuffix(".0")
+            assert default in named, action.option_strings
+
+
 def test_no_example_is_of_a_command_that_is_gone() -> None:
     assert set(EXAMPLES) == set(parsers())
 
