@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-import ssl
 from datetime import UTC, datetime
 
 from mapweave.wire.credentials import Credentials
@@ -15,6 +14,9 @@ _VALIDITY = re.compile(rb"\x30[\x1e\x20\x22](" + _TIME + rb")(" + _TIME + rb")")
 
 def validity(certificate: str) -> tuple[datetime, datetime] | None:
     """The first and the last moment at which a certificate (PEM) holds; None if it cannot be read."""
+    # It loads OpenSSL, which a command without a key does not need.
+    import ssl
+
     try:
         found = _VALIDITY.search(ssl.PEM_cert_to_DER_cert(certificate))
     except ValueError:
