@@ -130,6 +130,8 @@ def test_one_map_too_many_is_refused_with_the_reason_until_there_is_room(
         agent.serve(2)
         agent.beacon(2)
     eventually(lambda: all(server.store.watermark(agent.map) == 2 for agent in agents[:3]))
+    # The others are answered a moment later.
+    eventually(lambda: all(any(ack.map == agent.map for ack in agent.acks) for agent in agents[3:]))
     reason = f"r0 has 3 maps here, which is its quota: {ADVICE} `maps`"
     for agent in agents[3:]:
         refusals = [ack.refusals for ack in agent.acks if ack.map == agent.map]
