@@ -333,10 +333,10 @@ def read_pose(numbers: Iterable[float]) -> Pose2:
     """X and y in m, and the heading in degrees, as people write them.
 
     Raises:
-        InvalidValue: they are not three finite numbers.
+        InvalidValue: they are not three finite numbers, or the heading is more than a whole turn.
     """
     values = [float(number) for number in numbers]
-    if len(values) != 3 or not all(math.isfinite(value) for value in values):
+    if len(values) != 3 or not all(math.isfinite(value) for value in values) or abs(values[2]) > 360.0:
         raise InvalidValue("a pose is three numbers, X,Y,DEGREES: the second node seen from the first")
     return Pose2(values[0], values[1], math.radians(values[2]))
 

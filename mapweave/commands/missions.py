@@ -36,7 +36,10 @@ def add_to(commands: Any) -> None:
     )
     go.add_argument("robot", help="the robot's name, for example r0")
     go.add_argument(
-        "goal", metavar="GOAL", help="a node (r0.1.17), a named place, a position (3.1,-2.0) or home"
+        "goal",
+        type=values.goal,
+        metavar="GOAL",
+        help="a node (r0.1.17), a named place, a position (3.1,-2.0) or home",
     )
     go.add_argument(
         "--via", action="append", default=[], metavar="PLACE",

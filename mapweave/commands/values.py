@@ -35,6 +35,13 @@ def endpoint(text: str) -> str:
     return text
 
 
+def goal(text: str) -> str:
+    """Where a robot shall go; the map says whether it is there."""
+    if not text.strip():
+        raise UsageError("give a node (r0.1.17), a named place, a position (3.1,-2.0) or home")
+    return text
+
+
 def seed(text: str) -> int:
     """A seed that random generators take."""
     return _whole(text, 0, math.inf, "use 0 or more")
