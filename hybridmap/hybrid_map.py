@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
-from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Collection, Iterable, Iterator
+from typing import TYPE_CHECKING
 
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.ids import EdgeId, NodeId
@@ -27,29 +26,17 @@ class HybridMap:
         """Replay the changes."""
         self.nodes: dict[NodeId, Node] = {}
         self.edges: dict[EdgeId, Edge] = {}
-        # As networkx keeps a multigraph: what stands at each node, and the edges from each to each, by their
-        # keys. Both directions of a pair have the same ones.
-        self._ends: dict[NodeId, dict[str, Any]] = {}
-        self._between: dict[NodeId, dict[NodeId, dict[EdgeId, dict[str, Any]]]] = {}
+        # The keys of the edges from each to each; both directions of a pair have the same ones.
+        self._between: dict[NodeId, dict[NodeId, dict[EdgeId, None]]] = {}
         for body in changes:
             self.apply(body)
-
-    @cached_property
-    def graph(self) -> nx.MultiGraph:
-        """A networkx multigraph over node ids; each edge's key is its edge id. It changes with the map."""
-        # A robot needs none of its algorithms, and importing it takes a quarter of all that an agent imports.
-        import networkx as nx
-
-        graph = nx.MultiGraph()
-        graph._node, graph._adj = self._ends, self._between
-        return graph
 
     def apply(self, change: ChangeBody) -> None:
         """Apply one change. Retiring what is not there is no error: a log may be replayed from anywhere."""
         match change:
             case NodePut(node):
                 self.nodes[node.id] = node
-                self._enter(node.id)
+                self._between.setdefault(node.id, {})
             case NodeRetired(node_id):
                 self.nodes.pop(node_id, None)
                 for other, edge_ids in self._between.pop(node_id, {}).items():
@@ -57,21 +44,14 @@ class HybridMap:
                         self.edges.pop(edge_id, None)
                     if other != node_id:
                         del self._between[other][node_id]
-                self._ends.pop(node_id, None)
             case EdgePut(edge):
                 self._forget_edge(edge.id)
                 self.edges[edge.id] = edge
-                self._enter(edge.a)
-                self._enter(edge.b)
-                between = self._between[edge.a].setdefault(edge.b, {})
-                self._between[edge.b][edge.a] = between
-                between[edge.id] = {}
+                between = self._between.setdefault(edge.a, {}).setdefault(edge.b, {})
+                self._between.setdefault(edge.b, {})[edge.a] = between
+                between[edge.id] = None
             case EdgeRetired(edge_id):
                 self._forget_edge(edge_id)
-
-    def _enter(self, end: NodeId) -> None:
-        self._ends.setdefault(end, {})
-        self._between.setdefault(end, {})
 
     def _forget_edge(self, edge_id: EdgeId) -> None:
         edge = self.edges.pop(edge_id, None)
@@ -99,6 +79,21 @@ class HybridMap:
                 found.append(reached(node, lambda at: (to for to in self._between[at] if to in self.nodes)))
                 seen |= found[-1]
         return sorted(found, key=len, reverse=True)
+
+    def graph(self) -> nx.MultiGraph:
+        """The reachability graph as it is now, for algorithms of networkx; the key of each edge is its id."""
+        # A robot needs none of them, and to import networkx would be a quarter of all that an agent imports.
+        import networkx as nx
+
+        graph = nx.MultiGraph()
+        graph.add_nodes_from(self._between)
+        # With the data: networkx tries the last of three as such, and would take letters of a robot's name.
+        graph.add_edges_from((edge.a, edge.b, edge.id, {}) for edge in self.edges.values())
+        return graph
+
+    def neighbours(self, node: NodeId) -> Collection[NodeId]:
+        """Nodes to which an edge leads from a node, whichever way; none from one that is not there."""
+        return self._between.get(node, {}).keys()
 
     def edges_at(self, node: NodeId) -> list[Edge]:
         """Edges that begin or end at a node; none of one that is not there."""

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.area import Floats
+from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
@@ -91,7 +92,7 @@ class Roadmap:
         """Joined pairs of nodes of a component, and (N, 2) where each begins and ends in the merged frame."""
         if component not in self._segments:
             members = self.merged.components[component]
-            joined = {(a, b) for a, b in self.union.graph.edges() if a in members and b in members}
+            joined = {(a, b) for a in members for b in self.union.neighbours(a) if a <= b and b in members}
             pairs = [pair for pair in sorted(joined) if pair[0] in self.poses and pair[1] in self.poses]
             ends = [
                 np.array([(self.poses[pair[k]].x, self.poses[pair[k]].y) for pair in pairs]).reshape(-1, 2)
@@ -113,11 +114,9 @@ class Roadmap:
                     self._join(EdgeId(NEAR, number, k), nodes[i], nodes[j])
 
     def _drivable_between(self, a: NodeId, b: NodeId) -> bool:
-        edges = self.union.graph.get_edge_data(a, b) or {}
-        return any(edge_id not in self.closed for edge_id in edges)
+        return any(edge.id not in self.closed for edge in self.union.edges_between(a, b))
 
     def _join(self, edge_id: EdgeId, a: NodeId, b: NodeId) -> None:
         between: Pose2 = self.poses[a].inverse() @ self.poses[b]
         edge = Edge(edge_id, a, b, PoseGaussian(between, np.zeros((3, 3))), EdgeKind.LOOP)
-        self.union.edges[edge.id] = edge
-        self.union.graph.add_edge(a, b, key=edge.id)
+        self.union.apply(EdgePut(edge))

@@ -219,7 +219,7 @@ def _gaps(
             if hindrances.words(frozenset((a, b))):
                 out.append(_through(router, portals[number], frozenset((a, b)), hindrances))
             continue
-        between = [roads.union.edges[key] for key in roads.union.graph.get_edge_data(a, b)]
+        between = roads.union.edges_between(a, b)
         best = min(between, key=lambda e: (edge_cost(e, poses, True, router.costs), e.id))
         words = hindrances.words(frozenset((a, b)))
         if words or all(edge.id in roads.closed for edge in between):

@@ -351,8 +351,9 @@ class Router:
         goal = np.array([target.x, target.y])
         at = np.array([pose.x, pose.y])
         saved = 0.0
-        for _, neighbour, edge_id in roads.union.graph.edges(node, keys=True):
-            if roads.union.edges[edge_id].kind in RECOGNISED or frozenset((node, neighbour)) in barred:
+        for edge in roads.union.edges_at(node):
+            neighbour = edge.b if edge.a == node else edge.a
+            if edge.kind in RECOGNISED or frozenset((node, neighbour)) in barred:
                 continue
             if neighbour not in roads.poses:
                 continue

@@ -175,5 +175,5 @@ def _falls_apart(which: MapId, whole: HybridMap, before: set[NodeId], now: set[N
 
 def _parts(whole: HybridMap, retired: set[NodeId]) -> int:
     """Parts of a map between which no edge leads, without some nodes, and without bridges across them."""
-    left = whole.graph.subgraph(whole.nodes.keys() - retired)
+    left = whole.graph().subgraph(whole.nodes.keys() - retired)
     return nx.number_connected_components(left)  # type: ignore[no-any-return]

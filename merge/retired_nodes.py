@@ -114,9 +114,8 @@ def _composed(hybrid_map: HybridMap, way: Sequence[NodeId]) -> PoseGaussian:
 
 def _way_between(hybrid_map: HybridMap, a: NodeId, b: NodeId) -> PoseGaussian:
     """Pose `a_from_b` by the most certain edge of the robot's way between two neighbours."""
-    edges = (hybrid_map.edges[edge_id] for edge_id in hybrid_map.graph.get_edge_data(a, b))
     best = min(
-        (edge for edge in edges if edge.kind not in CLAIMS),
+        (edge for edge in hybrid_map.edges_between(a, b) if edge.kind not in CLAIMS),
         key=lambda edge: (float(edge.a_from_b.covariance.trace()), edge.id),
     )
     return best.a_from_b if best.a == a else best.a_from_b.inverse()

@@ -91,7 +91,7 @@ def _unmapped(mapped: Mapped, start: Pose2) -> bool:
 
 def _goals(mapped: Mapped, start: Pose2) -> list[tuple[NodeId, int]]:
     """Goals with a view, with the edges that lead to them from the node next to the start."""
-    graph = mapped.nodes.graph
+    graph = mapped.nodes.graph()
     beside = min(mapped.truth, key=lambda node: (mapped.truth[node].distance(start), node))
     hops = nx.single_source_shortest_path_length(graph, beside)
     return [

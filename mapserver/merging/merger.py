@@ -381,7 +381,7 @@ class Merger:
             return
         for map_id, hybrid_map in list(self.maps.items()):
             for node in plan.nodes:
-                if node in hybrid_map.graph:
+                if node in hybrid_map.nodes or hybrid_map.edges_at(node):
                     self._replay(map_id, NodeRetired(node))
             if not (hybrid_map.nodes or hybrid_map.edges):
                 del self.maps[map_id]

@@ -196,13 +196,7 @@ def plan_of(
     parts = {merged.component_of(node) for node in nodes}
     standing = {pair for pair in linked if merged.component_of(pair[0]) in parts} | pruning.standing
     standing = {pair for pair in standing if nodes.keys().isdisjoint(pair)}
-    edges = {
-        edge_id
-        for hybrid_map in maps
-        for node in nodes
-        if node in hybrid_map.graph
-        for _, _, edge_id in hybrid_map.graph.edges(node, keys=True)
-    }
+    edges = {edge.id for hybrid_map in maps for node in nodes for edge in hybrid_map.edges_at(node)}
     return PrunePlan(nodes, tuple(sorted(edges)), tuple(marginals), frozenset(standing))
 
 

@@ -137,7 +137,7 @@ class RecordedRobot:
         return f"{self._name} is a recording and knows its own map alone"
 
     def _way_to(self, goal: NodeId) -> list[NodeId]:
-        way: list[NodeId] = nx.shortest_path(self._map.graph, self._nearest(), goal)
+        way: list[NodeId] = nx.shortest_path(self._map.graph(), self._nearest(), goal)
         return way
 
     def _nearest(self) -> NodeId:

@@ -144,8 +144,7 @@ class Traversability:
         return self._ways[node]
 
     def _edges(self, node: NodeId) -> Iterator[Edge]:
-        hybrid_map = self._merged.maps[node.map]
-        own = (hybrid_map.edges[edge_id] for _, _, edge_id in hybrid_map.graph.edges(node, keys=True))
+        own = self._merged.maps[node.map].edges_at(node)
         links = (link.edge() for link in self._links.at(node))
         for edge in (*own, *links, *self._foreign.get(node, ())):
             if edge.id not in self._false and self._drivable(edge):

@@ -245,8 +245,7 @@ def _followed(
 
 def _next_to(node: NodeId, loops: Iterable[Link], hybrid_map: HybridMap) -> dict[int, list[Landmark]]:
     """Which landmarks of other nodes show the same things as a node's own."""
-    edges = (hybrid_map.edges[key] for _, _, key in hybrid_map.graph.edges(node, keys=True))
-    ways = [link_of(edge) for edge in edges if edge.kind in FOLLOWED and edge.within]
+    ways = [link_of(edge) for edge in hybrid_map.edges_at(node) if edge.kind in FOLLOWED and edge.within]
     table: dict[int, list[Landmark]] = defaultdict(list)
     for way in (*(way if way.a == node else way.turned() for way in ways), *loops):
         for i, j in way.shared.tolist():

@@ -240,9 +240,7 @@ class MergedMap:
                 if not (isinstance(change, EdgePut) and change.edge.id in false):
                     whole.apply(change)
         for link in self.links:
-            edge = link.edge()
-            whole.edges[edge.id] = edge
-            whole.graph.add_edge(edge.a, edge.b, key=edge.id)
+            whole.apply(EdgePut(link.edge()))
         return whole
 
     def explain(self, a: NodeId, b: NodeId) -> str:

@@ -95,7 +95,7 @@ def test_plots_are_valid_pictures(mapped: Mapped, floor: Floor) -> None:
             turned = abs(wrap_angle(start.heading - taken.heading))
             assert start.distance(taken) >= 0.15 or turned >= math.radians(15)
         beside = min(mapped.truth, key=lambda node: mapped.truth[node].distance(start))
-        assert nx.shortest_path_length(mapped.nodes.graph, beside, plot.goal) == plot.edges >= LEAST_EDGES
+        assert nx.shortest_path_length(mapped.nodes.graph(), beside, plot.goal) == plot.edges >= LEAST_EDGES
         line = np.array([[mapped.truth[beside].x, mapped.truth[beside].y], [start.x, start.y]])
         assert not crossed(line[:1], line[1:], PLAN.walls)[0]
         assert plot.shortest >= start.distance(plot.world_from_goal)

@@ -37,7 +37,7 @@ def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path: Path) -> None
         MapId("m0", 1): 6,
     }
     for outcome in maps.values():
-        assert nx.is_connected(outcome.graph)
+        assert nx.is_connected(outcome.graph())
         for edge in outcome.edges.values():
             a, b = (outcome.nodes[end].map_from_robot.mean for end in (edge.a, edge.b))
             assert (a @ edge.a_from_b.mean).distance(b) < 1e-5

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mapweave.hybridmap.change import EdgeRetired
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import EdgeKind
@@ -201,8 +202,7 @@ def test_links_that_contradict_a_better_supported_way_round_are_refused() -> Non
 
 def test_a_map_in_pieces_is_joined_piece_by_piece() -> None:
     whole = chain("a", 6)
-    del whole.edges[NodeId("a", 1, 6)]  # between nodes 5 and 7
-    whole.graph.remove_edge(NodeId("a", 1, 5), NodeId("a", 1, 7), key=NodeId("a", 1, 6))
+    whole.apply(EdgeRetired(NodeId("a", 1, 6)))  # between nodes 5 and 7
     merged = merge_maps({A: whole}, [])
     assert [len(part) for part in merged.components] == [3, 3]
     assert set(merged.poses) == set(whole.nodes)

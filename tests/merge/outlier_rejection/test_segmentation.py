@@ -96,7 +96,7 @@ def test_a_loop_closure_off_by_a_bay_is_left_out_with_a_reason(seed: int) -> Non
     assert "own loop contradicts" in merged.explain(*refusal.pair)
     union = merged.union()
     assert false not in union.edges and set(true) <= set(union.edges)
-    assert not union.graph.has_edge(*refusal.pair)
+    assert not union.edges_between(*refusal.pair)
     assert false in aisles.map.edges
 
 
