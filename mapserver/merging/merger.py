@@ -43,10 +43,13 @@ class Merger:
     """Holds every robot's map, and merges them from what comparing their nodes has found.
 
     A new node is compared with its best candidates when it comes; the merged map is made when it is requested
-    and something has changed, and then only where it has. New nodes are not compared with nodes superseded on
-    another day, and which of two nodes of one place supersedes the other depends on what was superseded
-    before. In a large place database (see LandmarkIndexSettings) cells are searched, which depend on what was
-    there when they were learned. Except for that the result depends on the maps, not on the order of changes.
+    and something has changed, and then only where it has.
+
+    With four exceptions the result depends on the maps, not on the order of changes. New nodes are not
+    compared with nodes superseded on another day. Which of two nodes of one place supersedes the other
+    depends on what was superseded before (docs/decisions/life-of-a-map.md says how much that is). In a large
+    place database cells are searched, which depend on what was there when they were learned (see
+    LandmarkIndexSettings). Decisions on a large island stay until much of it has changed (see Islands).
     """
 
     def __init__(
