@@ -29,5 +29,6 @@ MEASUREMENTS: dict[str, str] = {
     "wrong_geometry": "python -m benchmarks.wrong_geometry --runs 1 --kinds slip carried --scenes room "
     "--seed 723 --json",
     "agent": "python -m benchmarks.agent --seed 724 --json",
+    "fleet": "python -m benchmarks.fleet --agents 50 200 1000 --seconds 30 --seed 733 --json",
     "life": "python -m benchmarks.life --drives 6 --stops 4 --seed 713 --json",
 }

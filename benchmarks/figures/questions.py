@@ -255,6 +255,41 @@ LIFE = Question(
         ),
     ),
 )
+FLEET = Question(
+    "How many robots does a server carry?",
+    (
+        Row(
+            "50, 200, 1000 robots with a node every 10 s, on the server's machine: from a change to its "
+            "acknowledgement, median",
+            "{agents/50/ack_p50_ms:.0f}, {agents/200/ack_p50_ms:.0f}, {agents/1000/ack_p50_ms:.0f} ms",
+            "fleet",
+        ),
+        Row(
+            "the 99th percentile",
+            "{agents/50/ack_p99_ms:.0f}, {agents/200/ack_p99_ms:.0f}, {agents/1000/ack_p99_ms:.0f} ms",
+            "fleet",
+            "500 ms",
+        ),
+        Row(
+            "until an answer to a lost robot meanwhile, 95th percentile",
+            "{agents/50/relocalize_p95_ms:.0f}, {agents/200/relocalize_p95_ms:.0f}, "
+            "{agents/1000/relocalize_p95_ms:.0f} ms",
+            "fleet",
+            "250 ms",
+        ),
+        Row(
+            "1000 changes within a second behind that: all acknowledged after",
+            "{agents/50/burst_s:.1f}, {agents/200/burst_s:.1f}, {agents/1000/burst_s:.1f} s",
+            "fleet",
+        ),
+        Row(
+            "cores of 1000 robots' links, of the server, of its router",
+            "{agents/1000/generator_cpu:.2f}, {agents/1000/server_cpu:.2f}, {agents/1000/router_cpu:.2f}",
+            "fleet",
+        ),
+        Row("memory of the server with 1000 robots", "{agents/1000/server_rss_mb:.0f} MB", "fleet"),
+    ),
+)
 SMALL_COMPUTERS = Question(
     "What does an agent need?",
     (
@@ -278,4 +313,4 @@ SMALL_COMPUTERS = Question(
         Row("wheels of the base installation", "{wheel_mb:.0f} MB", "agent"),
     ),
 )
-QUESTIONS = (FILTERS, DRIVING, SMALL_COMPUTERS, LANDMARKS, LOST, MERGING, LIFE)
+QUESTIONS = (FILTERS, DRIVING, SMALL_COMPUTERS, LANDMARKS, LOST, MERGING, LIFE, FLEET)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 from benchmarks.figures.results import Result
 from mapweave.mapserver.server import MERGE_SHARE
@@ -18,9 +17,6 @@ QUESTION_BYTES = 2722
 """Of a view of a lost robot, encoded; likewise."""
 DISK_BYTES = 4588
 """Of a node with its edge in a store of SQLite; likewise."""
-FLEET = {"agents": 50, "server_cpu": 0.202, "router_cpu": 0.018, "ack_p99_ms": 507.9}
-"""`python -m benchmarks.fleet --agents 50 --seconds 20 --burst 50 --seed 731`, 2026-11-23, on two cores
-with a load of 16 from other programs. The stored result `fleet` takes its place where there is one."""
 GOOD_ACK_MS = 500.0
 """A fleet whose 99th percentile is below is carried."""
 
@@ -78,7 +74,7 @@ class Costs:
         explored = results["explore"].figures
         floor = explored["area_per_minute_ours"]["1"] * explored["minutes"]
         base = merge["rss_before_mb"]["10000"] * 1e6
-        rows = _fleet(results)
+        rows = {int(robots): row for robots, row in results["fleet"].figures["agents"].items()}
         agents = max(rows)
         return Costs(
             node_bytes=results["landmarks"].figures["bytes_per_node"],
@@ -94,13 +90,6 @@ class Costs:
             agents=agents,
             carried=max((n for n, row in rows.items() if row["ack_p99_ms"] <= GOOD_ACK_MS), default=0),
         )
-
-
-def _fleet(results: Mapping[str, Result]) -> dict[int, Mapping[str, Any]]:
-    """What a server took by number of agents."""
-    if "fleet" not in results:
-        return {int(FLEET["agents"]): FLEET}
-    return {int(agents): row for agents, row in results["fleet"].figures["agents"].items()}
 
 
 @dataclass(frozen=True)
@@ -211,7 +200,6 @@ def _table(head: Row, rows: list[Row]) -> str:
 
 
 def _costs(costs: Costs, results: Mapping[str, Result]) -> list[Row]:
-    fleet = "fleet" if "fleet" in results else "benchmarks.fleet --agents 50, busy machine"
     here = "encoded"
     return [
         ("a node with 150 landmarks on the wire", f"{costs.node_bytes:.0f} bytes", "landmarks", MEASURED),
@@ -228,7 +216,7 @@ def _costs(costs: Costs, results: Mapping[str, Result]) -> list[Row]:
         ("processor: an answer to a lost robot among 100 000 places", f"{1e3 * costs.answer_s:.0f} ms",
          "relocalize", MEASURED),
         (f"processor: a mapping robot's link, server and router, of {costs.agents} robots",
-         f"{1e3 * costs.link_s:.1f} ms/s", fleet, MEASURED),
+         f"{1e3 * costs.link_s:.1f} ms/s", "fleet", MEASURED),
         ("nodes that an exploring robot makes", f"{costs.nodes_per_m2:.1f} per m²", "explore", MEASURED),
         ("active nodes after six drives, over the first", f"{costs.growth:.2f}", "life", MEASURED),
     ]  # fmt: skip
