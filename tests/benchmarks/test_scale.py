@@ -26,7 +26,7 @@ from mapweave.wire.messages import encode, encode_view
 
 @pytest.fixture(scope="module")
 def results() -> dict[str, Result]:
-    return {name: load(name) for name in MEASUREMENTS if name != "fleet"}
+    return {name: load(name) for name in MEASUREMENTS}
 
 
 def test_bytes_are_those_of_today(tmp_path: Path) -> None:
@@ -79,7 +79,7 @@ def test_the_sums_are_those_of_simulated_minutes(results: dict[str, Result]) -> 
     assert plan.memory > plan.nodes * costs.kept_bytes > 0
 
 
-def test_a_stored_result_of_fleets_takes_the_place_of_the_small_one(results: dict[str, Result]) -> None:
+def test_a_server_carries_the_largest_fleet_that_is_in_time(results: dict[str, Result]) -> None:
     row = {"server_cpu": 0.5, "router_cpu": 0.1, "ack_p99_ms": 90.0}
     figures = {
         "agents": {"50": row, "1000": {**row, "ack_p99_ms": 400.0}, "2000": {**row, "ack_p99_ms": 9e3}}
@@ -89,3 +89,7 @@ def test_a_stored_result_of_fleets_takes_the_place_of_the_small_one(results: dic
     assert costs.link_s == pytest.approx(0.6 / 2000)
     page = scale_page({**results, "fleet": replace(results["life"], figures=figures)})
     assert "| front servers | robots over that | 10 |" in page
+    late = {"agents": {"50": {**row, "ack_p99_ms": 501.0}}}
+    page = scale_page({**results, "fleet": replace(results["life"], figures=late)})
+    assert "| none of 50 was in time on that machine |" in page
+    assert "| front servers | robots over that | not known |" in page
