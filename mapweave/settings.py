@@ -7,6 +7,7 @@ from pathlib import Path
 
 from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.agent.settings import AgentSettings
+from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.mapserver.admission_control import AdmissionSettings
 from mapweave.mapserver.cluster.settings import ClusterSettings
 from mapweave.mapserver.quotas import QuotaSettings
@@ -66,4 +67,7 @@ def load_settings(path: Path | None) -> Settings:
     """
     if path is None:
         return Settings()
-    return build(Settings, read_toml(path), str(path))
+    try:
+        return build(Settings, read_toml(path), str(path))
+    except InvalidValue as error:
+        raise SettingsError(f"{path}: {error}") from None

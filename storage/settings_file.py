@@ -16,7 +16,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from mapweave.hybridmap.errors import MapweaveError, SettingsError
+from mapweave.hybridmap.errors import SettingsError
 from mapweave.storage.atomic_file import read_whole
 from mapweave.storage.os_errors import reason_of
 from mapweave.wire.conversion import convert
@@ -74,8 +74,8 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
         where: for the error's text, for example `robot.toml`.
 
     Raises:
-        SettingsError: a name that does not exist or is missing, a value of the wrong kind or out of range, or
-            what a dataclass itself refuses, in its own words.
+        SettingsError: a name that does not exist or is missing, or a value of the wrong kind or out of range.
+        InvalidValue: values that a dataclass itself refuses, in its own words.
     """
     for problem in _problems(cls, values, ""):
         raise SettingsError(f"{where}: {problem}")
@@ -84,7 +84,7 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
         return settings
     except msgspec.ValidationError as error:
         raise SettingsError(f"{where}: {_in_words(str(error), values)}") from None
-    except MapweaveError as error:
+    except SettingsError as error:
         raise SettingsError(f"{where}: {error}") from None
 
 

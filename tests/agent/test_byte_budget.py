@@ -11,7 +11,6 @@ from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.node import Node
-from mapweave.registration.selection import SelectionSettings
 from mapweave.storage.settings_file import build
 from mapweave.wire.codec import decode_body, encode_body, encode_change
 
@@ -51,8 +50,6 @@ def test_the_robot_uses_the_quantized_numbers(walls, description):
 
 def test_a_budget_that_leaves_no_room_is_refused():
     with pytest.raises(InvalidValue, match="660 at least"):
-        SelectionSettings(100)
-    with pytest.raises(SettingsError, match=r"^robot\.toml: most_bytes: a node needs 660 at least, not 100$"):
         build(AgentSettings, {"landmarks": {"most_bytes": 100}}, "robot.toml")
     with pytest.raises(SettingsError, match="did you mean 'most_bytes'"):
         build(AgentSettings, {"landmarks": {"most_byte": 1000}}, "robot.toml")
