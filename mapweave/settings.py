@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Any
 
 from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.agent.settings import AgentSettings
@@ -65,9 +67,20 @@ def load_settings(path: Path | None) -> Settings:
     Raises:
         SettingsError: the file is missing, is not TOML, or names or values are wrong.
     """
-    if path is None:
-        return Settings()
+    return Settings() if path is None else settings_from(read_toml(path), str(path))
+
+
+def settings_from(table: Mapping[str, Any], where: str) -> Settings:
+    """Read a table over the defaults.
+
+    Args:
+        table: as TOML gives it.
+        where: for the error's text.
+
+    Raises:
+        SettingsError: names or values are wrong.
+    """
     try:
-        return build(Settings, read_toml(path), str(path))
+        return build(Settings, table, where)
     except InvalidValue as error:
-        raise SettingsError(f"{path}: {error}") from None
+        raise SettingsError(f"{where}: {error}") from None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 import subprocess
 import sys
 import time
@@ -15,7 +16,7 @@ from hypothesis import strategies as st
 
 from mapweave.agent.drivers.settings_writer import write_camera
 from mapweave.hybridmap.errors import SettingsError
-from mapweave.settings import Settings, load_settings
+from mapweave.settings import Settings, load_settings, settings_from
 from mapweave.storage.settings_file import build, read_toml
 
 
@@ -204,7 +205,7 @@ def test_any_value_anywhere_is_taken_or_refused(data):
     for name in reversed(path):
         table = {name: table}
     try:
-        made: Any = build(Settings, table, "file")
+        made: Any = settings_from(table, "file")
     except SettingsError as error:
         assert str(error).startswith("file: ")
         assert "\n" not in str(error)
@@ -214,6 +215,18 @@ def test_any_value_anywhere_is_taken_or_refused(data):
     assert default is None or type(made) is type(default)
     if isinstance(default, tuple):
         assert field.type == "tuple[str, ...]" and all(type(one) is str for one in made)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ({"agent": {"landmarks": {"most_bytes": 0}}}, "file: most_bytes: a node needs 660 at least, not 0"),
+        ({"robot": {"geometry": {"axle": 400.0}}}, "file: geometry: axle is 400; it is in metres, at most"),
+    ],
+)
+def test_what_settings_refuse_themselves_names_the_file(table, words):
+    with pytest.raises(SettingsError, match=f"^{re.escape(words)}"):
+        settings_from(table, "file")
 
 
 def test_a_camera_is_written_into_a_file_of_an_editor_of_windows(tmp_path: Path) -> None:
