@@ -25,6 +25,8 @@ from mapweave.hybridmap.portal import Portal
 from mapweave.hybridmap.wall_time import utc_words
 
 MAX_NAME = 64
+LEAST_FACTOR, MOST_FACTOR = 0.1, 100.0
+"""By which a preference multiplies the cost of a way."""
 MAX_ANNOTATIONS = 10_000
 """Made by hand, one by one."""
 RESERVED = ("home", "area", "here", "all")
@@ -115,7 +117,7 @@ class Preference:
     """
 
     TAG: ClassVar[str] = "preference"
-    factor: Annotated[float, Meta(ge=0.1, le=100.0)]
+    factor: Annotated[float, Meta(ge=LEAST_FACTOR, le=MOST_FACTOR)]
     edge: Pair | None = None
     area: Area | None = None
 
@@ -123,8 +125,9 @@ class Preference:
         """Refuse both, neither, and a factor that says nothing (InvalidValue)."""
         _check_one("a preference", self.edge, self.area)
         _check_edge(self.edge)
-        if not (0.1 <= self.factor <= 100.0) or self.factor == 1.0:
-            raise InvalidValue(f"factor {self.factor:g}: give 0.1 to 100, below 1 to prefer, above to avoid")
+        if not (LEAST_FACTOR <= self.factor <= MOST_FACTOR) or self.factor == 1.0:
+            within = f"{LEAST_FACTOR:g} to {MOST_FACTOR:g}"
+            raise InvalidValue(f"factor {self.factor:g}: give {within}, below 1 to prefer, above to avoid")
 
     @property
     def anchor(self) -> NodeId:

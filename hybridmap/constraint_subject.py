@@ -336,8 +336,10 @@ def read_pose(numbers: Iterable[float]) -> Pose2:
         InvalidValue: they are not three finite numbers, or the heading is more than a whole turn.
     """
     values = [float(number) for number in numbers]
-    if len(values) != 3 or not all(math.isfinite(value) for value in values) or abs(values[2]) > 360.0:
+    if len(values) != 3 or not all(math.isfinite(value) for value in values):
         raise InvalidValue("a pose is three numbers, X,Y,DEGREES: the second node seen from the first")
+    if abs(values[2]) > 360.0:
+        raise InvalidValue(f"a heading of {values[2]:g} degrees is more than a whole turn: give -360 to 360")
     return Pose2(values[0], values[1], math.radians(values[2]))
 
 

@@ -97,11 +97,12 @@ def run_close(arguments: argparse.Namespace) -> int:
 def run_prefer(arguments: argparse.Namespace) -> int:
     """Prefer or avoid a way, or withdraw that."""
     from mapweave.commands.usage import UsageError
+    from mapweave.hybridmap.annotation import LEAST_FACTOR, MOST_FACTOR
 
-    least, most = (0.1, 1.0) if arguments.verb == "prefer" else (1.0, 100.0)
+    least, most = (LEAST_FACTOR, 1.0) if arguments.verb == "prefer" else (1.0, MOST_FACTOR)
     # Written so that NaN fails.
     if not least <= arguments.factor <= most or arguments.factor == 1.0:
-        words = "0.1 to 1 prefers a way, 1 to 100 avoids it, and 1 itself does neither"
+        words = f"{LEAST_FACTOR:g} to 1 prefers a way, 1 to {MOST_FACTOR:g} avoids it, 1 itself does neither"
         raise UsageError(f"--factor {arguments.factor:g}: {words}")
     if arguments.undo:
         return _withdraw(arguments, "preference")

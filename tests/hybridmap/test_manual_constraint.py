@@ -171,6 +171,9 @@ def test_an_area_contains_what_its_sides_go_round_an_odd_number_of_times(corners
 def test_subjects_as_people_write_them() -> None:
     assert read_retired(["a.1"]) == RetiredMap(A.map) and read_retired(["b.1.5", "a.1.3"]).nodes == (A, B)
     assert read_corner("1.5,-2") == (1.5, -2.0) and read_pose([1, 2, 180]).heading == pytest.approx(np.pi)
+    assert read_pose([1, 2, -360]).heading == pytest.approx(-2.0 * np.pi)
+    with pytest.raises(InvalidValue, match="a heading of 400 degrees is more than a whole turn"):
+        read_pose([1, 2, 400])
     window = read_window(A.map, "1970-01-01T00:01", "1970-01-01T01:02+01:00", 0)
     assert (window.begin_ns, window.end_ns) == (60 * 10**9, 120 * 10**9)
     assert read_window(A.map, "7", 9, 0) == RetiredWindow(A.map, 7, 9)
