@@ -34,6 +34,8 @@ _D = TypeVar("_D", bound=Declared)
 SILENT, UNANSWERED = 20.0, 10.0
 """After so long without any message a client asks its router for a sign of life, and connects again if none
 comes for so long, s. A router that is gone is noticed earlier, by Zenoh."""
+FIRST_LOOK = 0.05
+"""When a client first looks for that sign, s; later ones each take twice the time of the one before."""
 
 
 class ZenohBus:
@@ -267,7 +269,7 @@ class ZenohBus:
         longer than `ACCEPT_TIMEOUT`: the link lives, and nothing that the client declares or sends is heard.
         """
         self._connect()
-        while not self._closed.wait(SILENT / 10):
+        while not self._closed.wait(max(SILENT / 10, self.owner.heard_at + SILENT - time.monotonic())):
             session = self._session
             if session is None or time.monotonic() - self.owner.heard_at < SILENT or not self.connected():
                 continue
@@ -289,7 +291,10 @@ class ZenohBus:
         try:
             # A client itself answers with what it knows; only the router's word ends that before its time.
             answers = session.liveliness().get(watched, timeout=UNANSWERED)
-            while not self._closed.wait(0.05):
+            pause = FIRST_LOOK
+            while not self._closed.wait(pause):
+                # A busy router leaves all of its clients waiting at once: looks must not make it busier.
+                pause = min(2 * pause, UNANSWERED / 10)
                 answer = answers.try_recv()
                 if answer is not None and answer.err is not None:
                     return False

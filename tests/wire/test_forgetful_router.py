@@ -5,10 +5,12 @@ from __future__ import annotations
 import logging
 import socket
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 
 import pytest
+import zenoh
 
 from mapweave.wire import zenoh_bus
 from mapweave.wire.bus_settings import BusSettings
@@ -148,3 +150,52 @@ def test_a_bus_is_closed_at_once_while_it_waits_for_a_sign_of_life(monkeypatch: 
         closing.start()
         closing.join(10.0)
         assert not closing.is_alive()
+
+
+class Silent:
+    """A session whose router says nothing for as long as is waited for it; counts how often one looks."""
+
+    def __init__(self, seconds: float) -> None:
+        self.looks = 0
+        self._end = time.monotonic() + seconds
+
+    def liveliness(self) -> Silent:
+        return self
+
+    def get(self, key: str, timeout: float) -> Silent:
+        return self
+
+    def try_recv(self) -> None:
+        self.looks += 1
+        if time.monotonic() > self._end:
+            raise zenoh.ZError("channel is empty and closed")
+
+
+def test_clients_that_wait_for_a_busy_router_do_not_keep_it_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With a look every 50 ms a thousand of them took a core and a half, and starved the server itself."""
+    with client_and_router(monkeypatch) as (client, _, _):
+        client.watch("m/alive/*", lambda key, there: None)
+        silent = Silent(3.0)
+        assert client._is_answered(silent)  # type: ignore[arg-type]
+        assert silent.looks <= 20
+
+
+def test_a_client_that_hears_messages_looks_for_silence_once_it_may_be_there(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """It looked ten times as often: a thousand robots, five hundred times a second."""
+    with client_and_router(monkeypatch) as (client, _, _):
+        looks: list[float] = []
+        wait = client._closed.wait
+
+        def noted(timeout: float | None = None) -> bool:
+            ended = wait(timeout)
+            looks.append(time.monotonic())
+            return ended
+
+        monkeypatch.setattr(client._closed, "wait", noted)
+        end = time.monotonic() + 3.0
+        while time.monotonic() < end:
+            client.owner.heard()
+            time.sleep(0.05)
+        assert 1 <= len(looks) <= 5
