@@ -254,11 +254,11 @@ class Keys:
 
     def parse_agent_status(self, key: str) -> str:
         """Which agent."""
-        return self._parse_names("agent/*/status", key)[0]
+        return _agent_of(self, "status", key)
 
     def parse_view(self, key: str) -> str:
         """Which agent."""
-        return self._parse_names("agent/*/view", key)[0]
+        return _agent_of(self, "view", key)
 
     def parse_robot_driver(self, key: str) -> tuple[str, int]:
         """Which robot, and the number of who drives it."""
@@ -297,6 +297,12 @@ class Keys:
 def _map_of(keys: Keys, what: str, key: str) -> MapId:
     agent, epoch = keys._chunks(f"agent/*/{what}/*", key)
     return MapId(_name(agent, key), _number(epoch, key))
+
+
+@lru_cache(KEYS_KEPT)
+def _agent_of(keys: Keys, what: str, key: str) -> str:
+    (agent,) = keys._parse_names(f"agent/*/{what}", key)
+    return agent
 
 
 def robot_of(key: str) -> str:

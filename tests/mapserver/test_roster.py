@@ -27,7 +27,8 @@ KEYS = Keys("fleet")
 
 
 @pytest.mark.parametrize(
-    ("robots", "period"), first_quick([(0, 0.0), (200, 0.0), (300, 0.75), (1000, 2.5), (1700, 4.0)], 3)
+    ("robots", "period"),
+    first_quick([(0, 0.0), (125, 0.0), (200, 0.8), (300, 1.2), (1000, 4.0), (1700, 4.0)], 3),
 )
 def test_the_period_of_statuses_grows_with_the_number_of_robots(robots: int, period: float) -> None:
     with ExitStack() as stack:
