@@ -24,9 +24,8 @@ NOTHING_DRIVEN = DriveStatistics()
 NO_COMPONENT = -1
 LONGEST_STATUS_PERIOD = 4.0
 """Between two statuses of a robot, s. It sends two a second, unless a server with many robots wants fewer."""
-SILENT = 6.0
-"""A robot that has sent nothing for longer is named as silent, s: behind the longest period a robot finishes
-some ticks first, and a busy server hears it up to a second later."""
+SILENT = 5.0
+"""A robot that has sent nothing for longer is named as silent, s."""
 
 
 def one_line(text: str) -> str:

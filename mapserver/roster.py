@@ -31,8 +31,8 @@ from mapweave.wire.messages import decode
 
 OWN_PERIOD = 0.5
 """Between two statuses of a robot that is not asked for fewer, s."""
-STATUSES_PER_S = 250.0
-"""Of all robots that a server wants: up to 125 robots each as it likes, of a thousand one every 4 s."""
+STATUSES_PER_S = 400.0
+"""Of all robots that a server wants: up to 200 robots each as it likes, of a thousand one every 2.5 s."""
 MOST_ALIVE = 8
 """Maps under which a robot is alive at once: it makes one, and two while it begins the next."""
 NO_LAG = Lag(0, 0.0)

@@ -163,7 +163,7 @@ def run_schedule(agents: Sequence[Agent], orders: Orders, begin: float) -> None:
     due: list[tuple[float, int, bool]] = []
     for k in range(len(agents)):
         due.append((begin + rng.uniform(0.0, INTERVAL), k, True))
-        due.append((begin + rng.uniform(0.0, agents[k].report_period), k, False))
+        due.append((begin + rng.uniform(0.0, 1.0 / REPORTS), k, False))
     due += [(end + rng.uniform(0.0, 1.0), number - orders.first, True) for number in burst_numbers(orders)]
     heapq.heapify(due)
     while due and due[0][0] < end + 1.0:

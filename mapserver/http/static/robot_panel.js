@@ -2,7 +2,7 @@
 import { add, ask, button, byId, degrees, facts, percent, seconds } from "./dom.js";
 import { wordsOf } from "./names.js";
 
-const QUIET = 6; // s without a status, SILENT of hybridmap/agent_status.py
+const QUIET = 5; // s without a status
 let panel = null;
 
 export function poseOf(robot, model) {
