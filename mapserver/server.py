@@ -175,7 +175,7 @@ class MapServer:
             self._bus, self._keys, self._store, self._name, worker.take, None,
             lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
             self._quotas, self._gone, worker.unmerged, worker.note_refusal, worker.note_disbelief,
-            self._metrics.acknowledged, self._roster.status_period,
+            self._metrics.acknowledged, self._roster.status_period_of,
         )  # fmt: skip
         clock.give_way(lambda: self._ingest.busy or self._admission.busy)
         self._plans = PlanService(

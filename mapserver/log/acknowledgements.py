@@ -23,7 +23,7 @@ class Acknowledgements:
         server_name: str,
         store: Store,
         taken: Collection[MapId],
-        status_period: Callable[[], float],
+        status_period: Callable[[str], float],
     ) -> None:
         """Begin with nothing sent.
 
@@ -33,7 +33,7 @@ class Acknowledgements:
             server_name: under which they go out.
             store: has the logs; stays the caller's.
             taken: maps that are here and not in the store: no new one may have their names.
-            status_period: of the robots' statuses, s; 0: their own.
+            status_period: of a robot's statuses, s; 0: its own.
         """
         self._bus, self._keys, self._name = bus, keys, check_name(server_name)
         self._store, self._taken = store, tuple(taken)
@@ -53,7 +53,7 @@ class Acknowledgements:
                 watermark,
                 refusals,
                 self._store.id,
-                self._status_period(),
+                self._status_period(agent_log.map.agent),
             )
         )
 

@@ -77,7 +77,7 @@ class Ingest:
         note_refusal: Callable[[MapId, str], None] = lambda map_id, reason: None,
         note_disbelief: Callable[[MapId, str], None] = lambda map_id, reason: None,
         observe_ack: Callable[[float], None] = lambda seconds: None,
-        status_period: Callable[[], float] = lambda: 0.0,
+        status_period: Callable[[str], float] = lambda robot: 0.0,
     ) -> None:
         """Replay the store, then listen.
 
@@ -100,7 +100,7 @@ class Ingest:
             note_disbelief: called for a map of which a sequence number is not believed, with the reason.
             observe_ack: called for each published change with the time from its receipt to its
                 acknowledgement, s.
-            status_period: of the robots' statuses, s; 0: their own.
+            status_period: of a robot's statuses, s; 0: its own.
 
         Raises:
             InvalidFile: the store cannot be read.

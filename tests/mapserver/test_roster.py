@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import ExitStack
 
+import numpy as np
 import pytest
 
 from mapweave.hybridmap.agent_status import MAX_ROBOTS, AgentStatus, FleetStatus, RobotEntry, Status
@@ -40,6 +41,24 @@ def test_the_period_of_statuses_grows_with_the_number_of_robots(robots: int, per
         for token in tokens[50:]:
             token.close()
         eventually(lambda: roster.status_period() == 0.0)
+
+
+def test_robots_that_begin_together_report_apart_after_two_periods() -> None:
+    """In step, 1000 robots filled two cores for half a second, five times in 12.5 s."""
+    with ExitStack() as stack:
+        bus = MemoryBus(MemoryHub())
+        stack.callback(bus.close)
+        roster = Roster(bus, KEYS, lambda: 0.0, lambda status: None, Quotas())
+        stack.callback(roster.close)
+        for k in range(1000):
+            bus.announce(KEYS.agent_alive(MapId(f"r{k}", 1)))
+        eventually(lambda: roster.status_period() == 2.5)
+        periods = np.array([roster.status_period_of(f"r{k}") for k in range(1000)])
+    rate = float(np.sum(1.0 / periods))
+    assert rate == pytest.approx(400.0, rel=0.02)
+    times = np.arange(50)[:, None] * periods
+    for begin in np.arange(5.0, 30.0, 0.5):
+        assert np.count_nonzero((times >= begin) & (times < begin + 0.5)) < 2 * 0.5 * rate
 
 
 @pytest.mark.slow
