@@ -102,6 +102,7 @@ class Journal:
         if agent is not None:
             check_name(agent)
         self._lock = threading.RLock()
+        self._newest: dict[MapId, int] = {}
         self._database = Database(
             path, "agent journal", APPLICATION_ID, VERSION, SCHEMA, None, ADVICE, read_only=agent is None
         )
@@ -188,20 +189,35 @@ class Journal:
             InvalidValue: one belongs to another map, or the map was never opened; nothing was written.
             InvalidFile: the disk does not take it; nothing was written.
         """
-        self.log_id(map_id)
         for draft in drafts:
             if draft.map != map_id:
                 raise InvalidValue(f"a change of {draft.map} does not belong into the log of {map_id}")
-        with self._lock, self._database.transaction() as rows:
-            first = self.head(map_id) + 1
-            rows.executemany(
-                "INSERT INTO change VALUES (?, ?, ?, ?, ?, ?, ?)",
-                (
-                    (map_id.epoch, first + k, d.element, d.put, d.stamp_ns, d.encoded, zlib.crc32(d.encoded))
-                    for k, d in enumerate(drafts)
-                ),
-            )
+        with self._lock:
+            first = self._newest_of(map_id) + 1
+            with self._database.transaction() as rows:
+                rows.executemany(
+                    "INSERT INTO change VALUES (?, ?, ?, ?, ?, ?, ?)",
+                    (
+                        (
+                            map_id.epoch, first + k, d.element, d.put, d.stamp_ns, d.encoded,
+                            zlib.crc32(d.encoded),
+                        )
+                        for k, d in enumerate(drafts)
+                    ),
+                )  # fmt: skip
+            self._newest[map_id] = first + len(drafts) - 1
         return first
+
+    def _newest_of(self, map_id: MapId) -> int:
+        """`head`, read once: no one else writes the file.
+
+        Raises:
+            InvalidValue: the map was never opened.
+        """
+        if map_id not in self._newest:
+            self.log_id(map_id)
+            self._newest[map_id] = self.head(map_id)
+        return self._newest[map_id]
 
     def rows(self, map_id: MapId, first: int, last: int) -> list[tuple[int, bytes]]:
         """Changes first to last, both included, as (sequence, encoded change).
@@ -251,11 +267,11 @@ class Journal:
             reset: the server has lost its store, so it may go back.
 
         Raises:
-            InvalidValue: the log is not that long.
+            InvalidValue: the log is not that long, or the map was never opened.
             InvalidFile: the disk does not take it.
         """
         with self._lock:
-            head = self.head(map_id)
+            head = self._newest_of(map_id)
             if not 0 <= watermark <= head:
                 raise InvalidValue(f"{server} acknowledges {watermark} changes of {map_id}, there are {head}")
             with self._database.transaction() as rows:
