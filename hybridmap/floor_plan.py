@@ -217,15 +217,15 @@ class PlacedPlan:
         """The plan under a component; under the one with most pairs if none is given.
 
         Raises:
-            InvalidValue: it does not lie there, with the reason.
+            Refused: it does not lie there, with the reason.
         """
         for part in self.parts:
             if component is None or part.component == component:
                 return part
         if not self.parts:
-            raise InvalidValue(f"plan {self.name} lies under no part of the map: {self.reason}")
+            raise Refused(f"plan {self.name} lies under no part of the map: {self.reason}")
         where = ", ".join(str(part.component) for part in self.parts)
-        raise InvalidValue(f"plan {self.name} does not lie under component {component}, but under {where}")
+        raise Refused(f"plan {self.name} does not lie under component {component}, but under {where}")
 
     def pose(self, component: int, merged_from_robot: Pose2) -> Pose2 | None:
         """A pose of the merged map in the coordinates of the plan; None where the plan does not lie."""

@@ -42,6 +42,7 @@ from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAn
 from mapweave.map_reading import MapReading
 from mapweave.merge.settings import MergeSettings
 from mapweave.node_table import NodeTable
+from mapweave.refusals import check_component
 from mapweave.storage.map_file import MapFile, write_map_file
 
 if TYPE_CHECKING:
@@ -152,15 +153,14 @@ class Map(ABC):
 
         Raises:
             MissingExtra: matplotlib is not installed.
-            InvalidValue: there is no such component.
+            Refused: there is no such component.
         """
         need("viz")
         from mapweave.drawing.map_picture import MapPicture, draw_on
 
         reading = self._reading
         poses = {n: pose.mean for n, (number, pose) in reading.placed.items() if number == component}
-        if not poses:
-            raise InvalidValue(f"the map has no component {component}")
+        check_component(component, len({number for number, _ in reading.placed.values()}))
         if axes is None:
             from matplotlib import pyplot
 

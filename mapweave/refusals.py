@@ -19,3 +19,14 @@ def refusals() -> Iterator[None]:
         yield
     except InvalidValue as error:
         raise Refused(str(error)) from error
+
+
+def check_component(number: int, count: int) -> None:
+    """Check that one of so many components has a number.
+
+    Raises:
+        Refused: none has.
+    """
+    if not 0 <= number < count:
+        choices = {0: "no nodes", 1: "one, 0"}.get(count, f"0 to {count - 1}")
+        raise Refused(f"the map has no component {number}; it has {choices}")

@@ -8,6 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.commands.network import add_network
 
@@ -24,8 +25,16 @@ def add_record_options(parser: argparse.ArgumentParser, changes: bool) -> None:
         changes: whether the command adds to the record.
     """
     if changes:
-        parser.add_argument("--because", default="", metavar="TEXT", help="why; for those who wonder later")
-        parser.add_argument("--by", default="", metavar="NAME", help="your name (default: the login name)")
+        parser.add_argument(
+            "--because",
+            type=values.remark,
+            default="",
+            metavar="TEXT",
+            help="why; for those who wonder later",
+        )
+        parser.add_argument(
+            "--by", type=values.remark, default="", metavar="NAME", help="your name (default: the login name)"
+        )
         parser.add_argument(
             "-o", "--out", type=Path, metavar="OUT", help="with --map: write a map file there instead"
         )
@@ -42,7 +51,7 @@ def add_area_options(parser: argparse.ArgumentParser) -> None:
         "--corners", nargs="+", metavar="X,Y", help="the floor within these corners in the merged map, m"
     )
     parser.add_argument(
-        "--near", metavar="NODE|PLACE",
+        "--near", type=values.node, metavar="NODE|PLACE",
         help="positions are in the part of the map where this is (default: the largest part)",
     )  # fmt: skip
 

@@ -7,6 +7,7 @@ import json
 import time
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.annotating import add_area_options, add_record_options, area_fields, record_of
 
 if TYPE_CHECKING:
@@ -70,9 +71,11 @@ def add_to(commands: Any) -> None:
 
 
 def _add_where(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("where", nargs="*", metavar="WHERE", help="two nodes, a place, a node or a position")
+    parser.add_argument(
+        "where", nargs="*", type=values.node, metavar="WHERE", help="two nodes, a place, a node or a position"
+    )
     add_area_options(parser)
-    parser.add_argument("--name", help="its name (default: what is meant)")
+    parser.add_argument("--name", type=values.title, help="its name (default: what is meant)")
     add_record_options(parser, changes=True)
 
 
@@ -157,6 +160,8 @@ def _meant(arguments: argparse.Namespace, record: Fleet | OfflineAnnotations) ->
     if len(where) > 2 or bool(where) == ("corners" in fields) or (len(where) == 2 and "radius" in fields):
         raise UsageError("give two nodes, or one place, node or position, or --corners")
     if len(where) == 2:
+        if where[0] == where[1]:
+            raise UsageError(f"{where[0]} twice: an edge joins two different nodes")
         fields["edge"] = where
     elif where and record.annotations().last("place", where[0]) is not None:
         fields["place"] = where[0]

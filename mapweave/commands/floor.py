@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
+from mapweave.commands import values
 from mapweave.commands.annotating import add_record_options, record_of
 
 
@@ -18,8 +19,8 @@ def add_to(commands: Any) -> None:
         "floor. Maps without a label are on the floor of those with which they have most in common. "
         "`mapweave floor --undo r0.1.17` withdraws the label.",
     )
-    parser.add_argument("label", nargs="?", metavar="NAME", help="of the floor")
-    parser.add_argument("node", metavar="NODE|PLACE", help="any node of the map")
+    parser.add_argument("label", nargs="?", type=values.title, metavar="NAME", help="of the floor")
+    parser.add_argument("node", type=values.node, metavar="NODE|PLACE", help="any node of the map")
     parser.add_argument("--undo", action="store_true", help="take it back")
     add_record_options(parser, changes=True)
     parser.set_defaults(run=run)

@@ -62,7 +62,9 @@ def add_to(commands: Any) -> None:
 
     revoke = _action(actions, "revoke", "admit an identity no more, at once")
     revoke.add_argument("name", metavar="NAME", help="who has a key, see `mapweave keys list`")
-    revoke.add_argument("--because", default="", metavar="TEXT", help="why; the router's log says it")
+    revoke.add_argument(
+        "--because", type=values.remark, default="", metavar="TEXT", help="why; the router's log says it"
+    )
     revoke.add_argument("--tokens", action="store_true", help="only the tokens for HTTP; the key stays good")
     revoke.add_argument(
         "--force", action="store_true", help="also the only server, which goes on with its key until it ends"

@@ -19,8 +19,12 @@ if TYPE_CHECKING:
 
 def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -> None:
     """Declare the options of every manual constraint."""
-    parser.add_argument("--because", default="", metavar="TEXT", help="why; for those who wonder later")
-    parser.add_argument("--by", metavar="NAME", help="your name (default: the login name)")
+    parser.add_argument(
+        "--because", type=values.remark, default="", metavar="TEXT", help="why; for those who wonder later"
+    )
+    parser.add_argument(
+        "--by", type=values.remark, metavar="NAME", help="your name (default: the login name)"
+    )
     if undo:
         parser.add_argument("--undo", action="store_true", help="take it back")
     parser.add_argument("--check", action="store_true", help="only say what it would do; change nothing")

@@ -27,8 +27,8 @@ if TYPE_CHECKING:
     from mapweave.mapserver.routes import Router
 
 
-def ends_of(words: list[str]) -> Ends:
-    """Read two nodes or two maps.
+def different_ends_of(words: list[str]) -> Ends:
+    """Read two different nodes or two different maps.
 
     Raises:
         UsageError: they are neither.
@@ -36,7 +36,10 @@ def ends_of(words: list[str]) -> Ends:
     if len(words) != 2:
         raise UsageError(f"give two nodes or two maps, not {len(words)}: {EXAMPLE}")
     with arguments_read():
-        return read_ends(words[0], words[1])
+        ends = read_ends(words[0], words[1])
+    if ends[0] == ends[1]:
+        raise UsageError(f"{ends[0]} twice: give two different nodes or two different maps")
+    return ends
 
 
 def resolved(arguments: argparse.Namespace, words: list[str], router: Router | None = None) -> list[str]:

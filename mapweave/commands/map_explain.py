@@ -39,7 +39,7 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask, print, draw."""
-    from mapweave.commands.map_ends import ends_of, explanation_of, resolved
+    from mapweave.commands.map_ends import different_ends_of, explanation_of, resolved
     from mapweave.commands.usage import UsageError
     from mapweave.explanation_text import maps_words, pair_words
     from mapweave.extras import need
@@ -51,7 +51,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     if arguments.draw is not None:
         need("viz")
-    ends = ends_of(resolved(arguments, arguments.ends)) if arguments.ends else None
+    ends = different_ends_of(resolved(arguments, arguments.ends)) if arguments.ends else None
     if arguments.draw is not None and not (ends and all(isinstance(end, NodeId) for end in ends)):
         raise UsageError(f"--draw needs two nodes: {EXAMPLE}")
     explanation = explanation_of(arguments, ExplainRequest(ends))

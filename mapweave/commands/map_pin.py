@@ -7,6 +7,7 @@ import json
 import math
 from typing import Any
 
+from mapweave.commands import values
 from mapweave.commands.annotating import add_record_options, record_of
 
 
@@ -21,7 +22,7 @@ def add_to(actions: Any) -> None:
         "`mapweave map history` says by which transform the other frame has moved. Without NODE the pins are "
         "listed.",
     )
-    parser.add_argument("node", nargs="?", metavar="NODE|PLACE", help="a node, or a place")
+    parser.add_argument("node", nargs="?", type=values.node, metavar="NODE|PLACE", help="a node, or a place")
     parser.add_argument("pose", nargs="?", metavar="X,Y,DEGREES", help="its pose (default: as it is now)")
     parser.add_argument("--undo", action="store_true", help="take the pin out")
     add_record_options(parser, changes=True)

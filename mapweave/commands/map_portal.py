@@ -6,6 +6,7 @@ import argparse
 import json
 from typing import Any
 
+from mapweave.commands import values
 from mapweave.commands.annotating import add_record_options, record_of
 
 KINDS = ("lift", "ramp", "door")
@@ -27,11 +28,15 @@ def add_to(actions: Any) -> None:
         "lift and a ramp lead from one floor to another: label both with `mapweave floor`. The same name "
         "again: the later one holds.",
     )
-    add.add_argument("name", metavar="NAME", help="1 to 64 characters, for example 'east lift'")
-    add.add_argument("a", metavar="A", help="node or place at one side")
-    add.add_argument("b", metavar="B", help="at the other side")
+    add.add_argument(
+        "name", type=values.title, metavar="NAME", help="1 to 64 characters, for example 'east lift'"
+    )
+    add.add_argument("a", type=values.node, metavar="A", help="node or place at one side")
+    add.add_argument("b", type=values.node, metavar="B", help="at the other side")
     add.add_argument("--kind", choices=KINDS, required=True, help="what it is")
-    add.add_argument("--note", default="", metavar="TEXT", help="for who takes a robot through")
+    add.add_argument(
+        "--note", type=values.note, default="", metavar="TEXT", help="for who takes a robot through"
+    )
     add_record_options(add, changes=True)
     add.set_defaults(run=run_add)
 
@@ -54,7 +59,11 @@ def add_to(actions: Any) -> None:
 
 def run_add(arguments: argparse.Namespace) -> int:
     """Add a portal."""
+    from mapweave.commands.usage import UsageError
+
     a = arguments
+    if a.a == a.b:
+        raise UsageError(f"{a.a} twice: a portal leads from one node to another")
     with record_of(a) as record:
         print(record.annotate("portal", a.name, a.because, a=a.a, b=a.b, means=a.kind, note=a.note))
     return 0

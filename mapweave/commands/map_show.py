@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
+from mapweave.refusals import check_component
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.ids import NodeId
@@ -80,11 +81,8 @@ def run(arguments: argparse.Namespace) -> int:
     # Components have frames of their own; only one can be drawn without pretending.
     sizes = Counter(component for component, _ in placed.values())
     poses = {n: p.mean for n, (c, p) in placed.items() if c == arguments.component}
-    if arguments.component not in sizes and sizes:
-        choices = "one, 0" if len(sizes) == 1 else f"0 to {len(sizes) - 1}"
-        from mapweave.hybridmap.errors import Refused
-
-        raise Refused(f"the map has no component {arguments.component}; it has {choices}")
+    if sizes:
+        check_component(arguments.component, len(sizes))
     landmarks = [len(n.landmarks) for n in hybrid.nodes.values()]
     kinds: dict[str, int] = {}
     for edge in hybrid.edges.values():

@@ -27,18 +27,15 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Set the constraint, and print its effect."""
-    from mapweave.commands.map_ends import ends_of, explanation_of, names_of
-    from mapweave.commands.usage import UsageError
+    from mapweave.commands.map_ends import different_ends_of, explanation_of, names_of
     from mapweave.hybridmap.constraint_subject import Apart
     from mapweave.hybridmap.explanation import FleetExplanation
     from mapweave.hybridmap.ids import MapId
     from mapweave.hybridmap.named_nodes import own_ids_of
     from mapweave.hybridmap.query import ExplainRequest
 
-    ends = ends_of(own_ids_of(arguments.ends, *names_of(arguments)))
+    ends = different_ends_of(own_ids_of(arguments.ends, *names_of(arguments)))
     first, second = (MapId(end[0], end[1]) for end in ends)
-    if ends[0] == ends[1]:
-        raise UsageError(f"{ends[0]} twice: give two different nodes or two different maps")
     constrain(arguments, Apart(ends))
     if first != second:
         found = explanation_of(arguments, ExplainRequest((first, second)))

@@ -93,7 +93,9 @@ def _add_common(parser: argparse.ArgumentParser, patience: float | None) -> None
             "--timeout", type=values.seconds, default=patience, metavar="S",
             help=f"with --wait: at most so long (default: {patience:g})",
         )  # fmt: skip
-    parser.add_argument("--by", default="", metavar="NAME", help="your name (default: the login name)")
+    parser.add_argument(
+        "--by", type=values.remark, default="", metavar="NAME", help="your name (default: the login name)"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(parser)
 

@@ -6,6 +6,7 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.annotating import add_area_options, add_record_options, area_fields, record_of
 
 if TYPE_CHECKING:
@@ -33,10 +34,14 @@ def add_to(commands: Any) -> None:
         "`mapweave place add hall 2.0,1.5 --radius 3`, "
         "`mapweave place add office --corners 0,0 4,0 4,3 0,3`.",
     )
-    add.add_argument("name", metavar="NAME", help="1 to 64 characters; not a node, a map, a position or home")
     add.add_argument(
-        "where", nargs="?", metavar="NODE|X,Y", help="a node, a position in the merged map, m, or a place"
-    )
+        "name", type=values.title, metavar="NAME",
+        help="1 to 64 characters; not a node, a map, a position or home",
+    )  # fmt: skip
+    add.add_argument(
+        "where", nargs="?", type=values.node, metavar="NODE|X,Y",
+        help="a node, a position in the merged map, m, or a place",
+    )  # fmt: skip
     add_area_options(add)
     add_record_options(add, changes=True)
     add.set_defaults(run=run_add)

@@ -46,10 +46,13 @@ def add_to(commands: Any) -> None:
         "--pair", action="append", required=True, metavar="NODE|PLACE|X,Y=U,V", dest="pairs",
         help=f"a place and its pixel: {PAIR}",
     )  # fmt: skip
-    add.add_argument("--name", metavar="NAME", help="of the plan (default: the file's, without its ending)")
+    add.add_argument(
+        "--name", type=values.title, metavar="NAME",
+        help="of the plan (default: the file's, without its ending)",
+    )  # fmt: skip
     add.add_argument("--metres-per-pixel", type=float, metavar="M", help="scale of the image, m")
     add.add_argument(
-        "--near", metavar="NODE|PLACE",
+        "--near", type=values.node, metavar="NODE|PLACE",
         help="positions are in the part of the map where this is (default: the largest part)",
     )  # fmt: skip
     add_record_options(add, changes=True)
@@ -211,6 +214,10 @@ def _pair(word: str) -> dict[str, Any]:
     position = two_numbers(pixel) if equals and place.strip() else None
     if position is None:
         raise UsageError(f"--pair {word}: write {PAIR}")
+    try:
+        values.node(place)
+    except UsageError as error:
+        raise UsageError(f"--pair {word}: {error}") from None
     return {"at": place.strip(), "u": position[0], "v": position[1]}
 
 

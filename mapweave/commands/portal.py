@@ -25,7 +25,9 @@ def add_to(commands: Any) -> None:
         "goes on. The message goes to the robot directly, and works without a map server.",
     )
     done.add_argument("robot", type=values.name, help="the robot's name, for example r0")
-    done.add_argument("--by", default="", metavar="NAME", help="your name (default: the login name)")
+    done.add_argument(
+        "--by", type=values.remark, default="", metavar="NAME", help="your name (default: the login name)"
+    )
     add_network(done)
     done.set_defaults(run=run_done)
 

@@ -39,7 +39,43 @@ def goal(text: str) -> str:
     """Where a robot shall go; the map says whether it is there."""
     if not text.strip():
         raise UsageError("give a node (r0.1.17), a named place, a position (3.1,-2.0) or home")
+    return node(text)
+
+
+def node(text: str) -> str:
+    """A node, the name of a place or a position; the map says whether it is there."""
+    from mapweave.hybridmap.constraint_subject import read_end
+    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.ids import NodeId
+
+    try:
+        end = read_end(text.strip())
+    except InvalidValue:
+        return text
+    if not isinstance(end, NodeId):
+        raise UsageError(f"this is a map: give one of its nodes, {end}.1 for example")
     return text
+
+
+def title(text: str) -> str:
+    """What people call a floor, a plan, a portal or a closure."""
+    from mapweave.hybridmap.annotation import MAX_NAME
+
+    return _line(text, 1, MAX_NAME)
+
+
+def remark(text: str) -> str:
+    """Who and why."""
+    from mapweave.hybridmap.manual_constraint import MOST_WORDS
+
+    return _line(text, 0, MOST_WORDS)
+
+
+def note(text: str) -> str:
+    """For who takes a robot through a portal."""
+    from mapweave.hybridmap.portal import MOST_NOTE
+
+    return _line(text, 0, MOST_NOTE)
 
 
 def seed(text: str) -> int:
@@ -73,6 +109,12 @@ def png(text: str) -> Path:
     if path.suffix.lower() != ".png":
         raise UsageError("the picture will be a PNG; end its name with .png")
     return path
+
+
+def _line(text: str, least: int, most: int) -> str:
+    if not least <= len(text) <= most or not text.isprintable():
+        raise UsageError(f"give one printable line of {least} to {most} characters")
+    return text
 
 
 def _whole(text: str, least: float, most: float, words: str) -> int:

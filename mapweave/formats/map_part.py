@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 
-from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.node import Node
@@ -15,6 +14,7 @@ from mapweave.merge.outlier_rejection.link_probability import link_probabilities
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.factors import Measurement
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.refusals import check_component
 
 IDENTITY = Pose2()
 
@@ -34,11 +34,8 @@ class MapPart:
     frame_from_merged: Pose2 = IDENTITY
 
     def __post_init__(self) -> None:
-        """Refuse a component that is not there (InvalidValue)."""
-        count = len(self.merged.components)
-        if not 0 <= self.component < count:
-            choices = {0: "no nodes", 1: "one, 0"}.get(count, f"0 to {count - 1}")
-            raise InvalidValue(f"the map has no component {self.component}; it has {choices}")
+        """Refuse a component that is not there (Refused)."""
+        check_component(self.component, len(self.merged.components))
 
     @cached_property
     def nodes(self) -> tuple[NodeId, ...]:

@@ -6,6 +6,7 @@ import argparse
 import shlex
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
@@ -52,7 +53,8 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (FAILED, "--connect {at}"),
     ],
     "go": [
-        (USAGE, "R0 r0.1.1"), (USAGE, "r0 '' --connect {at}"), (USAGE, "r0 r0.1.1 --wait --timeout 0"),
+        (USAGE, "R0 r0.1.1"), (USAGE, "r0 '' --connect {at}"), (USAGE, "r0 r0.1 --connect {at}"), (USAGE,
+        "r0 r0.1.1 --wait --timeout 0"),
         (FAILED, "r0 home --connect {at}"),
     ],
     "explore": [(USAGE, "R0"), (USAGE, "r0 --timeout x"), (FAILED, "r0 --connect {at}")],
@@ -61,14 +63,29 @@ CASES: dict[str, list[tuple[int, str]]] = {
     "place list": [(FAILED, "--map {tmp}/none.mapweave")],
     "place add": [
         (USAGE, "kitchen"), (USAGE, "kitchen r0.1.1 --radius -3 --map {map}"),
+        (USAGE, "kitchen r0.1 --map {map} -o {out}"), (USAGE, "kitchen r0.1.1 --because {long} --map {map}"),
+        (USAGE, "kitchen r0.1.1 --by {long} --map {map}"), (USAGE, "'' r0.1.1 --map {map}"),
         (NO, "kitchen r9.1.1 --map {map} -o {out}"), (FAILED, "kitchen r0.1.1 --map {tmp}/none.mapweave"),
     ],
     "place remove": [(USAGE, ""), (NO, "kitchen --map {map} -o {out}")],
-    "plan add": [(USAGE, "office.png --pair x"), (FAILED, "{tmp}/none.png --pair r0.1.1=1,2 --map {map}")],
-    "plan show": [(USAGE, "--connect nowhere"), (USAGE, "office -o plan.gif"), (NO, "office --map {map}")],
-    "plan export": [(USAGE, "office --format nosuch"), (NO, "office --format tf --map {map}")],
+    "plan add": [
+        (USAGE, "office.png --pair x"), (USAGE, "office.png --pair r0.1=1,2 --map {map}"),
+        (USAGE, "office.png --pair r0.1.1=1,2 --name '' --map {map}"), (FAILED,
+        "{tmp}/none.png --pair r0.1.1=1,2 --map {map}")],
+    "plan show": [
+        (USAGE, "--connect nowhere"), (USAGE, "office -o plan.gif"), (NO, "office --map {map}"),
+        (NO, "office -o {tmp}/plan.png --component 7 --map {planned}"),
+    ],
+    "plan export": [
+        (USAGE, "office --format nosuch"), (NO, "office --format tf --map {map}"),
+        (NO, "office --format tf --map {planned} --component 7"),
+    ],
     "plan remove": [(USAGE, ""), (NO, "office --map {map} -o {out}")],
-    "close": [(USAGE, "r0.1.1 --until 99:99 --map {map}"), (NO, "r0.1.1 r0.1.999 --map {map} -o {out}")],
+    "close": [
+        (USAGE, "r0.1.1 --until 99:99 --map {map}"), (USAGE, "r0.1.1 r0.1.1 --map {map} -o {out}"),
+        (USAGE, "r0.1 --map {map} -o {out}"), (USAGE, "r0.1.1 --name '' --map {map} -o {out}"),
+        (NO, "r0.1.1 r0.1.999 --map {map} -o {out}"),
+    ],
     "reopen": [(USAGE, ""), (NO, "kitchen --map {map} -o {out}")],
     "prefer": [
         (USAGE, "r0.1.1 r0.1.3 --factor x"), (USAGE, "r0.1.1 r0.1.3 --factor 0.01 --map {map} -o {out}"),
@@ -83,7 +100,10 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (NO, "r0.1.1 r9.1.3 --map {map} -o {out}"),
     ],
     "closures": [(USAGE, "--timeout 3"), (FAILED, "--map {tmp}/none.mapweave")],
-    "floor": [(USAGE, "ground"), (NO, "ground r9.1.1 --map {map} -o {out}")],
+    "floor": [
+        (USAGE, "ground"), (USAGE, "'' r0.1.1 --map {map}"), (USAGE, "ground r0.1 --map {map}"),
+        (NO, "ground r9.1.1 --map {map} -o {out}"),
+    ],
     "portal done": [(USAGE, "R0"), (FAILED, "r0 --connect {at}")],
     "keys init": [
         (USAGE, "--at host:99 --keys {tmp}/new"), (USAGE, "--fleet a/b --keys {tmp}/new"),
@@ -115,7 +135,8 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (NO, "{recording} --calibration {tmp}"), (FAILED, "{tmp}/none"),
     ],
     "map show": [
-        (USAGE, "{map} -o map.gif"), (NO, "{map} --component 99"), (FAILED, "{tmp}/none.mapweave"),
+        (USAGE, "{map} -o map.gif"), (NO, "{map} --component 99"), (NO, "{map} --component -1"), (FAILED,
+        "{tmp}/none.mapweave"),
     ],
     "map diff": [(USAGE, "{map}"), (FAILED, "{map} {tmp}/none.mapweave")],
     "map backup": [
@@ -125,6 +146,7 @@ CASES: dict[str, list[tuple[int, str]]] = {
     "map fetch": [(USAGE, ""), (USAGE, "{out} --connect nowhere"), (FAILED, "{out} --connect {at}")],
     "map explain": [
         (USAGE, "r0.1"), (USAGE, "r0.1.1 r1.1.1 --map {map} --draw x.gif"), (USAGE, "r0.1 r1.1 --timeout 0"),
+        (USAGE, "r0.1 r0.1 --map {map}"), (USAGE, "r0.1.1 r0.1.1 --map {map}"),
         (NO, "r0.1.1 r9.1.1 --map {map}"), (FAILED, "--connect {at}"),
     ],
     "map route": [
@@ -140,20 +162,37 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (USAGE, "r0.1.1 r1.1.1 --pose 0,0,1e308 --because x --map {map} --check"),
         (NO, "r0.1.1 r9.1.1 --map {map} --check"),
     ],
-    "map unmerge": [(USAGE, "r0.1 r1.1.1 --map {map} -o {out}"), (NO, "r0.1 r9.1 --map {map} -o {out}")],
-    "map retire": [(USAGE, "--map {map}"), (NO, "r9.1 --map {map} -o {out}")],
+    "map unmerge": [
+        (USAGE, "r0.1 r1.1.1 --map {map} -o {out}"), (USAGE, "r0.1 r0.1 --map {map}"),
+        (NO, "r0.1 r9.1 --map {map} -o {out}"),
+    ],
+    "map retire": [
+        (USAGE, "--map {map}"), (USAGE, "r0.1 --because {long} --map {map}"),
+        (NO, "r9.1 --map {map} -o {out}"),
+    ],
     "map undo": [(USAGE, "x"), (NO, "7 --map {map} -o {out}")],
     "map portal list": [(FAILED, "--map {tmp}/none.mapweave")],
     "map portal add": [
-        (USAGE, "lift r0.1.1 r1.1.1 --kind nosuch"),
+        (USAGE, "lift r0.1.1 r1.1.1 --kind nosuch"), (USAGE, "lift r0.1.1 r0.1.1 --kind lift --map {map}"),
+        (USAGE, "'' r0.1.1 r1.1.1 --kind lift --map {map}"), (USAGE,
+        "lift r0.1 r1.1.1 --kind lift --map {map}"),
+        (USAGE, "lift r0.1.1 r1.1.1 --kind lift --note {long} --map {map}"),
         (NO, "lift r0.1.1 r9.1.1 --kind lift --map {map} -o {out}"),
     ],
     "map portal remove": [(USAGE, ""), (NO, "lift --map {map} -o {out}")],
-    "map pin": [(USAGE, "r0.1.1 x --map {map} -o {out}"), (NO, "r9.1.1 --map {map} -o {out}")],
+    "map pin": [
+        (USAGE, "r0.1.1 x --map {map} -o {out}"), (USAGE, "r0.1 --map {map} -o {out}"),
+        (NO, "r9.1.1 --map {map} -o {out}"),
+    ],
     "map merge": [(USAGE, "{map}"), (FAILED, "{tmp}/none.mapweave -o {out}")],
     "map extract": [(FAILED, "{tmp}/none.sqlite -o {tmp}/maps")],
     "map from-photos": [(USAGE, "{tmp} --spacing -1 -o {out}"), (FAILED, "{tmp}/none --spacing 1 -o {out}")],
-    "map export": [(USAGE, "{map} --format nosuch -o {out}"), (FAILED, "{tmp}/none --format g2o -o {out}")],
+    "map export": [
+        (USAGE, "{map} --format nosuch -o {out}"), (NO, "{map} --format g2o -o {out} --component 99"),
+        (NO, "{map} --format g2o -o {out} --component -1"), (NO, "{map} --format g2o -o {out} --plan office"),
+        (NO, "{planned} --format g2o -o {out} --plan office --component 7"),
+        (FAILED, "{tmp}/none --format g2o -o {out}"),
+    ],
     "map import": [(USAGE, "{tmp}/in.g2o -o {tmp}/x.mapweave"), (FAILED, "{tmp}/none.g2o -o {tmp}/x.g2o")],
     "open": [(USAGE, "{map} --http x"), (FAILED, "{tmp}/none.mapweave")],
     "record": [
@@ -190,13 +229,24 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.fixture(scope="module")
+def planned(written: Path) -> Path:
+    """The same map with the plan `office` under its one component."""
+    path, image = written.with_name("planned.mapweave"), written.with_name("office.png")
+    cv2.imwrite(str(image), np.full((400, 400), 90, np.uint8))
+    pairs = [("0,0", "50,350"), ("2,0", "150,350"), ("2,2", "150,250"), ("0,2", "50,250")]
+    given = [word for place, pixel in pairs for word in ("--pair", f"{place}={pixel}")]
+    assert main(["plan", "add", str(image), *given, "--map", str(written), "-o", str(path)]) == 0
+    return path
+
+
 def test_every_command_is_tried() -> None:
     assert set(CASES) == set(commands(runnable=True))
 
 
 @pytest.mark.parametrize("command", CASES)
 def test_a_command_ends_with_the_status_of_what_was_wrong(
-    command: str, written: Path, recording: Path, closed: str, tmp_path: Path,
+    command: str, written: Path, planned: Path, recording: Path, closed: str, tmp_path: Path,
     capfd: pytest.CaptureFixture[str],
 ) -> None:  # fmt: skip
     keys = tmp_path / "keys"
@@ -204,7 +254,8 @@ def test_a_command_ends_with_the_status_of_what_was_wrong(
         assert main(["keys", "init", "--keys", str(keys)]) == 0
     values = {
         "tmp": tmp_path, "map": written, "out": tmp_path / "out.mapweave", "keys": keys, "at": closed,
-        "free": "tcp/127.0.0.1:0", "recording": recording, "images": recording / "images",
+        "planned": planned, "long": 301 * "x", "free": "tcp/127.0.0.1:0", "recording": recording,
+        "images": recording / "images",
     }  # fmt: skip
     for status, arguments in CASES[command]:
         line = f"{command} {arguments}".format(**values)

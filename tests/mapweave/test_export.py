@@ -18,6 +18,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from mapweave.cli import main
+from mapweave.exit_status import NO
 from mapweave.formats.export import FORMATS
 from mapweave.formats.g2o import G2oEdge, G2oGraph, read_g2o, write_g2o
 from mapweave.formats.g2o_optimum import optimum_of
@@ -173,7 +174,7 @@ def test_the_command_writes_and_prints_what_is_left_out(
     assert all(Path(line).stat().st_size > 100 for line in out.splitlines())
     assert "6 nodes of others are left out" in err
     arguments = ["map", "export", str(file), "--format", form, "-o", str(tmp_path / "no"), "--component", "7"]
-    assert main(arguments) == 1
+    assert main(arguments) == NO
     assert "the map has no component 7; it has 0 to 1" in capfd.readouterr().err
     assert not (tmp_path / "no").exists()
 
