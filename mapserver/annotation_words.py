@@ -16,6 +16,7 @@ from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.named_nodes import Resolve
 from mapweave.hybridmap.query import Resolved, ResolveRequest
 from mapweave.hybridmap.wall_time import read_time
+from mapweave.mapserver.field_words import field_words
 from mapweave.mapserver.places import position_of
 from mapweave.wire.typed import packed, value_of
 
@@ -25,6 +26,23 @@ ANYWHERE = 1e6
 """An area may lie away from all nodes, m: they only give its frame."""
 
 TIMES = ("begin_ns", "end_ns")
+EXAMPLES = {
+    **dict.fromkeys(NODES[:4], '"r0.1.17"'),
+    "merged_from_node": "[12.5, -3.0, 1.57]",
+    "area": '{"anchor": "r0.1.17", "corners": [[0, -1], [2, -1], [2, 1]]}',
+    "corners": "[[0, -1], [2, -1], [2, 1]]",
+    "radius": "1.5",
+    "edge": '["r0.1.17", "r0.1.19"]',
+    **dict.fromkeys(TIMES, '"2026-03-01 14:00"'),
+    "factor": "4",
+    "label": '"first"',
+    "means": '"lift", "ramp" or "door"',
+    "note": '"key: desk"',
+    "pairs": '[{"at": "r0.1.17", "u": 102, "v": 340}]',
+    "metres_per_pixel": "0.05",
+    "origin": "[0, 0, 0]",
+}
+"""JSON by the name of a field."""
 AROUND = 1.0
 """Of a place that is a node, so much floor around it is meant, m."""
 
@@ -74,8 +92,8 @@ def body_of_words(
     elif isinstance(area := plain.get("area"), Mapping):
         plain["area"] = {name: _node(value, name, near, resolve) for name, value in area.items()}
     elif radius is not None:
-        node = value_of(_node(plain.pop("node", None), "node", near, resolve), NodeId)
-        plain["area"] = packed(Area.around(node, value_of(radius, float)))
+        node = value_of(_node(plain.pop("node", ()), "node", near, resolve), NodeId)
+        plain["area"] = packed(Area.around(node, _value(radius, float, "radius")))
     if isinstance(edge := plain.get("edge"), list | tuple):
         plain["edge"] = [_node(word, "node", near, resolve) for word in edge]
     if isinstance(pairs := plain.get("pairs"), list | tuple):
@@ -86,13 +104,32 @@ def body_of_words(
     unknown = body.keys() - BODIES[kind].__dataclass_fields__.keys() - {"kind"}
     if unknown:
         raise InvalidValue(f"a {kind} has no {', '.join(sorted(unknown))}")
-    return value_of(body, BODIES[kind])
+    return _value(body, BODIES[kind])
+
+
+def _value(plain: Any, kind: type[Value], within: str = "") -> Value:
+    """A value of plain data; what is wrong with it is said in the words of who has sent it (InvalidValue)."""
+    try:
+        return value_of(plain, kind)
+    except InvalidValue as error:
+        raise InvalidValue(field_words(str(error), EXAMPLES, within)) from None
 
 
 def _node(value: Any, name: str, near: str | None, resolve: Resolve) -> Any:
-    """A word as a node; everything else as it is."""
-    if name not in NODES or not isinstance(value, str):
+    """A word as a node; everything else as it is.
+
+    Raises:
+        InvalidValue: it is neither a word nor an id.
+    """
+    if name not in NODES or value is None:
         return value
+    if not isinstance(value, str):
+        if name == "merged_from_node":
+            return value
+        try:
+            return packed(value_of(value, NodeId))
+        except InvalidValue:
+            raise InvalidValue(f"`{name}`: give a node as text, for example {EXAMPLES[name]}") from None
     return packed(_found(value, near or "", resolve).node)
 
 
@@ -117,7 +154,7 @@ def _pair(pair: Any, near: str | None, resolve: Resolve) -> Any:
 
 
 def _area(corners: Any, near: str, resolve: Resolve) -> Area:
-    points = value_of(corners, list[tuple[float, float]])
+    points = _value(corners, list[tuple[float, float]], "corners")
     if not points:
         raise InvalidValue("an area has 3 corners or more")
     # Written so that NaN fails.

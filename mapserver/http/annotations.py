@@ -14,11 +14,19 @@ from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.mapserver.floor_plans import placed_plan
+from mapweave.mapserver.http.json_body import read_json
 from mapweave.mapserver.http.json_values import json_values, time_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.conversion import json_value
 
-FORM = 'send JSON: {"name": "kitchen", "body": {"kind": "place", "node": "r0.1.17"}}'
+EXAMPLES = {
+    "name": '"kitchen"',
+    "body": '{"kind": "place", "node": "r0.1.17"}',
+    "removed": "true",
+    "check": "true",
+    "who": '"anna"',
+    "because": '"wet paint"',
+}
+FORM = f'{{"name": {EXAMPLES["name"]}, "body": {EXAMPLES["body"]}}}'
 
 
 class _Posted(msgspec.Struct, forbid_unknown_fields=True):
@@ -77,9 +85,9 @@ def annotate(server: Annotating, data: bytes, by: str, who: str = "") -> Mapping
         InvalidValue: it is none, or says nothing new.
     """
     try:
-        posted = json_value(data, _Posted)
-    except (msgspec.MsgspecError, UnicodeDecodeError, RecursionError) as error:
-        raise InvalidValue(f"{error}; {FORM}") from None
+        posted = read_json(data, _Posted, EXAMPLES)
+    except InvalidValue as error:
+        raise InvalidValue(f"{error}; send {FORM}") from None
     annotation = annotation_of_words(
         posted.name[: MAX_NAME + 1], posted.body, posted.removed, server.annotations, server.resolve,
         who or posted.who or by, posted.because, time.time_ns(),

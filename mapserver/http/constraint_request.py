@@ -34,9 +34,22 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint, to_take_back
 from mapweave.hybridmap.named_nodes import Record, Resolve, own_ids_of, retired_of
-from mapweave.wire.conversion import json_value
+from mapweave.mapserver.http.json_body import read_json
 
 ONE = "link, unmerge, retire, area, window, or undo with a number"
+EXAMPLES = {
+    "link": '["r0.1.17", "r1.1.5"]',
+    "pose": "[1.0, 0.2, 90]",
+    "unmerge": '["r0.1", "r1.1"]',
+    "retire": '["r0.1.17", "r0.1.18"]',
+    "area": '{"anchor": "r0.1.17", "corners": [[0, -1], [2, -1], [2, 1]]}',
+    "window": '{"map": "r0.1", "begin": "2026-03-01T12:00", "end": "2026-03-01T12:05"}',
+    "undo": "3",
+    "check": "true",
+    "because": '"two like doors"',
+    "by": '"anna"',
+}
+"""JSON by the name of a field."""
 
 
 class _Area(msgspec.Struct, forbid_unknown_fields=True):
@@ -85,9 +98,9 @@ def read_request(
         InvalidValue: it is no such request.
     """
     try:
-        asked = json_value(body, _Body)
-    except (msgspec.DecodeError, UnicodeDecodeError) as error:
-        raise InvalidValue(f"the body is no constraint: {error}; write {ONE}, as JSON") from None
+        asked = read_json(body, _Body, EXAMPLES)
+    except InvalidValue as error:
+        raise InvalidValue(f"the body is no constraint: {error}; send {ONE}, as JSON") from None
     numbered = not isinstance(asked.undo, bool)
     given = [
         subject

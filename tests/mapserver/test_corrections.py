@@ -181,13 +181,23 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
         ({"window": {"map": "a.1", "begin": 5, "end": 4}}, "ends after it begins"),
         ({"window": {"map": "a.1", "begin": "noon"}}, "'noon' is no time"),
         ({"undo": 1}, "there is no constraint 1"),
-        ({"retired": ["a.1"]}, "unknown field"),
+        ({"retired": ["a.1"]}, "`retired`: there is no such field; send link, unmerge"),
+        ({"link": "a.1.1"}, '`link`: give a list, not text; for example ["r0.1.17", "r1.1.5"]'),
+        ({"link": ["a.1.1", 5]}, "`link[1]`: give text, not a whole number; for example ["),
+        ({"retire": "a.1"}, "`retire`: give a list, not text; for example ["),
+        ({"undo": "1"}, "`undo`: give true or false, or a whole number, not text; for example 3"),
+        ({"undo": 1.5}, "`undo`: give true or false, or a whole number, not a number with decimals"),
+        ({"retire": ["a.1"], "check": "yes"}, "`check`: give true or false, not text; for example true"),
+        ({"window": {"map": 1}}, "`window.map`: give text, not a whole number; for example {"),
+        ({"area": {"anchor": "a.1.1"}}, "`area.corners`: this field is missing; for example {"),
+        (b"5", "the body is no constraint"),
         (b'{"link": ["\xff", "a.1.1"]}', "the body is no constraint"),
     ],
 )
 def test_a_request_that_is_wrong_says_why(small: Asking, body: object, words: str) -> None:
     status, answer = small.http("POST", body)
     assert status == 400 and words in answer["error"], answer
+    assert "Expected `" not in answer["error"] and "$" not in answer["error"]
     assert small.http("GET") == (200, {"constraints": []})
 
 

@@ -130,7 +130,7 @@ def test_places_over_http(house: House) -> None:
             (b"{", "Input data was truncated"),
             (b'{"name": "x", "body": {"kind": "hologram"}}', "an annotation has a kind: place"),
             (b'{"name": "x", "body": {"kind": "place", "colour": 1}}', "a place has no colour"),
-            (b'{"name": "x", "body": {"kind": "place", "node": 5}}', "Expected `array"),
+            (b'{"name": "x", "body": {"kind": "place", "node": 5}}', "`node`: give a node as text, for exam"),
             (b'{"name": "x", "body": {"kind": "place", "node": "50,50"}}', "nothing is mapped within 2 m"),
             (
                 b'{"name": "x", "body": {"kind": "place", "corners": [[0, 0], [2, 2], [2, 0], [0, 2]]}}',
@@ -149,12 +149,41 @@ def test_places_over_http(house: House) -> None:
                 "nothing is mapped within 2 m of 1e+308,0: the nearest node is r0.1.1, 1e+308 m away at ",
             ),
             (b'{"name": "r0.1.1", "body": {"kind": "place", "node": "r0.1.3"}}', "looks like a node"),
-            (b'{"name": "x", "body": {"kind": "place", "radius": 1}}', "Expected `array"),
-            (b'{"name": "x", "body": {"kind": "place", "radius": 1, "node": ["r0"]}}', "Expected `array`"),
+            (b'{"name": "x", "body": {"kind": "place", "radius": 1}}', "`node`: give a node as text"),
+            (
+                b'{"name": "x", "body": {"kind": "place", "radius": 1, "node": ["r0"]}}',
+                "`node`: give a node as text",
+            ),
+            (b'{"name": 5, "body": {"kind": "place"}}', "`name`: give text, not a whole number; for example"),
+            (b'{"name": "x"}', "`body`: this field is missing; for example {"),
+            (b'{"name": "x", "body": [], "why": "y"}', "`body`: give an object, not a list; for example {"),
+            (b'{"name": "x", "body": {}, "why": "y"}', "`why`: there is no such field"),
+            (b"[]", "give an object, not a list; send {"),
+            (
+                b'{"name": "x", "body": {"kind": "place", "node": "r0.1.3", "radius": "1"}}',
+                "`radius`: give a number, not text; for example 1.5",
+            ),
+            (
+                b'{"name": "x", "body": {"kind": "place", "corners": [[0, 0], [1, "0"], [1, 1]]}}',
+                "`corners[1][1]`: give a number, not text; for example [[",
+            ),
+            (
+                b'{"name": "x", "body": {"kind": "closure", "edge": ["r0.1.1"]}}',
+                '`edge`: give a list of 2 elements, not 1; for example ["r0.1.17", "r0.1.19"]',
+            ),
+            (
+                b'{"name": "r0.1", "body": {"kind": "floor", "node": "r0.1.3", "label": ""}}',
+                "`label`: give text of at least 1 characters; for example",
+            ),
+            (
+                b'{"name": "x", "body": {"kind": "portal", "a": "r0.1.1", "b": "r0.1.3", "means": "rope"}}',
+                "`means`: 'rope' is none of the words that it may be; for example \"lift\", ",
+            ),
             (b'{"name": "x", "body": {"a": ' + 9999 * b"[", "recursion"),
         ]:
             status, answer = ask(web, "POST", "/annotations", wrong)
             assert status == 400 and reason in answer["error"], answer
+            assert "Expected `" not in answer["error"] and "$" not in answer["error"]
 
 
 @pytest.fixture(scope="module")
