@@ -195,6 +195,32 @@ def test_fingers_hit_every_button(page: Browser, services: StubServices) -> None
     assert small == []
 
 
+@pytest.mark.parametrize("width", [320, 390, 1280])
+def test_no_button_touches_another_one(page: Browser, width: int) -> None:
+    page.look(width, 844, mobile=width < 760)
+    try:
+        near = page.run("""
+            const found = [];
+            for (const panel of ["fleet", "why", "edit", "photo"]) {
+              document.getElementById(`tab-${panel}`).click();
+              const all = [...document.querySelectorAll(`#${panel} :is(button, input, select)`)];
+              const seen = all.filter(one => one.checkVisibility());
+              const boxes = seen.map(one => [one.id || one.textContent, one.getBoundingClientRect()]);
+              boxes.forEach(([name, a], k) => {
+                for (const [other, b] of boxes.slice(k + 1)) {
+                  const x = Math.max(a.left, b.left) - Math.min(a.right, b.right);
+                  const y = Math.max(a.top, b.top) - Math.min(a.bottom, b.bottom);
+                  if (Math.max(x, y) < 2) found.push(`${name} and ${other}: ${x}, ${y}`);
+                }
+              });
+            }
+            return found;
+        """)
+    finally:
+        page.look(420, 800)
+    assert near == []
+
+
 def test_a_map_without_room_is_drawn_when_it_has_some(page: Browser) -> None:
     """As on a phone, where the keyboard may leave none."""
     eventually(lambda: page.run("return mapweave.painter.bitmap !== null"))
