@@ -271,20 +271,33 @@ class AliasedRegions:
         return [graph.nodes[k] for k in nearby.tolist()], graph.means[nearby]
 
     def _votes(self, around: Iterable[Node], frame: Frame, robot: Pose2) -> list[_Vote]:
-        """The motions that the aliases of nodes imply."""
+        """The motions that the aliases of nodes imply; none if too few nodes have any for a party.
+
+        Those whose aliases are known come first: to search the aliases of one takes 10 ms in a large fleet.
+        """
+        nodes = list(around)
+        votes: list[list[_Vote]] = [[] for _ in nodes]
+        order = sorted(range(len(nodes)), key=lambda k: not self._alike.knows(nodes[k]))
+        for asked, k in enumerate(order):
+            if sum(map(bool, votes)) + len(nodes) - asked < self._settings.least_nodes:
+                return []
+            votes[k] = self._votes_of(nodes[k], frame, robot)
+        return [vote for of_node in votes for vote in of_node]
+
+    def _votes_of(self, neighbour: Node, frame: Frame, robot: Pose2) -> list[_Vote]:
+        """The motions that the aliases of one node imply."""
         votes: list[_Vote] = []
-        for neighbour in around:
-            frame_from_neighbour = self._placed(neighbour)[1]
-            for alike in self._aliases(neighbour):
-                other_frame, frame_from_alias = self._placed(alike.other)
-                robot_there = (
-                    frame_from_alias @ alike.other_from_node.mean @ frame_from_neighbour.inverse() @ robot
-                )
-                if other_frame == frame and same_place(robot_there, robot):
-                    continue
-                shown = frame_from_neighbour.apply(neighbour.points_in_robot[alike.landmarks])
-                shown = shown[np.isfinite(shown[:, 0])]
-                votes.append(_Vote(neighbour, alike, other_frame, frame_from_alias, robot_there, shown))
+        frame_from_neighbour = self._placed(neighbour)[1]
+        for alike in self._aliases(neighbour):
+            other_frame, frame_from_alias = self._placed(alike.other)
+            robot_there = (
+                frame_from_alias @ alike.other_from_node.mean @ frame_from_neighbour.inverse() @ robot
+            )
+            if other_frame == frame and same_place(robot_there, robot):
+                continue
+            shown = frame_from_neighbour.apply(neighbour.points_in_robot[alike.landmarks])
+            shown = shown[np.isfinite(shown[:, 0])]
+            votes.append(_Vote(neighbour, alike, other_frame, frame_from_alias, robot_there, shown))
         return votes
 
     def _parties(self, votes: Sequence[_Vote]) -> Iterator[list[_Vote]]:
