@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import logging
 import sys
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from datetime import datetime
@@ -94,6 +95,8 @@ class Bar:
         """
         self._console, self._words, self._total, self._clock = console, words, total, clock
         self._done, self._said_at, self._said = 0.0, clock(), ""
+        self._begun, self._over, self._saying = clock(), threading.Event(), threading.Lock()
+        self._waiting = threading.Thread(target=self._say_that_it_goes_on, name="progress", daemon=True)
         self._bar: tuple[Progress, TaskID] | None = None
         self._detail = ""
         if console.is_terminal:
@@ -114,6 +117,8 @@ class Bar:
         """Begin to show."""
         if self._bar is not None:
             self._bar[0].start()
+        else:
+            self._waiting.start()
         return self
 
     def __exit__(
@@ -122,7 +127,10 @@ class Bar:
         """Show the last state. What was quick, or has failed, ends without a plain line."""
         if self._bar is not None:
             self._bar[0].stop()
-        elif self._said and error is None:
+            return
+        self._over.set()
+        self._waiting.join()
+        if self._said and error is None:
             self._say()
 
     def advance(self, steps: float = 1, detail: str = "") -> None:
@@ -145,12 +153,19 @@ class Bar:
         elif self._clock() - self._said_at >= EVERY:
             self._say()
 
-    def _say(self) -> None:
-        of = "" if self._total is None else f" of {self._total:g}"
-        line = f"{self._words}: {self._done:g}{of}{', ' * bool(self._detail)}{self._detail}"
-        if line != self._said:
-            self._console.print(line, markup=False, highlight=False, soft_wrap=True)
-        self._said, self._said_at = line, self._clock()
+    def _say_that_it_goes_on(self) -> None:
+        """A step may take minutes, such as the joining of maps."""
+        while not self._over.wait(EVERY / 10):
+            if self._clock() - self._said_at >= EVERY:
+                self._say(f", {self._clock() - self._begun:.0f} s")
+
+    def _say(self, since: str = "") -> None:
+        with self._saying:
+            of = "" if self._total is None else f" of {self._total:g}"
+            line = f"{self._words}: {self._done:g}{of}{', ' * bool(self._detail)}{self._detail}{since}"
+            if line != self._said:
+                self._console.print(line, markup=False, highlight=False, soft_wrap=True)
+            self._said, self._said_at = line, self._clock()
 
 
 def tracked(

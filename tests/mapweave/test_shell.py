@@ -10,6 +10,7 @@ import shlex
 import shutil
 import subprocess
 import sys
+import threading
 import time
 from pathlib import Path
 
@@ -17,6 +18,7 @@ import pytest
 from argcomplete.finders import CompletionFinder
 from rich.console import Console
 
+from mapweave import terminal
 from mapweave.cheat_sheet import as_markdown
 from mapweave.cli import main, parser
 from mapweave.commands.completion import SHELLS
@@ -24,6 +26,7 @@ from mapweave.commands.examples import EXAMPLES
 from mapweave.exit_status import USAGE
 from mapweave.terminal import EVERY, PLAIN_WIDTH, Bar, EventLog, tracked
 from tests.mapweave.command_line import parsers
+from tests.waiting import eventually
 
 STAMP = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d "
 
@@ -153,6 +156,19 @@ def test_progress_is_a_plain_line_now_and_then_where_there_is_no_terminal() -> N
     ]
     console, file = plain()
     assert list(tracked([], "frames", console=console)) == [] and file.getvalue() == ""
+
+
+def test_progress_goes_on_while_one_step_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a store of 484 nodes `map diff` said nothing for a minute: joining its maps is one step."""
+    monkeypatch.setattr(terminal, "EVERY", 0.05)
+    (console, file), before = plain(), threading.active_count()
+    with Bar(console, "reading nodes", None) as bar:
+        bar.update(484, "comparing and joining", 484)
+        eventually(lambda: file.getvalue().count("\n") >= 2)
+    *waited, last = file.getvalue().splitlines()
+    assert last == "reading nodes: 484 of 484, comparing and joining"
+    assert all(re.fullmatch(re.escape(last) + r", \d+ s", line) for line in waited)
+    assert threading.active_count() == before
 
 
 def test_a_long_detail_leaves_the_numbers_of_a_bar() -> None:
