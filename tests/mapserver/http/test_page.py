@@ -21,6 +21,10 @@ from tests.waiting import eventually
 pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 RESULT = "return document.getElementById('answer').textContent"
 ROWS = "return [...document.querySelectorAll('tr')].map(r => [...r.children].map(c => c.textContent))"
+CONTROLS = {
+    "application", "button", "checkbox", "combobox", "image", "link", "searchbox", "slider", "spinbutton",
+    "tab", "tablist", "tabpanel", "textbox",
+}  # fmt: skip
 STATUS = "return document.getElementById('summary').textContent"
 KIND = "const answer = document.getElementById('answer'); return answer.dataset.certainty || answer.className"
 
@@ -193,6 +197,26 @@ def test_fingers_hit_every_button(page: Browser, services: StubServices) -> None
     finally:
         page.look(420, 800)
     assert small == []
+
+
+def test_screen_readers_name_every_control(page: Browser, services: StubServices) -> None:
+    """By the accessibility tree that Chromium gives them, panel by panel."""
+    services.fleet = FleetStatus((RobotEntry("r0", True),))
+    eventually(lambda: page.run("return document.querySelectorAll('#robots button').length"))
+    seen, nameless = set(), []
+    for panel in ("fleet", "selected", "why", "edit", "photo"):
+        page.run(
+            "document.querySelector('#robots button').click()"
+            if panel == "selected"
+            else f"document.getElementById('tab-{panel}').click()"
+        )
+        for node in page.devtools("Accessibility.getFullAXTree")["nodes"]:
+            role = node.get("role", {}).get("value")
+            if role in CONTROLS and not node["ignored"]:
+                seen.add(role)
+                if not node.get("name", {}).get("value", "").strip():
+                    nameless.append((panel, role, node["nodeId"]))
+    assert not nameless and len(seen) > 6, seen
 
 
 @pytest.mark.parametrize("width", [320, 390, 1280])
