@@ -4,9 +4,18 @@ from __future__ import annotations
 
 import functools
 import inspect
+import os
 from typing import Any
 
-import pybullet
+# PyBullet says when it was built on stderr itself, amid the lines of a log.
+_stderr, _nowhere = os.dup(2), os.open(os.devnull, os.O_WRONLY)
+os.dup2(_nowhere, 2)
+try:
+    import pybullet
+finally:
+    os.dup2(_stderr, 2)
+    os.close(_stderr)
+    os.close(_nowhere)
 
 
 class Physics:

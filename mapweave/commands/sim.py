@@ -214,7 +214,6 @@ def run_serve(arguments: argparse.Namespace) -> int:
     network = network_of(arguments, settings)
     if network.keys and not arguments.listen:
         raise UsageError(simulator_beside(network))
-    # Before PyBullet is loaded, which prints a line of its own.
     scenario = _scenario(arguments)
     from mapweave.processes.simulator import run_sim
     from mapweave.terminal import log_with_time

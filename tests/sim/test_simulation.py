@@ -23,6 +23,13 @@ from mapweave.sim.worlds.catalog import make_world
 RANGE_NOISE = RobotSetup("r0").range_noise
 
 
+def test_pybullet_prints_nothing_amid_a_log() -> None:
+    """It said on stderr when it was built: a line without the time, and none of JSON."""
+    program = "import sys, mapweave.sim.physics; print('after it', file=sys.stderr)"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert (done.stdout, done.stderr) == ("", "after it\n")
+
+
 def fingerprint(seed: int) -> str:
     """Digest of all that three robots sense on a short drive."""
     digest = hashlib.sha256()
