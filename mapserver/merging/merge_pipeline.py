@@ -17,7 +17,7 @@ from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.mapserver.plausibility import fragments
 from mapweave.merge.islands import Islands
 from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover
-from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
+from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder, Superseding
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -43,6 +43,15 @@ class MergePipeline:
         self._frames = PinnedFrames()
         self._superseder = NodeSuperseder(reaches)
         self._remover = LandmarkRemover()
+
+    @property
+    def superseding(self) -> Superseding:
+        """What is superseded after the newest merge, and what that was judged from."""
+        return self._superseder.state
+
+    def resume(self, superseding: Superseding) -> None:
+        """See `NodeSuperseder.resume`."""
+        self._superseder.resume(superseding)
 
     def replace_marginals(self, marginals: Sequence[Link], standing: Set[Pair]) -> None:
         """See `Islands.replace_marginals`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 
@@ -22,10 +22,12 @@ from mapweave.mapserver.merging.merge_pipeline import MergePipeline
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import Compare, NodeComparisons, compare
 from mapweave.mapserver.merging.pruning import PrunePlan, Pruning
-from mapweave.mapserver.merging.verification_cache import VerificationCache
+from mapweave.mapserver.merging.restart_record import RestartRecord
+from mapweave.mapserver.merging.verification_cache import RecentComparisons, VerificationCache
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.merge.islands import Islands
+from mapweave.merge.map_maintenance.node_superseding import Superseding
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
@@ -47,9 +49,10 @@ class Merger:
 
     With four exceptions the result depends on the maps, not on the order of changes. New nodes are not
     compared with nodes superseded on another day. Which of two nodes of one place supersedes the other
-    depends on what was superseded before (docs/decisions/life-of-a-map.md says how much that is). In a large
-    place database cells are searched, which depend on what was there when they were learned (see
-    LandmarkIndexSettings). Decisions on a large island stay until much of it has changed (see Islands).
+    depends on what was superseded before (docs/decisions/life-of-a-map.md says how much that is); a
+    RestartRecord passes that on to the next process. In a large place database cells are searched, which
+    depend on what was there when they were learned (see LandmarkIndexSettings). Decisions on a large island
+    stay until much of it has changed (see Islands).
     """
 
     def __init__(
@@ -78,6 +81,8 @@ class Merger:
         self._comparisons = NodeComparisons(self.places, self.node, self.counters, compare, pause)
         self._verdicts = Verdicts()
         self.pruning = Pruning()
+        self._record: RestartRecord | None = None
+        self._resumed: Superseding | None = None
         self._pipeline = self._new_pipeline()
         self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
@@ -111,15 +116,30 @@ class Merger:
         """Whether there are earlier verdicts that no merge has taken over yet."""
         return self._comparisons.recollecting
 
-    def recollect(self, findings: VerificationCache) -> None:
-        """Use earlier results for nodes that are unchanged when they are read."""
-        self._comparisons.recollect(findings)
+    def recollect(self, findings: VerificationCache, record: RestartRecord | None = None) -> None:
+        """Use earlier results for nodes that are unchanged when they are read.
+
+        Args:
+            findings: of comparisons.
+            record: of the last merge, and what was compared after these findings.
+        """
+        self._record = record
+        self._comparisons.recollect(findings, record.recent if record else RecentComparisons())
 
     def findings(self) -> VerificationCache:
         """What was found of all nodes that are compared."""
-        return self._comparisons.findings(
-            node for hybrid_map in self.maps.values() for node in hybrid_map.nodes.values()
-        )
+        return self._comparisons.findings(self._nodes())
+
+    def findings_kept(self) -> None:
+        """Take note that the findings are on the disk."""
+        self._comparisons.kept()
+
+    def record(self) -> RestartRecord:
+        """What another process needs to go on from the last merge, besides the findings on the disk."""
+        return RestartRecord.of(self._pipeline.superseding, self._comparisons.recent(self._nodes()))
+
+    def _nodes(self) -> Iterator[Node]:
+        return (node for hybrid_map in self.maps.values() for node in hybrid_map.nodes.values())
 
     def node(self, node_id: NodeId) -> Node | None:
         """A node of any map, if it is there."""
@@ -249,8 +269,8 @@ class Merger:
             except Exception as error:  # any error is of one map or a few, and not of all
                 log.exception("the merge fails; looking for the map with which it does")
                 merged = self._made_without_bad(maps, error, use)
-            for node_id, overlaps in self.places.leave_out(merged.superseded, self.node).items():
-                self._comparisons.put_overlaps(node_id, overlaps)
+            self._resumed = None
+            self._leave_out(merged.superseded)
             if self._merged.implausible.keys() - merged.implausible.keys():
                 self.alike.forget()
             self._merged = merged
@@ -362,7 +382,23 @@ class Merger:
 
     def search_pairs(self, most: int | None = None) -> None:
         """Search for nodes similar to those that were read, or to so many of them."""
+        # A server merges before it has read its store if manual constraints come first.
+        if self._record is not None and self.maps:
+            self._resume(self._record)
+            self._record = None
         self._comparisons.search_pairs(most)
+
+    def _resume(self, record: RestartRecord) -> None:
+        """Go on from the last merge of another process, as far as the nodes are what they were."""
+        unchanged = record.unchanged(self._comparisons.prints(self._nodes()))
+        self._resumed = record.superseding(unchanged, self.node)
+        self._pipeline.resume(self._resumed)
+        # Later nodes are not compared with what had left the index before they came.
+        self._leave_out(record.superseded.keys() & unchanged)
+
+    def _leave_out(self, superseded: Collection[NodeId]) -> None:
+        for node_id, overlaps in self.places.leave_out(superseded, self.node).items():
+            self._comparisons.put_overlaps(node_id, overlaps)
 
     def apart(self) -> MergedMap:
         """The merged map without comparisons of maps: a component for each part of each map.
@@ -425,4 +461,6 @@ class Merger:
     def _new_pipeline(self) -> MergePipeline:
         pipeline = MergePipeline(self.settings, self.reaches, self._pause)
         pipeline.replace_marginals(self.pruning.marginals, self.pruning.standing)
+        if self._resumed is not None:
+            pipeline.resume(self._resumed)
         return pipeline

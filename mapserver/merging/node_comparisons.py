@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from itertools import islice
 
 from mapweave.hybridmap.ids import NodeId
@@ -11,6 +11,7 @@ from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.verification_cache import (
     CachedVerifications,
+    RecentComparisons,
     VerificationCache,
     fingerprint_of,
 )
@@ -71,6 +72,8 @@ class NodeComparisons:
         self._verdicts: dict[NodeId, dict[NodeId, Verdict]] = {}
         self._cached: CachedVerifications | None = None
         self._prints: dict[NodeId, tuple[Node, bytes]] = {}
+        self._unsaved: set[NodeId] = set()
+        self._recent: Set[NodeId] = frozenset()
 
     def __len__(self) -> int:
         """Pairs of nodes on which there is a verdict."""
@@ -103,13 +106,14 @@ class NodeComparisons:
             before: its pairs as it was.
         """
         try:
-            self._pairs.put(node.id, self._places.overlaps(node, self._node_of, before))
+            self.put_overlaps(node.id, self._places.overlaps(node, self._node_of, before))
         except IncompleteSearch:  # it must not pass for compared, here or in what is kept for the next start
             self.postpone([node])
 
     def put_overlaps(self, node_id: NodeId, overlaps: Mapping[NodeId, float]) -> None:
         """Take overlaps of a node with others that are known already."""
         self._pairs.put(node_id, dict(overlaps))
+        self._unsaved.add(node_id)
 
     def postpone(self, nodes: Iterable[Node]) -> None:
         """Nodes for which `search_pairs` shall look which others are like them."""
@@ -119,6 +123,7 @@ class NodeComparisons:
         """Drop what was found out about a node: it is gone, or is known better."""
         self._pairs.forget(node_id)
         self._uncompared.pop(node_id, None)
+        self._unsaved.discard(node_id)
         for other in self._verdicts.pop(node_id, {}):
             del self._verdicts[other][node_id]
 
@@ -140,9 +145,16 @@ class NodeComparisons:
             del self._uncompared[node_id]
             if (node := self._node_of(node_id)) is not None:
                 cached = self._cached
-                source = cached if cached is not None and cached.knows(node) else self._places
+                known = cached is not None and cached.knows(node)
                 try:
-                    self._pairs.put(node_id, source.overlaps(node, self._node_of))
+                    if cached is not None and known:
+                        overlaps = cached.overlaps(node, self._node_of)
+                    else:
+                        before = [] if cached is None else cached.pairs_of(node_id)
+                        overlaps = self._places.overlaps(node, self._node_of, before)
+                    self._pairs.put(node_id, overlaps)
+                    if not known or node_id in self._recent:
+                        self._unsaved.add(node_id)
                 except IncompleteSearch:
                     self.postpone([node])
                     return
@@ -186,9 +198,9 @@ class NodeComparisons:
         """Whether there are earlier verdicts that have not been taken over yet."""
         return self._cached is not None
 
-    def recollect(self, findings: VerificationCache) -> None:
-        """Use earlier results for nodes that are unchanged when they are read."""
-        self._cached = CachedVerifications(findings)
+    def recollect(self, findings: VerificationCache, recent: RecentComparisons) -> None:
+        """Use earlier results, and later ones, for nodes that are unchanged when they are read."""
+        self._cached, self._recent = CachedVerifications(findings.extended(recent)), recent.compared
 
     def take_over(self) -> None:
         """Take over all earlier verdicts, once nodes are read; later pairs are compared again."""
@@ -198,14 +210,36 @@ class NodeComparisons:
                     self.judge(pair, verdict)
             self._cached = None
 
-    def findings(self, nodes: Iterable[Node]) -> VerificationCache:
-        """What was found of those of these nodes that are compared."""
+    def kept(self) -> None:
+        """Take note that the findings are on the disk."""
+        self._unsaved = set()
+
+    def recent(self, nodes: Iterable[Node]) -> RecentComparisons:
+        """What was found since `kept` was called last.
+
+        Args:
+            nodes: all that there are.
+        """
+        compared = frozenset(self._unsaved - self._uncompared.keys())
+        overlaps = {pair: value for node in compared for pair, value in self._pairs.overlaps_of(node).items()}
+        return RecentComparisons(self.prints(nodes), compared, overlaps)
+
+    def prints(self, nodes: Iterable[Node]) -> dict[NodeId, bytes]:
+        """Fingerprints of nodes.
+
+        Args:
+            nodes: all that there are; those of others are forgotten.
+        """
         before, self._prints = self._prints, {}
         for node in nodes:
             known = before.get(node.id)
             same = known is not None and known[0] is node
             self._prints[node.id] = known if known and same else (node, fingerprint_of(node))
-        prints = {n: fingerprint for n, (_, fingerprint) in self._prints.items() if n not in self._uncompared}
+        return {node_id: fingerprint for node_id, (_, fingerprint) in self._prints.items()}
+
+    def findings(self, nodes: Iterable[Node]) -> VerificationCache:
+        """What was found of those of these nodes that are compared."""
+        prints = {n: print_ for n, print_ in self.prints(nodes).items() if n not in self._uncompared}
         verdicts = {(a, b): v for a, known in self._verdicts.items() for b, v in known.items() if a < b}
         return VerificationCache(prints, self._pairs.overlaps(), verdicts)
 

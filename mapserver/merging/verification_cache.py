@@ -7,7 +7,7 @@ tested by fingerprints of all that a comparison uses.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass, field
 
 from mapweave.hybridmap.ids import NodeId
@@ -36,6 +36,30 @@ class VerificationCache:
         """How many pairs were compared."""
         return len(self.verdicts)
 
+    def extended(self, recent: RecentComparisons) -> VerificationCache:
+        """These results and later ones. What was found of nodes that were others since is left out."""
+        prints = {n: p for n, p in self.prints.items() if recent.prints.get(n, p) == p}
+        others = self.prints.keys() - prints.keys()
+        overlaps = {pair: value for pair, value in self.overlaps.items() if others.isdisjoint(pair)}
+        verdicts = {pair: verdict for pair, verdict in self.verdicts.items() if others.isdisjoint(pair)}
+        prints |= {node: recent.prints[node] for node in recent.compared}
+        return VerificationCache(prints, overlaps | dict(recent.overlaps), verdicts)
+
+
+@dataclass(frozen=True)
+class RecentComparisons:
+    """What was compared since a verification cache was saved; it is little.
+
+    Attributes:
+        prints: of all nodes.
+        compared: nodes of these that were compared with all others that there were.
+        overlaps: of these with others; pairs that are left out share too little.
+    """
+
+    prints: Mapping[NodeId, bytes] = field(default_factory=dict)
+    compared: Set[NodeId] = frozenset()
+    overlaps: Mapping[Pair, float] = field(default_factory=dict)
+
 
 class CachedVerifications:
     """Results of another process, for nodes that are unchanged."""
@@ -47,6 +71,10 @@ class CachedVerifications:
         for (a, b), value in findings.overlaps.items():
             self._overlaps.setdefault(a, {})[b] = value
             self._overlaps.setdefault(b, {})[a] = value
+        self._compared: dict[NodeId, list[NodeId]] = {}
+        for a, b in findings.verdicts:
+            self._compared.setdefault(a, []).append(b)
+            self._compared.setdefault(b, []).append(a)
         self._checked: dict[NodeId, tuple[Node, bool]] = {}
 
     def knows(self, node: Node) -> bool:
@@ -65,6 +93,11 @@ class CachedVerifications:
             if candidate is not None and self.knows(candidate):
                 out[candidate_id] = value
         return out
+
+    def pairs_of(self, node_id: NodeId) -> list[Pair]:
+        """The pairs of a node, as it was then, that were compared; those that share enough if none was."""
+        others = self._compared.get(node_id) or [*self._overlaps.get(node_id, {})]
+        return [(node_id, other) for other in others]
 
     def verdicts(self, node_of: Callable[[NodeId], Node | None]) -> Iterable[tuple[Pair, Verdict]]:
         """On pairs of nodes that it knows."""

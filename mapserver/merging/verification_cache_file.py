@@ -55,7 +55,7 @@ def load(path: Path, made_by: str) -> VerificationCache:
     """
     parts = unseal(path, MAGIC)
     try:
-        if _words(next(parts)) != _header(made_by):
+        if read_json(next(parts)) != _header(made_by):
             raise InvalidFile(f"{path}: of another version of this program, or with other settings")
         return _read(parts)
     except (ValueError, KeyError, TypeError, IndexError, EOFError, StopIteration, InvalidValue) as error:
@@ -71,8 +71,8 @@ def _parts(findings: VerificationCache, made_by: str) -> Iterator[NDArray[Any]]:
     row = {node: k for k, node in enumerate(nodes)}
     agents = sorted({node.agent for node in nodes})
     number = {agent: k for k, agent in enumerate(agents)}
-    yield _text(_header(made_by))
-    yield _text(agents)
+    yield json_part(_header(made_by))
+    yield json_part(agents)
     yield np.array([(number[n.agent], n.epoch, n.number) for n in nodes], np.int64).reshape(-1, 3)
     yield np.frombuffer(b"".join(findings.prints[n] for n in nodes), np.uint8).reshape(-1, PRINT_BYTES)
     overlaps = _with_rows(findings.overlaps.items(), row)
@@ -82,7 +82,7 @@ def _parts(findings: VerificationCache, made_by: str) -> Iterator[NDArray[Any]]:
     refused = [(pair, v.reason) for pair, v in verdicts if isinstance(v, RefusedLink)]
     links = [(pair, v) for pair, v in verdicts if isinstance(v, Link)]
     reasons = {reason: k for k, reason in enumerate(sorted({reason for _, reason in refused}))}
-    yield _text(list(reasons))
+    yield json_part(list(reasons))
     yield _rows([pair for pair, _ in refused], row)
     yield np.array([reasons[reason] for _, reason in refused], np.int64)
     yield _rows([pair for pair, _ in links], row)
@@ -91,24 +91,24 @@ def _parts(findings: VerificationCache, made_by: str) -> Iterator[NDArray[Any]]:
     yield np.cumsum([0, *(len(link.shared) for _, link in links)])
     yield np.concatenate([np.zeros((0, 2), np.int64), *(link.shared for _, link in links)])
     kinds = {kind: k for k, kind in enumerate(sorted({tuple(link.evidence) for _, link in links}))}
-    yield _text([list(kind) for kind in kinds])
+    yield json_part([list(kind) for kind in kinds])
     yield np.array([kinds[tuple(link.evidence)] for _, link in links], np.int64)
     yield np.cumsum([0, *(len(link.evidence) for _, link in links)])
     yield np.array([value for _, link in links for value in link.evidence.values()], np.float64)
 
 
 def _read(parts: Iterator[NDArray[Any]]) -> VerificationCache:
-    agents = _words(next(parts))
+    agents = read_json(next(parts))
     nodes = [NodeId(agents[a], epoch, number) for a, epoch, number in next(parts).tolist()]
     prints = {node: checksum.tobytes() for node, checksum in zip(nodes, next(parts), strict=True)}
     overlaps = dict(zip(_pairs(next(parts), nodes), next(parts).tolist(), strict=True))
-    reasons = _words(next(parts))
+    reasons = read_json(next(parts))
     refused = zip(_pairs(next(parts), nodes), next(parts).tolist(), strict=True)
     verdicts: dict[Pair, Verdict] = {pair: RefusedLink(*pair, reasons[k]) for pair, k in refused}
     pairs = _pairs(next(parts), nodes)
     means, covariances = next(parts).tolist(), next(parts)
     shared_at, shared = next(parts).tolist(), next(parts)
-    kinds, kind = _words(next(parts)), next(parts).tolist()
+    kinds, kind = read_json(next(parts)), next(parts).tolist()
     evidence_at, evidence = next(parts).tolist(), next(parts).tolist()
     for k, (pair, (i, j), (m, n)) in enumerate(
         zip(pairs, pairwise(shared_at), pairwise(evidence_at), strict=True)
@@ -132,9 +132,11 @@ def _pairs(rows: NDArray[np.int64], nodes: Sequence[NodeId]) -> list[Pair]:
     return [(nodes[a], nodes[b]) for a, b in rows.tolist()]
 
 
-def _text(words: Any) -> NDArray[np.uint8]:
+def json_part(words: Any) -> NDArray[np.uint8]:
+    """Words as a part of a file."""
     return np.frombuffer(json.dumps(words).encode(), np.uint8)
 
 
-def _words(part: NDArray[Any]) -> Any:
+def read_json(part: NDArray[Any]) -> Any:
+    """Such a part again."""
     return json.loads(part.tobytes())

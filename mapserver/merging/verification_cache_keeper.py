@@ -1,4 +1,4 @@
-"""Keeps the results of comparing nodes on the disk next to the store."""
+"""Keeps comparisons of nodes, and what is superseded, on the disk next to the store for the next start."""
 
 from __future__ import annotations
 
@@ -9,7 +9,9 @@ from importlib.metadata import version
 from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.mapserver.merging import restart_record_file
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.restart_record import RestartRecord
 from mapweave.mapserver.merging.verification_cache import VerificationCache
 from mapweave.mapserver.merging.verification_cache_file import load, save
 
@@ -17,6 +19,8 @@ log = logging.getLogger(__name__)
 
 SUFFIX = ".verdicts"
 """Of the file, behind the store's name."""
+RECORD_SUFFIX = ".superseded"
+"""Of the other file."""
 SHARE = 0.05
 """Of the time that it may take to save."""
 WORTHWHILE = 0.02
@@ -38,10 +42,13 @@ class VerificationCacheKeeper:
         """
         self._clock = clock
         self._path = path.with_name(path.name + SUFFIX)
+        self._record_path = path.with_name(path.name + RECORD_SUFFIX)
         self._fresh = fresh
         self._saved: tuple[int, int] = (0, 0)
         self._rest_until = 0.0
-        self._failure = ""
+        self._record: RestartRecord | None = None
+        self._merges = 0
+        self._failures: dict[str, tuple[str, float]] = {}
 
     def restore(self, merger: Merger) -> None:
         """Load the results for a new merger, if the file is there and valid."""
@@ -57,32 +64,61 @@ class VerificationCacheKeeper:
                 "%d nodes were compared with each other before, %d pairs; %.1f s",
                 len(findings.prints), len(findings), self._clock() - began,
             )  # fmt: skip
-        merger.recollect(findings)
+        try:
+            self._record = restart_record_file.load(self._record_path, _made_by(merger))
+        except InvalidFile as error:
+            # Files of another version are reported once.
+            if self._record_path.exists() and findings.prints:
+                log.info("what is superseded is decided again: %s", error)
+        merger.recollect(findings, self._record)
         self._saved = len(findings.prints), len(findings)
 
     def save(self, merger: Merger, last: bool = False) -> None:
-        """Save them, if that is worth while.
+        """Save them, if that is worth while, and what is superseded if there was a merge.
 
         Args:
             merger: has compared nodes.
             last: there is no later call: save anything new.
         """
         if merger.recollecting:
-            return  # The file has more than this process yet.
+            return  # The files have more than this process yet.
+        self._save_findings(merger, last)
+        # It is small: a server that is killed goes on from its last merge.
+        if merger.counters.merges != self._merges:
+            self._save_record(merger, last)
+
+    def _save_findings(self, merger: Merger, last: bool) -> None:
         now, least = merger.compared, 0.0 if last else WORTHWHILE
         new = max(abs(count - before) for count, before in zip(now, self._saved, strict=True))
         if not new or new < least * max(now) or (self._clock() < self._rest_until and not last):
             return
-        began = self._clock()
+        began, words = self._clock(), "the next start takes longer"
+        if self._tried(lambda: save(self._path, merger.findings(), _made_by(merger)), words, last):
+            merger.findings_kept()
+            self._saved = now
+            self._rest_until = self._clock() + (self._clock() - began) / SHARE
+
+    def _save_record(self, merger: Merger, last: bool) -> None:
+        record, words = merger.record(), "the next start may supersede other nodes"
+        if record == self._record or self._tried(
+            lambda: restart_record_file.save(self._record_path, record, _made_by(merger)), words, last
+        ):
+            self._record, self._merges = record, merger.counters.merges
+
+    def _tried(self, write: Callable[[], None], otherwise: str, last: bool) -> bool:
+        """Write a file, but not soon after a failure; whether it was written."""
+        failure, rest_until = self._failures.get(otherwise, ("", 0.0))
+        if self._clock() < rest_until and not last:
+            return False
         try:
-            save(self._path, merger.findings(), _made_by(merger))
+            write()
         except InvalidFile as error:
-            if str(error) != self._failure:
-                log.warning("%s; the next start takes longer", error)
-            self._failure, self._rest_until = str(error), self._clock() + RETRY
-            return
-        self._saved, self._failure = now, ""
-        self._rest_until = self._clock() + (self._clock() - began) / SHARE
+            if str(error) != failure:
+                log.warning("%s; %s", error, otherwise)
+            self._failures[otherwise] = str(error), self._clock() + RETRY
+            return False
+        self._failures.pop(otherwise, None)
+        return True
 
 
 def _made_by(merger: Merger) -> str:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Iterator
 
 from mapweave.hybridmap.ids import NodeId
 from mapweave.merge.pose_graph.links import Link
@@ -20,6 +20,10 @@ class Adjacency:
         self.touched: set[NodeId] = set()
         self._links: dict[int, Link] = {}
         self._at: dict[NodeId, dict[NodeId, Link]] = {}
+
+    def __iter__(self) -> Iterator[Link]:
+        """All links of the newest merged map."""
+        return iter(self._links.values())
 
     def follow(self, links: Iterable[Link]) -> list[Link]:
         """Take those of the next merged map, and no others.

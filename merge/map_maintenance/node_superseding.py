@@ -21,8 +21,8 @@ these: a superseded node answers no more, and is deleted in the end.
 from __future__ import annotations
 
 import heapq
-from collections.abc import Iterable, Set
-from dataclasses import replace
+from collections.abc import Iterable, Mapping, Set
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -47,12 +47,30 @@ from mapweave.merge.map_maintenance.adjacency import Adjacency
 from mapweave.merge.map_maintenance.comparisons import Comparisons
 from mapweave.merge.map_maintenance.node_age import is_older
 from mapweave.merge.map_maintenance.traversability import ForeignEdges, Traversability
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 NEAR = 0.5
 """Nodes nearer than this to each other stand in one place, as for routes, m."""
+
+
+@dataclass(frozen=True)
+class Superseding:
+    """What a superseder knows after a merge, so that another one can go on from there.
+
+    Attributes:
+        superseded: nodes, and why.
+        judged: nodes that were evaluated, as they were then.
+        linked: pairs of nodes with a link.
+        unsure: maps that may not be right.
+    """
+
+    superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
+    judged: Mapping[NodeId, Node] = field(default_factory=dict)
+    linked: Set[Pair] = frozenset()
+    unsure: Set[MapId] = frozenset()
 
 
 class NodeSuperseder:
@@ -76,6 +94,24 @@ class NodeSuperseder:
         self._foreign = ForeignEdges()
         self._blocking: dict[NodeId, NodeId] = {}
         self._unsure: Set[MapId] = frozenset()
+        self._linked: Set[Pair] = frozenset()
+
+    @property
+    def state(self) -> Superseding:
+        """What it knows after the newest merged map."""
+        linked = frozenset(link.pair for link in self._links)
+        return Superseding(dict(self._superseded), dict(self._nodes_seen), linked, frozenset(self._unsure))
+
+    def resume(self, state: Superseding) -> None:
+        """Go on from what another superseder knew, with the next merged map.
+
+        What is not as it was then is judged again: nodes that are others now or gone, and new links.
+
+        Args:
+            state: of merged maps of the same fleet.
+        """
+        self._superseded, self._nodes_seen = dict(state.superseded), dict(state.judged)
+        self._linked, self._unsure = state.linked, state.unsure
 
     def renewed(self, merged: MergedMap, unsure: Set[MapId] = frozenset()) -> MergedMap:
         """The same map with the nodes that are superseded.
@@ -89,7 +125,9 @@ class NodeSuperseder:
         nodes = self._changed(merged, differ)
         changed = {node for node, content in nodes.items() if self._nodes_seen.get(node) is not content}
         self._nodes_seen |= nodes
-        fresh = {node for link in self._links.follow(merged.links) for node in link.pair}
+        come = [link.pair for link in self._links.follow(merged.links)]
+        fresh = {node for pair in come if pair not in self._linked for node in pair}
+        self._linked = frozenset()
         fresh = changed | fresh & nodes.keys() | {node for node in nodes if node.map in differ}
         # A node that was written again is judged again, with those that it covers.
         for node, successor in tuple(self._superseded.items()):
@@ -133,6 +171,9 @@ class NodeSuperseder:
             # Known still, if it is in another component now.
             if merged.component_of(node) is None
         }
+        if not self._graphs:
+            # Of what it resumed from, some may be gone, too.
+            gone = {node for node in self._nodes_seen if merged.component_of(node) is None}
         for node in gone:
             self._nodes_seen.pop(node, None)
             self._blocking.pop(node, None)

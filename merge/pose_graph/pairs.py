@@ -47,6 +47,11 @@ class PairTable:
             if node < neighbour
         }
 
+    def overlaps_of(self, node: NodeId) -> dict[Pair, float]:
+        """Those of one node, likewise."""
+        by_node = self._overlaps.get(node, {})
+        return {(min(node, other), max(node, other)): value for other, value in by_node.items()}
+
     def forget(self, node: NodeId) -> None:
         """Drop a node's overlaps: it is gone, or is known better."""
         for neighbour in self._overlaps.pop(node, ()):

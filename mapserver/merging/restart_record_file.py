@@ -1,0 +1,153 @@
+"""The restart record as a file (see mapweave.mapserver.checksummed_file), so that a restarted server
+supersedes the nodes that it had superseded.
+
+header (JSON), agents (JSON), nodes, prints, what is known of each, superseded, links, overlaps, unsure maps
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId, check_name
+from mapweave.hybridmap.limits import MAX_LANDMARKS, MAX_NUMBER, MAX_POSITION
+from mapweave.hybridmap.superseded import Superseded
+from mapweave.mapserver.checksummed_file import seal, unseal
+from mapweave.mapserver.merging.restart_record import RestartRecord
+from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, RecentComparisons
+from mapweave.mapserver.merging.verification_cache_file import json_part, read_json
+from mapweave.merge.pose_graph.candidates import Pair
+
+MAGIC = b"mapweave superseded\n"
+FORMAT = 1
+JUDGED, COMPARED = 1, 2
+"""What is known of a node: bits."""
+
+
+def save(path: Path, record: RestartRecord, made_by: str) -> None:
+    """Write the file, or replace it at once.
+
+    Args:
+        path: of the file.
+        record: to be kept.
+        made_by: settings and version of what made it, in words.
+
+    Raises:
+        InvalidFile: the disk does not take it.
+    """
+    seal(path, MAGIC, _parts(record, made_by))
+
+
+def load(path: Path, made_by: str) -> RestartRecord:
+    """Read the file.
+
+    Args:
+        path: of the file.
+        made_by: as it was saved; what other versions had superseded is not used.
+
+    Raises:
+        InvalidFile: there is none, it is damaged, or it was made otherwise; with the reason.
+    """
+    parts = unseal(path, MAGIC)
+    try:
+        if read_json(next(parts)) != _header(made_by):
+            raise InvalidFile(f"{path}: of another version of this program, or with other settings")
+        return _read(parts)
+    except (ValueError, KeyError, TypeError, IndexError, EOFError, StopIteration, InvalidValue) as error:
+        raise InvalidFile(f"{path}: is no record of this version ({error})") from None
+
+
+def _header(made_by: str) -> dict[str, Any]:
+    return {"format": FORMAT, "made_by": made_by}
+
+
+def _parts(record: RestartRecord, made_by: str) -> Iterator[NDArray[Any]]:
+    recent = record.recent
+    nodes = sorted(recent.prints)
+    row = {node: k for k, node in enumerate(nodes)}
+    agents = sorted({node.agent for node in nodes} | {map_id.agent for map_id in record.unsure})
+    number = {agent: k for k, agent in enumerate(agents)}
+    yield json_part(_header(made_by))
+    yield json_part(agents)
+    yield np.array([(number[n.agent], n.epoch, n.number) for n in nodes], np.int64).reshape(-1, 3)
+    yield np.frombuffer(b"".join(recent.prints[n] for n in nodes), np.uint8).reshape(-1, PRINT_BYTES)
+    yield np.array(
+        [JUDGED * (n in record.judged) + COMPARED * (n in recent.compared) for n in nodes], np.uint8
+    )
+    table = sorted(record.superseded.items())
+    yield np.array([(row[n], row[s.by], s.found) for n, s in table], np.int64).reshape(-1, 3)
+    yield np.array([(s.distance, s.turn) for _, s in table], np.float64).reshape(-1, 2)
+    yield _rows(record.linked, row)
+    overlaps = {pair: v for pair, v in recent.overlaps.items() if pair[0] in row and pair[1] in row}
+    yield _rows(overlaps, row)
+    yield np.fromiter(overlaps.values(), np.float64)
+    yield np.array([(number[m.agent], m.epoch) for m in sorted(record.unsure)], np.int64).reshape(-1, 2)
+
+
+def _read(parts: Iterator[NDArray[Any]]) -> RestartRecord:
+    agents = [check_name(name) for name in read_json(next(parts))]
+    ids = _whole(next(parts), 3)
+    _in_range(ids, (len(agents), MAX_NUMBER + 1, MAX_NUMBER + 1))
+    nodes = [NodeId(agents[a], epoch, number) for a, epoch, number in ids.tolist()]
+    if not all(a < b for a, b in pairwise(nodes)):
+        raise InvalidValue("nodes are not in the order of ids")
+    prints = {n: one.tobytes() for n, one in zip(nodes, _of(next(parts), np.uint8, PRINT_BYTES), strict=True)}
+    known = dict(zip(nodes, _of(next(parts), np.uint8).tolist(), strict=True))
+    judged = frozenset(node for node, bits in known.items() if bits & JUDGED)
+    compared = frozenset(node for node, bits in known.items() if bits & COMPARED)
+    rows, poses = _whole(next(parts), 3), _of(next(parts), np.float64, 2)
+    _in_range(rows, (len(nodes), len(nodes), MAX_LANDMARKS + 1))
+    # Written so that NaN fails.
+    if not ((poses >= 0.0) & (poses <= (4.0 * MAX_POSITION, math.pi))).all():
+        raise InvalidValue("a distance or a turn is out of range")
+    superseded = {
+        nodes[a]: Superseded(nodes[by], found, *pose)
+        for (a, by, found), pose in zip(rows.tolist(), poses.tolist(), strict=True)
+    }
+    if any(s.by in superseded or n not in judged or s.by not in judged for n, s in superseded.items()):
+        raise InvalidValue("a node is superseded by one that is not active")
+    linked = frozenset(_pairs(next(parts), nodes))
+    pairs, values = _pairs(next(parts), nodes), _of(next(parts), np.float64)
+    if not ((values > 0.0) & np.isfinite(values)).all():
+        raise InvalidValue("an overlap is out of range")
+    overlaps = dict(zip(pairs, values.tolist(), strict=True))
+    maps = _whole(next(parts), 2)
+    _in_range(maps, (len(agents), MAX_NUMBER + 1))
+    unsure = frozenset(MapId(agents[a], epoch) for a, epoch in maps.tolist())
+    return RestartRecord(RecentComparisons(prints, compared, overlaps), judged, superseded, linked, unsure)
+
+
+def _rows(pairs: Iterable[Pair], row: Mapping[NodeId, int]) -> NDArray[np.int32]:
+    return np.fromiter((row[node] for pair in pairs for node in pair), np.int32).reshape(-1, 2)
+
+
+def _pairs(part: NDArray[Any], nodes: Sequence[NodeId]) -> list[Pair]:
+    """Pairs of nodes, the smaller id first: nodes are in the order of ids."""
+    rows = _of(part, np.int32, 2)
+    _in_range(rows, (len(nodes), len(nodes)))
+    if not (rows[:, 0] < rows[:, 1]).all():
+        raise InvalidValue("a pair is not in the order of ids")
+    return [(nodes[a], nodes[b]) for a, b in rows.tolist()]
+
+
+def _whole(part: NDArray[Any], columns: int) -> NDArray[Any]:
+    return _of(part, np.int64, columns)
+
+
+def _of(part: NDArray[Any], kind: type[np.generic], columns: int | None = None) -> NDArray[Any]:
+    """A part, if it is of this kind and shape."""
+    if part.dtype != kind or part.shape[1:] != (() if columns is None else (columns,)) or not part.ndim:
+        raise InvalidValue(f"an array of {part.shape} {part.dtype}")
+    return part
+
+
+def _in_range(rows: NDArray[Any], ends: Sequence[int]) -> None:
+    if not ((rows >= 0) & (rows < ends)).all():
+        raise InvalidValue("a number is out of range")
