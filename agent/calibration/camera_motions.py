@@ -46,6 +46,15 @@ class WheelTrack:
         """The same averaged over a time about each reading."""
         return WheelTrack(self.stamps, *self._mean(self.stamps, seconds))
 
+    def _covering(self, first: float, last: float) -> WheelTrack:
+        """Itself, or its readings from one time, s, to another where these are few, as of a single pair."""
+        begin, end = self.stamps.searchsorted([first, last], side="right").tolist()
+        begin = max(min(begin - 1, len(self.stamps) - 2), 0)
+        end = max(end + 1, begin + 2)
+        if 2 * (end - begin) > len(self.stamps):
+            return self
+        return WheelTrack(self.stamps[begin:end], self.way[begin:end], self.turn[begin:end])
+
     @cached_property
     def _steps(self) -> Array:
         """(K - 1,) s, from each reading to the next."""
@@ -61,14 +70,16 @@ class WheelTrack:
 
     def _mean(self, times: Array, width: float) -> Array:
         """(2, ...) way and turn, each averaged over a time, s, about each of (...) times."""
-        counted, areas, rates = self._integrals
+        part = self._covering(times.min() - 0.5 * width, times.max() + 0.5 * width)
+        counted, areas, rates = part._integrals
 
         def integral(t: Array) -> Array:
-            i = np.minimum(np.maximum(self.stamps.searchsorted(t, side="right") - 1, 0), len(self._steps) - 1)
-            after = t - self.stamps[i]
+            i = np.minimum(np.maximum(part.stamps.searchsorted(t, side="right") - 1, 0), len(part._steps) - 1)
+            after = t - part.stamps[i]
             return np.asarray(areas[:, i] + counted[:, i] * after + 0.5 * rates[:, i] * after**2)
 
-        return (integral(times + 0.5 * width) - integral(times - 0.5 * width)) / width
+        ends = integral(np.stack([times + 0.5 * width, times - 0.5 * width]))
+        return np.asarray((ends[:, 0] - ends[:, 1]) / width)
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,13 +105,16 @@ class CameraMotions:
         A step (tau, omega) turns y = R x + rho t into y + omega x y + rho tau.
         """
         apart = self.rotation @ np.swapaxes(other.rotation, -1, -2)
-        skew = 0.5 * (apart - np.swapaxes(apart, -1, -2))
-        sine = np.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], axis=-1)
-        size = np.linalg.norm(sine, axis=-1, keepdims=True)
-        cosine = 0.5 * (np.trace(apart, axis1=-2, axis2=-1)[..., None] - 1.0)
-        omega = sine * np.where(size > 1e-12, np.arctan2(size, cosine) / np.maximum(size, 1e-300), 1.0)
-        tau = self.translation - (apart @ other.translation[..., None])[..., 0]
-        return np.concatenate([tau, omega], axis=-1)
+        entries = apart.reshape(*apart.shape[:-2], 9)
+        sine = 0.5 * (entries.take(_POSITIVE, axis=-1) - entries.take(_NEGATIVE, axis=-1))
+        size = np.sqrt((sine * sine).sum(axis=-1, keepdims=True))
+        cosine = 0.5 * (entries[..., :1] + entries[..., 4:5] + entries[..., 8:] - 1.0)
+        step = np.empty((*sine.shape[:-1], 6))
+        step[..., :3] = self.translation - (apart @ other.translation[..., None])[..., 0]
+        step[..., 3:] = sine * np.where(
+            size > 1e-12, np.arctan2(size, cosine) / np.maximum(size, 1e-300), 1.0
+        )
+        return step
 
     def stepped(self, step: Array) -> CameraMotions:
         """These motions, each moved by a row of (N, 6) small steps; the inverse of `since`."""
@@ -115,15 +129,22 @@ class CameraMotions:
 
 def rotations(vectors: Array) -> Array:
     """(..., 3, 3) rotations by (..., 3) rotation vectors, rad: Rodrigues' formula."""
-    angle = np.linalg.norm(vectors, axis=-1)[..., None, None]
-    k = np.zeros((*vectors.shape[:-1], 3, 3))
-    x, y, z = vectors[..., 0], vectors[..., 1], vectors[..., 2]
-    k[..., 0, 1], k[..., 0, 2], k[..., 1, 0] = -z, y, z
-    k[..., 1, 2], k[..., 2, 0], k[..., 2, 1] = -x, -y, x
-    a = np.sinc(angle / np.pi)
-    b = 0.5 * np.sinc(angle / (2.0 * np.pi)) ** 2
-    return np.asarray(np.eye(3) + a * k + b * (k @ k))
+    square = (vectors * vectors).sum(axis=-1)[..., None, None]
+    angle = np.maximum(np.sqrt(square), 1e-20)
+    a, b = np.sin(angle) / angle, 0.5 * (np.sin(0.5 * angle) / (0.5 * angle)) ** 2
+    # The square of a skew matrix is v v' - |v|^2 I.
+    out = b * (vectors[..., :, None] * vectors[..., None, :])
+    out += (1.0 - b * square) * _IDENTITY
+    turned = a[..., 0] * vectors
+    for k, (row, column) in enumerate(((2, 1), (0, 2), (1, 0))):
+        out[..., row, column] += turned[..., k]
+        out[..., column, row] -= turned[..., k]
+    return np.asarray(out)
 
+
+_IDENTITY = np.eye(3)
+_POSITIVE, _NEGATIVE = np.array([7, 2, 3]), np.array([5, 6, 1])
+"""Entries of a skew matrix, row by row, that are x, y and z of its vector, and those that are negated."""
 
 ROBOT_FROM_LEVEL = np.array([[0.0, 0.0, 1.0], [-1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
 """Of a camera that looks straight ahead: x right, y down, z forward."""
@@ -170,14 +191,20 @@ def motions_over(vector: Array, ways: Array, turns: Array) -> CameraMotions:
     turns = math.exp(vector[p.TURN_SCALE]) * turns + vector[p.DRIFT] * ways
     heading = np.cumsum(turns, axis=1)
     middle = heading - 0.5 * turns
-    x, y, turned = (ways * np.cos(middle)).sum(1), (ways * np.sin(middle)).sum(1), heading[:, -1]
     mount, centre = _robot_from_camera(vector)
-    back = rotations(np.stack([0.0 * turned, 0.0 * turned, -turned], axis=1))
-    moved = np.stack([x, y, 0.0 * x], axis=1)
-    rotation = mount.T @ back @ mount
-    translation = ((back @ (centre - moved)[..., None])[..., 0] - centre) @ mount
-    floor = mount.T @ np.array([0.0, 0.0, -1.0]) * math.exp(-vector[p.HEIGHT])
-    return CameraMotions(rotation, translation, np.broadcast_to(floor, (len(ways), 3)).copy())
+    x, y = centre[0] - (ways * np.cos(middle)).sum(1), centre[1] - (ways * np.sin(middle)).sum(1)
+    cosine, sine = np.cos(heading[:, -1]), np.sin(heading[:, -1])
+    # The robot turns about the up of the camera: its rows of the mount stay, the others turn into each other.
+    ahead, left, up = mount
+    turning = ahead[:, None] * left
+    turning = turning - turning.T
+    standing = up[:, None] * up
+    rotation = standing + cosine[:, None, None] * (_IDENTITY - standing) + sine[:, None, None] * turning
+    moved_x, moved_y = cosine * x + sine * y - centre[0], cosine * y - sine * x - centre[1]
+    translation = moved_x[:, None] * ahead + moved_y[:, None] * left
+    floor = np.empty((len(ways), 3))
+    floor[:] = -math.exp(-vector[p.HEIGHT]) * up
+    return CameraMotions(rotation, translation, floor)
 
 
 def slip_steps(vector: Array) -> Array:

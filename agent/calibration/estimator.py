@@ -90,6 +90,7 @@ class Estimator:
             keep_wheels: hold the wheels' scale to a percent instead of the height.
         """
         self.declared = declared.vector
+        self._stale = STALE * useful(self.declared)
         self.vector = self.declared.copy()
         prior = np.array([PRIOR_SIGMAS[p] for p in P])
         if keep_wheels:
@@ -127,7 +128,7 @@ class Estimator:
 
     def stale(self, index: int) -> bool:
         """Whether a pair was reduced with parameters, or a sigma of tracks, that differ from the present."""
-        moved = np.abs(self.vector - self.reduced_at[index]) > STALE * useful(self.declared)
+        moved = np.abs(self.vector - self.reduced_at[index]) > self._stale
         return bool(moved.any()) or abs(math.log(self._sigma / self._reduced_sigmas[index])) > STALE
 
     def refresh(self, index: int, wheels: WheelTrack) -> None:

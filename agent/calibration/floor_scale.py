@@ -16,6 +16,8 @@ from mapweave.hybridmap.pose import Array
 
 FLOOR_WIDTH = 0.1
 """Of the kernel with which the floor is first looked for among logarithms of depth ratios."""
+CENTRES_APART = 0.02
+"""Ratios about which it is looked for, as logarithms: so far apart, to 0.6 either way."""
 PLAUSIBLE = 0.15
 """Standard deviation of the logarithm of wheel scale beforehand."""
 FLOOR_STEPS = 20
@@ -77,11 +79,12 @@ def floor_scale(
     if len(logs) < LEAST_FLOOR or len(np.unique(pairs // block)) < LEAST_BLOCKS:
         return None
     sigmas = np.hypot(sigmas, FLOOR_FLAT)
-    centres = np.arange(-0.6, 0.6, 0.02)
-    density = _kernel(logs - centres[:, None], sigmas).sum(1)
-    below = _kernel(logs - (centres[:, None] - 4.0 * FLOOR_WIDTH), sigmas).sum(1)
+    apart = round(4.0 * FLOOR_WIDTH / CENTRES_APART)
+    centres: Array = CENTRES_APART * np.arange(-30.0 - apart, 30.0)
+    density = _density(logs, sigmas, centres)
+    centres, rise = centres[apart:], density[apart:] - density[:-apart]
     plausible = np.exp(-0.5 * (centres / PLAUSIBLE) ** 2)
-    mode = float(centres[int(((density - below) * plausible).argmax())])
+    mode = float(centres[int((rise * plausible).argmax())])
     numbers, own = np.unique(pairs, return_inverse=True)
     slopes, slope = np.zeros(len(numbers)), SLOPE
     floor, scale = 0.5, 1.0
@@ -92,13 +95,14 @@ def floor_scale(
         floor, pull = float(share.mean()), share / spread**2
         square = (share * (off / sigmas) ** 2).sum() / max(share.sum(), 1e-9)
         # The mode is common, each pair has a slope: its row of the normal equations is eliminated.
-        level, cross, square_sum = (np.bincount(own, pull * flatness**k) for k in range(3))
-        steep = square_sum + 1.0 / slope**2
+        flat = pull * flatness
+        level, cross = np.bincount(own, pull), np.bincount(own, flat)
+        steep = np.bincount(own, flat * flatness) + 1.0 / slope**2
         off = logs - mode
-        rest, tilt = np.bincount(own, pull * off), np.bincount(own, pull * flatness * off)
+        rest, tilt = np.bincount(own, pull * off), np.bincount(own, flat * off)
         pulls, stiff = rest - cross * tilt / steep, level - cross**2 / steep
-        mode += float(pulls.sum() / max(stiff.sum(), 1e-9))
-        slopes = (np.bincount(own, pull * flatness * (logs - mode))) / steep
+        more = float(pulls.sum() / max(stiff.sum(), 1e-9))
+        mode, slopes = mode + more, (tilt - more * cross) / steep
         slope = math.sqrt(
             ((slopes**2 + 1.0 / steep).sum() + SLOPE_PAIRS * SLOPE**2) / (len(slopes) + SLOPE_PAIRS)
         )
@@ -116,7 +120,9 @@ def floor_scale(
     return FloorScale(mode, max(float(np.linalg.norm(blocks)) / stiffness, FLOOR_SIGMA), tracks)
 
 
-def _kernel(off: Array, sigmas: Array) -> Array:
-    """Weights of ratios at a distance from the mode."""
+def _density(logs: Array, sigmas: Array, centres: Array) -> Array:
+    """(M,) how dense (N,) ratios are about (M,) centres, each spread by its sigma and the kernel."""
     variance = FLOOR_WIDTH**2 + sigmas**2
-    return np.asarray(np.exp(-0.5 * off**2 / variance) / np.sqrt(variance))
+    off = np.square(logs - centres[:, None])
+    off *= -0.5 / variance
+    return np.asarray(np.exp(off, out=off) @ (1.0 / np.sqrt(variance)))

@@ -30,6 +30,8 @@ MARGIN_PX = 4
 BLUR_PX = 0.8
 SEARCHED = np.arange(-0.3, 0.31, 0.05)
 """Logarithms of inverse depth over the floor's with which a tile is tried first,"""
+EVERY_OTHER = slice(None, None, 2)
+"""of its pixels,"""
 STEPS = 3
 """and Gauss-Newton steps from the best."""
 CONVERGED = 0.02
@@ -62,13 +64,15 @@ class FloorTiles:
         columns = np.arange(MARGIN_PX, camera.width - MARGIN_PX - WIDTH_PX, WIDTH_PX)
         corner = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 1, 2)
         y, x = np.mgrid[:HEIGHT_PX, :WIDTH_PX]
-        self._pixels = corner + np.stack([x, y], axis=-1).reshape(1, -1, 2)
-        raw = self._pixels.reshape(-1, 2).astype(np.float64)
+        pixels = corner + np.stack([x, y], axis=-1).reshape(1, -1, 2)
+        raw = pixels.reshape(-1, 2).astype(np.float64)
         ideal = lens.undistort(raw)
         self.distorted = not np.array_equal(raw, ideal)
-        rays = np.ones((len(ideal), 3))
-        rays[:, :2] = (ideal - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
-        self._rays = rays.reshape(*self._pixels.shape[:2], 3)
+        # Row by row in a part of an image, of all pixels of all tiles.
+        self._places = pixels[..., 0] + (pixels[..., 1] - self.top) * camera.width
+        rays = np.ones((3, *self._places.shape))
+        rays[:2] = ((ideal - [camera.cx, camera.cy]) / [camera.fx, camera.fy]).T.reshape(2, *rays.shape[1:])
+        self._rays, self._middle = rays, np.ascontiguousarray(rays.mean(axis=2).T)
 
     def part(self, image: NDArray[np.uint8]) -> NDArray[np.float32]:
         """What matters of an image, (H, W) grey: below the middle row, a little blurred."""
@@ -87,32 +91,32 @@ class FloorTiles:
             after: part of the second.
             at: one motion between them.
         """
-        middle = self._rays.mean(axis=1)
+        middle = self._middle
         steepness = middle @ (at.floor / np.linalg.norm(at.floor))
         ahead = (steepness > FLOOR_STEEPNESS) & (np.abs(middle[:, 0]) < ABREAST * steepness)
         chosen = np.flatnonzero(ahead)
         size = (self.camera.height - self.top, self.camera.width)
         if not before.shape == after.shape == size or not len(chosen):
             return FloorMatches.none()
-        column, row = np.moveaxis(self._pixels[chosen], -1, 0)
-        template = before[row - self.top, column]
+        template = before.ravel().take(self._places[chosen])
         # Texture along the way counts: gradients down the image.
         energy = np.square(np.diff(template.reshape(-1, HEIGHT_PX, WIDTH_PX), axis=1)).sum((1, 2))
         best = np.sort(np.argsort(-energy, kind="stable")[:MOST])
         chosen, template = chosen[best], template[best]
-        warp = _Warp(self, self._rays[chosen], at)
-        template = template - template.mean(axis=1, keepdims=True)
-        logs = _searched(template, after, warp)
+        rays = self._rays[:, chosen]
+        warp = _Warp(self, rays, at)
+        template = (template - template.mean(axis=1, keepdims=True)).astype(np.float64)
+        logs = _searched(template, after, _Warp(self, rays[..., EVERY_OTHER], at))
         step = sigma = np.zeros(len(logs))
         for _ in range(STEPS):
             nearer, farther = (warp.values(after, logs + off) for off in (STEP, -STEP))
             shown, slope = 0.5 * (nearer + farther), (nearer - farther) / (2.0 * STEP)
-            gain = ((template * shown).sum(1) / np.maximum((shown**2).sum(1), 1e-6))[:, None]
+            gain = (_dot(template, shown) / np.maximum(_dot(shown, shown), 1e-6))[:, None]
             error, slope = gain * shown - template, gain * slope
-            stiffness = (slope**2).sum(1) + 1e-6
-            step = np.clip(-(slope * error).sum(1) / stiffness, -0.05, 0.05)
+            stiffness = _dot(slope, slope) + 1e-6
+            step = np.clip(-_dot(slope, error) / stiffness, -0.05, 0.05)
             logs = np.clip(logs + step, -1.0, 1.0)
-            sigma = np.sqrt((error**2).sum(1) / (INDEPENDENT * error.shape[1] * stiffness))
+            sigma = np.sqrt(_dot(error, error) / (INDEPENDENT * error.shape[1] * stiffness))
         sigma = np.minimum(sigma, 1.0)
         column, row = warp.pixels(logs)
         inside = ((column > 2) & (column < self.camera.width - 3)).all(axis=1)
@@ -128,22 +132,29 @@ class _Warp:
     """Where pixels of tiles are in the second image, by the logarithms of their inverse depths."""
 
     def __init__(self, tiles: FloorTiles, rays: Array, at: CameraMotions) -> None:
+        """Take (3, N, P) rays of the tiles' pixels."""
         self._tiles = tiles
-        self._turned = np.moveaxis(rays @ at.rotation.T, -1, 0)
-        self._floor = rays @ at.floor
+        flat = rays.reshape(3, -1)
+        self._turned = (at.rotation @ flat).reshape(rays.shape)
+        self._floor = (at.floor @ flat).reshape(rays.shape[1:])
         self._translation = at.translation
 
-    def pixels(self, logs: Array, part: slice = slice(None)) -> tuple[Array, Array]:
+    def pixels(self, logs: Array) -> tuple[Array, Array]:
         """Columns and rows (N, P) px in the real image."""
         tiles, camera = self._tiles, self._tiles.camera
-        rho = self._floor[:, part] * np.exp(logs)[:, None]
-        x, y, z = (a[:, part] + rho * t for a, t in zip(self._turned, self._translation, strict=True))
-        focal = 1.0 / np.maximum(z, 0.05)
-        column, row = camera.cx + camera.fx * x * focal, camera.cy + camera.fy * y * focal
+        rho = self._floor * np.exp(logs)[:, None]
+        x, y, z = (np.multiply(rho, t) for t in self._translation)
+        for moved, turned in zip((x, y, z), self._turned, strict=True):
+            moved += turned
+        focal = np.divide(1.0, np.maximum(z, 0.05, out=z), out=z)
+        for moved, length, centre in ((x, camera.fx, camera.cx), (y, camera.fy, camera.cy)):
+            moved *= focal
+            moved *= length
+            moved += centre
         if tiles.distorted:
-            there = tiles.lens.distort(np.column_stack([column.ravel(), row.ravel()]))
-            column, row = there.T.reshape(2, *column.shape)
-        return column, row
+            there = tiles.lens.distort(np.column_stack([x.ravel(), y.ravel()]))
+            x, y = there.T.reshape(2, *x.shape)
+        return x, y
 
     def middle(self, logs: Array) -> Array:
         """(N, 2) normalised coordinates of the tiles' middles."""
@@ -151,25 +162,27 @@ class _Warp:
         y = turned.T + (floor * np.exp(logs))[:, None] * self._translation
         return np.asarray(y[:, :2] / np.maximum(y[:, 2:], 0.05))
 
-    def values(self, after: NDArray[np.float32], logs: Array, part: slice = slice(None)) -> Array:
+    def values(self, after: NDArray[np.float32], logs: Array) -> Array:
         """(N, P) of the second image there, less each tile's mean."""
-        column, row = self.pixels(logs, part)
-        there = (column.astype(np.float32), (row - self._tiles.top).astype(np.float32))
-        values = cv2.remap(after, *there, cv2.INTER_LINEAR)
+        column, row = self.pixels(logs)
+        row -= self._tiles.top
+        values = cv2.remap(after, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR)
         return np.asarray(values - values.mean(axis=1, keepdims=True), np.float64)
+
+
+def _dot(one: Array, other: Array) -> Array:
+    """(N,) products of rows (N, P)."""
+    return np.asarray(np.einsum("np,np->n", one, other))
 
 
 def _correlation(one: Array, other: Array) -> Array:
     """(N,) of rows that have no mean."""
-    size = np.sqrt((one**2).sum(axis=1) * (other**2).sum(axis=1))
-    return np.asarray((one * other).sum(axis=1) / np.maximum(size, 1e-6))
+    size = np.sqrt(_dot(one, one) * _dot(other, other))
+    return np.asarray(_dot(one, other) / np.maximum(size, 1e-6))
 
 
 def _searched(template: Array, after: NDArray[np.float32], warp: _Warp) -> Array:
-    """(N,) best of the logarithms that are tried, by every other pixel."""
-    part = slice(None, None, 2)
-    tried = [
-        _correlation(template[:, part], warp.values(after, np.full(len(template), log), part))
-        for log in SEARCHED
-    ]
+    """(N,) best of the logarithms that are tried, by every other pixel: a warp of these."""
+    part = np.ascontiguousarray(template[:, EVERY_OTHER])
+    tried = [_correlation(part, warp.values(after, np.full(len(part), log))) for log in SEARCHED]
     return np.asarray(SEARCHED[np.stack(tried).argmax(axis=0)])

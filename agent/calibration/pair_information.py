@@ -8,9 +8,13 @@ Marchionni and Oriolo (Simultaneous calibration of odometry and sensor parameter
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field, replace
+from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapweave.agent.arrays import median
 from mapweave.agent.calibration.camera_motions import CameraMotions
@@ -29,7 +33,8 @@ linearised about has one spread all the same: near the focus of expansion depths
 Jacobian passes for information."""
 NO_PRIOR = 1e6
 """Spread of inverse depths of which nothing is known, 1/m."""
-ITERATIONS = 3
+STEPS = 2
+"""Of Gauss and Newton, from the motion by the wheels to that which a pair is linearised about."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,6 +74,17 @@ class ImagePair:
     before: Array
     after: Array
     floor: FloorMatches = field(default_factory=FloorMatches.none)
+
+    @cached_property
+    def rows(self) -> tuple[Array, Array, Array]:
+        """What a reduction begins with: (3, N) rays of the first image, (2, N) `after`, (6, N) `_field`."""
+        return _rays(self.before), np.ascontiguousarray(self.after.T), _field(self.before)
+
+    @cached_property
+    def floor_rows(self) -> tuple[Array, Array]:
+        """Of tracks and then of the floor: (3, N + K) rays, (2, N + K) coordinates in the second image."""
+        before = np.concatenate([self.before, self.floor.before])
+        return _rays(before), np.concatenate([self.after, self.floor.after]).T.copy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,46 +145,83 @@ def reduce_pair(
         depth: mean and standard deviation of inverse depths beforehand, 1/m.
         floor_sigma: of a track on the floor, which has less texture than what stands on it.
     """
-    x = np.column_stack([pair.before, np.ones(len(pair.before))])
+    rays, after, shapes = pair.rows
     prior = np.linalg.inv(noise)
-    at = predicted[None]
+    at = predicted
+    for k in range(STEPS):
+        seen = _linearised(rays, after, at, sigma, depth, shapes)
+        pull = seen.vector - prior @ at.since(predicted) if k else seen.vector
+        at = at.stepped(np.asarray(np.linalg.solve(seen.matrix + prior, pull), np.float64))
+    seen = _linearised(rays, after, at, sigma, depth, shapes)
+    depths = seen.inverse_depths[seen.agreeing]
+    typical = (median(depths), float(depths.std())) if len(depths) > 5 else depth
+    floor = floor_ratios(pair, at, floor_sigma)
+    return PairInformation(
+        at, seen.matrix, seen.vector, len(depths), typical, 1.4826 * median(seen.across), floor
+    )
+
+
+class _Linearised(NamedTuple):
+    """Tracks linearised about a motion.
+
+    Attributes:
+        matrix: (6, 6) as of `PairInformation`.
+        vector: (6,) likewise.
+        inverse_depths: (N,) 1/m.
+        agreeing: (N,) whether a track agrees with the motion.
+        across: (N,) how far tracks are from the lines on which their points can lie.
+    """
+
+    matrix: Array
+    vector: Array
+    inverse_depths: Array
+    agreeing: NDArray[np.bool_]
+    across: Array
+
+
+def _linearised(
+    rays: Array, after: Array, at: CameraMotions, sigma: float, depth: tuple[float, float], shapes: Array
+) -> _Linearised:
+    """Linearise about a motion. A row holds one number of all tracks: a few long rows are computed fastest.
+
+    Args:
+        rays: (3, N) as `_rays`, of the first image.
+        after: (2, N) normalised coordinates in the second.
+        at: one motion.
+        sigma: standard deviation of a track.
+        depth: mean and standard deviation of inverse depths beforehand, 1/m.
+        shapes: (6, N) as `_field`.
+    """
     mean, spread = depth
-    shapes = _field(pair.before)
-    columns = 6 + shapes.shape[1]
-    for iteration in range(ITERATIONS):
-        step_to_at = at.since(predicted[None])[0]
-        turned = x @ at.rotation[0].T
-        rho = _inverse_depths(turned, at.translation[0], pair.after, sigma, (mean, spread))
-        y = turned + rho[:, None] * at.translation[0]
-        good = y[:, 2] > 0.05
-        z = np.where(good, y[:, 2], 1.0)
-        seen = y[:, :2] / z[:, None]
-        slope = _projected(at.translation[0], seen, z)
-        length = np.maximum(np.linalg.norm(slope, axis=1, keepdims=True), 1e-12)
-        residual = pair.after - seen - slope * (mean - rho)[:, None]
-        jacobian = np.concatenate(
-            [_jacobian(seen, z, rho, slope / length, mean), slope[:, :, None] * shapes[:, None]], axis=2
-        )
-        # (sigma^2 I + spread^2 g g')^-1 by Sherman and Morrison.
-        gain = 1.0 / ((sigma / spread) ** 2 + (slope**2).sum(1))
-        along_r = (slope * residual).sum(1)
-        along_j = np.einsum("ni,nij->nj", slope, jacobian)
-        chi2 = ((residual**2).sum(1) - gain * along_r**2) / sigma**2
-        weight = good / (1.0 + chi2 / CAUCHY**2) / sigma**2
-        left = (weight[:, None, None] * jacobian).reshape(-1, columns)
-        matrix = left.T @ jacobian.reshape(-1, columns) - ((weight * gain)[:, None] * along_j).T @ along_j
-        vector = left.T @ residual.reshape(-1) - along_j.T @ (weight * gain * along_r)
-        matrix, vector = _without_field(matrix, vector, FREE_DEPTH * spread)
-        step = np.linalg.solve(matrix + prior, vector - prior @ step_to_at)
-        if iteration < ITERATIONS - 1:
-            at = at.stepped(step[None])
-    agreeing = good & (chi2 < 9.0)
-    depths = rho[agreeing]
-    typical = (median(depths), float(depths.std())) if agreeing.sum() > 5 else depth
-    across = np.abs(residual[:, 0] * slope[:, 1] - residual[:, 1] * slope[:, 0])
-    scatter = 1.4826 * median(across / length[:, 0])
-    floor = floor_ratios(pair, at[0], floor_sigma)
-    return PairInformation(at[0], matrix, vector, int(agreeing.sum()), typical, scatter, floor)
+    translation = at.translation
+    turned = at.rotation @ rays
+    rho = _inverse_depths(turned, translation, after, sigma, depth)
+    y = turned + translation[:, None] * rho
+    good = y[2] > 0.05
+    z = np.where(good, y[2], 1.0)
+    seen = y[:2] / z
+    slope = _projected(translation, seen, z)
+    square = slope[0] * slope[0] + slope[1] * slope[1]
+    length = np.maximum(np.sqrt(square), 1e-12)
+    off = mean - rho
+    # By the field of depths, by the step, and the residual.
+    columns = np.empty((len(shapes) + 7, 2, rays.shape[1]))
+    np.multiply(shapes[:, None], slope, out=columns[: len(shapes)])
+    _derive(seen, z, rho, slope / length, off, columns[len(shapes) : -1])
+    jacobian, residual = columns[:-1], columns[-1]
+    np.subtract(after - seen, slope * off, out=residual)
+    # (sigma^2 I + spread^2 g g')^-1 by Sherman and Morrison.
+    gain = 1.0 / ((sigma / spread) ** 2 + square)
+    along = slope[0] * residual[0] + slope[1] * residual[1]
+    squares = residual[0] * residual[0] + residual[1] * residual[1]
+    chi2 = (squares - gain * along * along) / sigma**2
+    weight = good / (1.0 + chi2 / CAUCHY**2) / sigma**2
+    inside = jacobian[:, 0] * slope[0] + jacobian[:, 1] * slope[1]
+    left = weight * (jacobian - inside[:, None] * (gain * slope))
+    normal = left.reshape(len(left), -1) @ columns.reshape(len(columns), -1).T
+    normal = _without_field(normal, FREE_DEPTH * spread)
+    across = np.abs(residual[0] * slope[1] - residual[1] * slope[0]) / length
+    return _Linearised(normal[:, :6], normal[:, 6], rho, good & (chi2 < 9.0), across)
 
 
 def with_floor(information: PairInformation, pair: ImagePair, floor_sigma: float) -> PairInformation:
@@ -184,28 +237,36 @@ def floor_ratios(pair: ImagePair, at: CameraMotions, track_sigma: float) -> Floo
         at: one motion.
         track_sigma: standard deviation of a track.
     """
-    before = np.concatenate([pair.before, pair.floor.before])
-    after = np.concatenate([pair.after, pair.floor.after])
-    sigma = np.concatenate([np.full(len(pair.before), track_sigma), pair.floor.sigmas])
-    x = np.column_stack([before, np.ones(len(before))])
-    turned = x @ at.rotation.T
+    rays, after = pair.floor_rows
+    floor_depth = at.floor @ rays
+    steepness = floor_depth / math.sqrt(at.floor @ at.floor)
+    steep = np.flatnonzero(steepness > FLOOR_STEEPNESS)
+    steepness, floor_depth = steepness[steep], floor_depth[steep]
+    rays, after = rays.take(steep, axis=1), after.take(steep, axis=1)
+    sigma = np.concatenate([np.full(len(pair.before), track_sigma), pair.floor.sigmas])[steep]
+    turned = at.rotation @ rays
     # What is typical in this scene must not draw the floor to it.
     inverse_depth = _inverse_depths(turned, at.translation, after, track_sigma, (0.0, NO_PRIOR))
-    floor_depth = x @ at.floor
-    steepness = floor_depth / np.linalg.norm(at.floor)
-    steep = steepness > FLOOR_STEEPNESS
-    floor_depth = np.where(steep, floor_depth, 1.0)
-    y = turned + floor_depth[:, None] * at.translation
-    z = np.maximum(y[:, 2], 0.05)
-    parallax = np.linalg.norm(_projected(at.translation, y[:, :2] / z[:, None], z), axis=1) * floor_depth
-    precise = steep & (sigma < LEAST_FLOOR_SHARE * parallax)
-    logs = np.log(np.clip(inverse_depth[precise] / floor_depth[precise], 0.05, 20.0))
+    y = turned + at.translation[:, None] * floor_depth
+    z = np.maximum(y[2], 0.05)
+    slope = _projected(at.translation, y[:2] / z, z)
+    parallax = np.sqrt(slope[0] * slope[0] + slope[1] * slope[1]) * floor_depth
+    precise = sigma < LEAST_FLOOR_SHARE * parallax
+    nearness = inverse_depth[precise] / floor_depth[precise]
+    logs = np.log(np.minimum(np.maximum(nearness, 0.05), 20.0))
     return FloorRatios(logs, sigma[precise] / parallax[precise], 1.0 / steepness[precise])
 
 
+def _rays(coordinates: Array) -> Array:
+    """(3, N) points (u, v, 1), of (N, 2) normalised coordinates."""
+    rays = np.ones((3, len(coordinates)))
+    rays[:2] = coordinates.T
+    return rays
+
+
 def _projected(direction: Array, seen: Array, z: Array) -> Array:
-    """(N, 2) how points seen at (N, 2), at depths (N,), move in the image along a direction (3,)."""
-    moved: Array = (direction[:2] - seen * direction[2]) / z[:, None]
+    """(2, N) how points seen at (2, N), at depths (N,), move in the image along a direction (3,)."""
+    moved: Array = (direction[:2, None] - seen * direction[2]) / z
     return moved
 
 
@@ -215,44 +276,67 @@ def _inverse_depths(
     """(N,) most likely inverse depths, not below zero: two equations linear in each, and a prior.
 
     From y = a + rho t: (a_z + rho t_z) (u, v) = (a_x + rho t_x, a_y + rho t_y).
+
+    Args:
+        turned: (3, N) a.
+        translation: (3,) t, m.
+        after: (2, N) u and v.
+        sigma: standard deviation of a track.
+        depth: mean and standard deviation beforehand, 1/m.
     """
     mean, spread = depth
-    slope = translation[:2] - after * translation[2]
-    constant = after * turned[:, 2:] - turned[:, :2]
-    scale = np.maximum(turned[:, 2], 0.05) ** 2 * sigma**2
-    information = (slope**2).sum(1) / scale + 1.0 / spread**2
-    best: Array = ((slope * constant).sum(1) / scale + mean / spread**2) / information
+    slope = translation[:2, None] - after * translation[2]
+    constant = after * turned[2] - turned[:2]
+    scale = np.maximum(turned[2], 0.05) ** 2 * sigma**2
+    information = (slope[0] * slope[0] + slope[1] * slope[1]) / scale + 1.0 / spread**2
+    measured = (slope[0] * constant[0] + slope[1] * constant[1]) / scale
+    best: Array = (measured + mean / spread**2) / information
     return np.maximum(best, 0.0)
 
 
-def _jacobian(seen: Array, z: Array, rho: Array, along: Array, mean: float) -> Array:
-    """(N, 2, 6) of the predicted coordinates with respect to a step; (N, 2) `along` each point's line.
+def _derive(seen: Array, z: Array, rho: Array, along: Array, off: Array, out: Array) -> None:
+    """Derivatives of the predicted coordinates with respect to a step.
 
     A depth is estimated from the very residual along the line on which the point may lie. So along that line
     the depth known beforehand takes its place: a product of one noise with itself has a mean.
+
+    Args:
+        seen: (2, N) predicted coordinates.
+        z: (N,) depths in the second camera over those in the first.
+        rho: (N,) inverse depths, 1/m.
+        along: (2, N) direction of each point's line.
+        off: (N,) inverse depth known beforehand less that, 1/m.
+        out: (6, 2, N), is written.
     """
-    u, v = seen.T
-    jacobian = np.zeros((len(seen), 2, 6))
-    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
-    jacobian[:, :, 2] = -seen
-    shared = (mean - rho)[:, None] * np.einsum("ni,nij->nj", along, jacobian[:, :, :3])
-    jacobian[:, :, :3] *= rho[:, None, None]
-    jacobian[:, :, :3] += along[:, :, None] * shared[:, None]
-    jacobian[:, :, :3] /= z[:, None, None]
+    u, v = seen
+    # With (rho I + off a a') / z a shift of the image becomes what a shift of the camera does.
+    own, lent = rho / z, (off / z) * along
+    np.multiply(lent[0], along, out=out[0])
+    np.multiply(lent[1], along, out=out[1])
+    out[0, 0] += own
+    out[1, 1] += own
+    out[2] = -(out[0] * u + out[1] * v)
     # omega x y, projected; y / z = (u, v, 1).
-    jacobian[:, 0, 3], jacobian[:, 0, 4], jacobian[:, 0, 5] = -u * v, 1.0 + u * u, -v
-    jacobian[:, 1, 3], jacobian[:, 1, 4], jacobian[:, 1, 5] = -1.0 - v * v, u * v, u
-    return jacobian
+    both = u * v
+    out[3, 0], out[3, 1] = -both, -1.0 - v * v
+    out[4, 0], out[4, 1] = 1.0 + u * u, both
+    out[5, 0], out[5, 1] = -v, u
 
 
 def _field(before: Array) -> Array:
-    """(N, 6) shapes of which the inverse depths of a scene are made: a polynomial over the image."""
+    """(6, N) shapes of which the inverse depths of a scene are made: a polynomial over the image."""
     u, v = (before / np.abs(before).max(axis=0)).T
-    return np.column_stack([1.0 + 0.0 * u, u, v, u * u, u * v, v * v])
+    return np.stack([np.ones(len(before)), u, v, u * u, u * v, v * v])
 
 
-def _without_field(matrix: Array, vector: Array, spread: float) -> tuple[Array, Array]:
-    """Eliminate the field of depths: what is assumed of depths must tell nothing of the way."""
-    inner = matrix[6:, 6:] + np.eye(len(matrix) - 6) / spread**2
-    cross = np.linalg.solve(inner, np.column_stack([matrix[6:, :6], vector[6:]]))
-    return matrix[:6, :6] - matrix[:6, 6:] @ cross[:, :6], vector[:6] - matrix[:6, 6:] @ cross[:, 6]
+def _without_field(normal: Array, spread: float) -> Array:
+    """(6, 7) normal equations of a step without those of the field of depths, which is eliminated.
+
+    What is assumed of depths must tell nothing of the way.
+
+    Args:
+        normal: (12, 13) of field and step, with their right side.
+        spread: of the field, 1/m.
+    """
+    inner = normal[:6, :6] + np.eye(6) / spread**2
+    return np.asarray(normal[6:, 6:] - normal[6:, :6] @ np.linalg.solve(inner, normal[:6, 6:]))

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import math
 
+import cv2
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
@@ -113,3 +115,33 @@ def test_a_smooth_track_goes_as_far():
     smooth = noisy.smooth(0.5)
     assert abs((smooth.way[80] - smooth.way[20]) - (noisy.way[80] - noisy.way[20])) < 0.01
     assert np.allclose(smooth.turn[10:90], noisy.turn[10:90])
+
+
+@pytest.mark.parametrize("size", [0.0, 1e-9, 0.01, 1.0, 3.0])
+def test_rotations_are_those_of_opencv(size: float):
+    for vector in size * np.random.default_rng(1).normal(size=(20, 3)):
+        assert np.allclose(rotations(vector), cv2.Rodrigues(vector)[0], atol=1e-12)
+
+
+def test_a_single_pair_asks_for_the_readings_around_it():
+    """Against averages of samples, within what was counted and beyond; and as among pairs of a drive."""
+    rng = np.random.default_rng(2)
+    stamps = np.cumsum(rng.choice([0.08, 0.1, 0.1, 0.1, 0.3], 300))
+    wheels = WheelTrack(stamps, np.cumsum(rng.normal(0.02, 0.01, 300)), np.cumsum(rng.normal(0.0, 0.03, 300)))
+    first = np.array([stamps[0] - 0.4, *rng.uniform(stamps[0], stamps[-1], 40), stamps[-1] - 0.3])
+    last = first + rng.uniform(0.2, 1.2, len(first))
+    together = wheels.between(first, last)
+    width, spread = float(np.median(np.diff(stamps))), np.linspace(-0.5, 0.5, 20001)
+
+    def counted(column: np.ndarray, time: float) -> float:
+        """A count averaged about a time; it goes on at both ends as it did."""
+        ends = [stamps[0] - 9.0, *stamps, stamps[-1] + 9.0]
+        rates = np.diff(column)[[0, -1]] / np.diff(stamps)[[0, -1]]
+        counts = [column[0] - 9.0 * rates[0], *column, column[-1] + 9.0 * rates[1]]
+        return float(np.interp(time + width * spread, ends, counts).mean())
+
+    for k, (begin, end) in enumerate(zip(first, last, strict=True)):
+        alone = wheels.between(first[k : k + 1], last[k : k + 1])
+        for column, parts, among_all in zip((wheels.way, wheels.turn), alone, together, strict=True):
+            assert np.allclose(parts[0], among_all[k], rtol=0.0, atol=1e-12)
+            assert parts.sum() == pytest.approx(counted(column, end) - counted(column, begin), abs=1e-5)
