@@ -50,6 +50,7 @@ class BlindZone:
     def __init__(self, description: RobotDescription) -> None:
         """Remember nothing."""
         self._bearings = np.array(description.ranger_bearings)
+        self._directions = np.stack([np.cos(self._bearings), np.sin(self._bearings)], axis=1)
         self._radius, self._reach = description.radius, description.ranger_reach
         self._odom_from_robot = Pose2()
         self._points: Array = np.zeros((0, 2))
@@ -68,19 +69,19 @@ class BlindZone:
             return observation
         remembered = self._odom_from_robot.inverse().apply(self._points)
         distances, angles = np.hypot(*remembered.T), np.arctan2(remembered[:, 1], remembered[:, 0])
-        aside = np.abs((angles - self._bearings[:, None] + math.pi) % math.tau - math.pi)
+        aside = np.abs(_within_turn(angles - self._bearings[:, None] + math.pi) - math.pi)
         measured = np.isfinite(readings) & (readings > 0.0)
         seen_through = (aside < CORE) & measured[:, None]
         seen_through &= distances < (readings + self._radius - SURE)[:, None]
         kept = (distances < WITHIN) & ~seen_through.any(axis=0)
         hits = measured & (readings < self._reach - 1e-6)
         self._least = min(self._least, float(readings[hits].min(initial=math.inf)))
-        near = np.where(kept & (aside < CONE), distances - self._radius, math.inf)
-        free = np.maximum(near.min(axis=1, initial=math.inf), 0.0)
-        self._remember(kept, self._bearings[hits], readings[hits] + self._radius)
+        self._remember(kept, (readings[hits] + self._radius)[:, None] * self._directions[hits])
         blind = readings == 0.0
         if not blind.any():
             return observation
+        near = np.where(kept & (aside < CONE), distances - self._radius, math.inf)
+        free = np.maximum(near.min(axis=1, initial=math.inf), 0.0)
         free[blind] = [
             f if f <= self._least + SLACK else self._driven(b)
             for f, b in zip(free[blind], self._bearings[blind], strict=True)
@@ -103,8 +104,8 @@ class BlindZone:
         first = int(beyond[1:].argmax())
         return float(along[first]) if beyond[1:].any() else 0.0
 
-    def _remember(self, kept: NDArray[np.bool_], bearings: Array, distances: Array) -> None:
-        fresh = distances[:, None] * np.stack([np.cos(bearings), np.sin(bearings)], axis=1)
+    def _remember(self, kept: NDArray[np.bool_], fresh: Array) -> None:
+        """Keep some of the points, and (N, 2) m in robot."""
         points = np.concatenate([self._odom_from_robot.apply(fresh), self._points[kept]])
         cells = np.round(points / CELL).astype(np.int64)
         _, latest = np.unique(cells[:, 0] * 2**32 + cells[:, 1], return_index=True)
@@ -112,3 +113,10 @@ class BlindZone:
         at = np.array([self._odom_from_robot.x, self._odom_from_robot.y])
         if not len(self._stood) or np.hypot(*(self._stood[-1] - at)) > STEP:
             self._stood = np.concatenate([self._stood, at[None]])[-POSES:]
+
+
+def _within_turn(angles: Array) -> Array:
+    """Angles in [0, 2 pi), in place: the remainder is slow, and most are there already."""
+    outside = (angles < 0.0) | (angles >= math.tau)
+    angles[outside] %= math.tau
+    return angles

@@ -12,7 +12,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.arrays import median
+from mapweave.agent.arrays import lengths, median
 from mapweave.agent.calibration.correction import OdometryCorrection, corrected, frame_change, geometry_of
 from mapweave.agent.calibration.counted_wheels import CountedWheels
 from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate, Lengths
@@ -150,17 +150,17 @@ class OnlineCalibration:
             return found
         if now - self._first_s < SHORTEST_S:
             return found
-        common, mine, theirs = np.intersect1d(self._ids, ids, assume_unique=True, return_indices=True)
-        moved = median(np.linalg.norm(raw[theirs] - self._begin[mine], axis=1)) if len(common) else 0.0
+        mine, theirs = _common(self._ids, ids)
+        moved = median(lengths(raw[theirs] - self._begin[mine])) if len(mine) else 0.0
         camera = self._declared.camera
         due = now - self._first_s >= LONGEST_S or moved > ENOUGH * camera.width
         way = abs(self._counted.way - self._first_way)
-        leaving = len(common) < LEAST_LEFT * len(self._ids) or way > ENOUGH_HEIGHTS * camera.mount_height
+        leaving = len(mine) < LEAST_LEFT * len(self._ids) or way > ENOUGH_HEIGHTS * camera.mount_height
         if not (due or leaving):
             self._refresh()
             return found
         pair = None
-        if len(common) >= LEAST_TRACKS and moved > LEAST * camera.width:
+        if len(mine) >= LEAST_TRACKS and moved > LEAST * camera.width:
             before, after = (
                 (self._plain.undistort(px) - [camera.cx, camera.cy]) / [camera.fx, camera.fy]
                 for px in (self._begin[mine], raw[theirs])
@@ -185,7 +185,8 @@ class OnlineCalibration:
     def _start(
         self, image: NDArray[np.uint8], source: object, now: float, ids: NDArray[np.int64], raw: Array
     ) -> None:
-        self._source, self._first_s, self._ids, self._begin = source, now, ids.copy(), raw.copy()
+        order = ids.argsort()
+        self._source, self._first_s, self._ids, self._begin = source, now, ids[order], raw[order]
         self._first_way = self._counted.way
         self._floor = self._tiles.part(image)
 
@@ -281,3 +282,13 @@ class OnlineCalibration:
         self._source, self._last = None, None
         self._since_solution = self._parts_left = self._taken = 0
         self._named_since[:] = self._changed_since[:] = np.inf
+
+
+def _common(ordered: NDArray[np.int64], ids: NDArray[np.int64]) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
+    """(K,) places of the same ids in (N,) ascending ones and in (M,) others; in each there is an id once."""
+    if not len(ids):
+        return np.zeros(0, np.intp), np.zeros(0, np.intp)
+    order = ids.argsort()
+    places = order.take(ids.take(order).searchsorted(ordered), mode="clip")
+    mine = np.flatnonzero(ids.take(places) == ordered)
+    return mine, places.take(mine)

@@ -210,11 +210,10 @@ class MappingFilter:
 
     def predict_pixels(self, ids: Ids | None = None) -> Array:
         """(N, 2) px where landmarks are expected now; NaN for ids that the filter does not hold."""
-        pixels = self._pinhole.pixels(self._rays[:, :2])
-        if ids is None:
-            return pixels
+        pixels = np.full((len(self.ids) + 1, 2), math.nan)
+        pixels[:-1] = self._pinhole.pixels(self._rays[:, :2])
         # The last row is of those that are not held, whose slot is -1.
-        return np.asarray(np.vstack([pixels, [math.nan, math.nan]])[slots_of(self.ids, ids)], np.float64)
+        return pixels[:-1] if ids is None else pixels[slots_of(self.ids, ids)]
 
     def landmarks(self) -> LandmarkEstimates:
         """All landmarks as they are known now."""

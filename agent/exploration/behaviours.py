@@ -12,6 +12,7 @@ from mapweave.agent.exploration.phase import Phase
 from mapweave.agent.mapping.episode import Episode, EpisodeRequest, Move
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.servo.image_drive import ImageDrive
+from mapweave.agent.servo.leg_controller import clip
 from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 
@@ -183,7 +184,7 @@ class ExplorationBehaviours:
                 yield Command()
                 yield EpisodeRequest.FINISH
             self.detail = f"turning {math.degrees(error):+.0f} deg toward the way"
-            yield Command(0.0, float(np.clip(2.0 * error, -s.turn_rate, s.turn_rate)))
+            yield Command(0.0, clip(2.0 * error, s.turn_rate))
 
     def drive_to(self, corner: Array) -> Generator[Move, None, bool]:
         """Returns whether the corner was reached."""
@@ -209,7 +210,7 @@ class ExplorationBehaviours:
                 yield EpisodeRequest.FINISH
             self.detail = f"{distance:.1f} m to the next corner"
             speed = min(s.travel_speed, max(0.6 * distance, 0.05)) * max(0.0, 1.0 - abs(error) / 0.5)
-            yield Command(speed, float(np.clip(1.5 * error, -s.turn_rate, s.turn_rate)))
+            yield Command(speed, clip(1.5 * error, s.turn_rate))
 
     # Small things
 

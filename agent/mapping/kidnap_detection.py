@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import lengths
 from mapweave.agent.settings import TrackerSettings
 from mapweave.agent.vision.image_quality import BLACK, LEAST_CORNERS, MOST_CLIPPED, WHITE, strongest_corners
 from mapweave.agent.vision.tracker import Tracker
@@ -107,7 +108,7 @@ class KidnapDetector:
         inside = self._camera.contains(expected, BORDER_PX)
         if inside.sum() < LEAST:
             return None
-        near = np.linalg.norm(followed[inside] - expected[inside], axis=1) <= ASTRAY_PX
+        near = lengths(followed[inside] - expected[inside]) <= ASTRAY_PX
         return bool(near.mean() >= SHARE)
 
     def _alike(self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float) -> bool:

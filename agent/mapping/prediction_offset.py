@@ -39,7 +39,7 @@ class PredictionOffset:
         """(N, 2) px, how far tracks are from where the filter expects them; zeros for those not noted."""
         out = np.zeros((len(ids), 2))
         if len(self._ids):
-            place = np.clip(np.searchsorted(self._ids, ids), 0, len(self._ids) - 1)
-            matching = self._ids[place] == ids
+            place = self._ids.searchsorted(ids)
+            matching = self._ids.take(place, mode="clip") == ids
             out[matching] = self._aside[place[matching]]
         return out

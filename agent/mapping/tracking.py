@@ -352,12 +352,10 @@ class Tracking:
     def _expected(self) -> Array:
         """(N, 2) px where the tracks should be now: by the filter, else by the turn alone."""
         expected = turned(self._camera, self._tracker.pixels, self.acceptance.moved.heading)
-        ids = self._filter.ids
-        if len(ids):
-            order = np.argsort(ids)
-            place = np.clip(np.searchsorted(ids[order], self._tracker.ids), 0, len(ids) - 1)
-            rows = self._filter.predict_pixels()[order[place]] + self._unheld.aside(self._tracker.ids)
-            hit = (ids[order][place] == self._tracker.ids) & self._camera.contains(rows)
+        ids = self._tracker.ids
+        if len(self._filter.ids):
+            rows = self._filter.predict_pixels(ids) + self._unheld.aside(ids)
+            hit = self._camera.contains(rows)
             expected[hit] = rows[hit]
         return expected
 

@@ -214,7 +214,8 @@ class EncoderMonitor:
         seen = [moment.small for moment in self._moments if moment.small is not None]
         if len(seen) < len(self._moments) // 2:
             return False
-        return all(float(np.abs(one - seen[0]).mean()) < AT_REST for one in seen[1:])
+        # The last first: while the robot moves, it is the one that differs.
+        return all(float(np.abs(one - seen[0]).mean()) < AT_REST for one in reversed(seen[1:]))
 
     def _seen(self) -> _Seen | None:
         """How the robot has moved by its images; None if they show too little."""

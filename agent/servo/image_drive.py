@@ -46,7 +46,12 @@ class ImageDrive:
         """
         self._wanted = speed
         self._description = description
-        self._rangers = np.asarray(description.ranger_bearings, dtype=np.float64)
+        rangers = np.asarray(description.ranger_bearings, dtype=np.float64)
+        # Of each ranger, off the direction of travel: forward, and backward.
+        self._offsets = [
+            np.mod(rangers - behind + math.pi, 2.0 * math.pi) - math.pi for behind in (0.0, math.pi)
+        ]
+        self._facing = [np.abs(offsets) <= CONE for offsets in self._offsets]
         self.start(0.0)
 
     def start(self, distance: float) -> None:
@@ -124,12 +129,13 @@ class ImageDrive:
     def _near(self, direction: float, proximity: NDArray[Any]) -> NDArray[np.float64]:
         """(M, 2) distance m and bearing off the direction of travel rad (left of the robot positive)."""
         distances = np.asarray(proximity, dtype=np.float64)
-        count = min(len(distances), len(self._rangers))
-        behind = 0.0 if direction > 0 else math.pi
-        offsets = np.mod(self._rangers[:count] - behind + math.pi, 2.0 * math.pi) - math.pi
-        chosen = (np.abs(offsets) <= CONE) & np.isfinite(distances[:count])
-        left = offsets * (1.0 if direction > 0 else -1.0)
-        return np.column_stack([distances[:count][chosen], left[chosen]])
+        forward = direction > 0
+        offsets, facing = self._offsets[not forward], self._facing[not forward]
+        count = min(len(distances), len(offsets))
+        chosen = np.flatnonzero(facing[:count] & np.isfinite(distances[:count]))
+        near = np.empty((len(chosen), 2))
+        near[:, 0], near[:, 1] = distances[chosen], offsets[chosen] if forward else -offsets[chosen]
+        return near
 
     def _free(self, near: NDArray[np.float64]) -> float:
         """Free way in the direction of travel, m: to the nearest thing within the width of the robot."""

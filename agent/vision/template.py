@@ -14,6 +14,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import lengths
 from mapweave.hybridmap.pose import Array
 
 Floats = NDArray[np.float32]
@@ -108,7 +109,7 @@ class TemplateMatcher:
     def __init__(self, settings: TemplateCriteria | None = None) -> None:
         """Lay out the patch."""
         self._settings = settings or TemplateCriteria()
-        side = np.arange(-HALF_PX, HALF_PX + 1, dtype=np.float32)
+        self._side = side = np.arange(-HALF_PX, HALF_PX + 1, dtype=np.float32)
         # (2, P): a row for each coordinate, since rows are read much faster than columns.
         self._spots = np.stack(np.meshgrid(side, side)).reshape(2, -1)
         weights = np.exp(-(self._spots**2).sum(axis=0) / (2 * SIGMA_PX**2))
@@ -136,17 +137,19 @@ class TemplateMatcher:
         grey = image.astype(np.float32)
         at, scales = raw.astype(np.float32), templates.scales.copy()
         for _ in range(s.iterations):
-            off = self._normalised(self._sampled(grey, at, scales))[0] - templates.patches
+            off = self._normalised(self._sampled(grey, at, scales))[0]
+            off -= templates.patches
             step = np.einsum("nij,nj->ni", templates.solve, np.einsum("nip,np->ni", templates.slopes, off))
             # Inverse composition: the step moves the patch as it was cut, and is undone on the present one.
-            scales = scales / np.clip(1.0 + step[:, 2], 0.5, 2.0)
+            scales = scales / np.minimum(np.maximum(1.0 + step[:, 2], 0.5), 2.0)
             at = at - scales[:, None] * step[:, :2]
         patches, _ = self._normalised(self._sampled(grey, at, scales))
         correlation = np.einsum("np,np,p->n", patches, templates.patches, self._weights)
         held = correlation >= s.least_correlation
-        held &= np.linalg.norm(at - raw, axis=1) <= s.agree_px
-        reach = (HALF_PX * scales)[:, None]
-        held &= ((at >= reach) & (at <= np.array(image.shape[::-1], np.float32) - 1 - reach)).all(axis=1)
+        held &= lengths(at - raw) <= s.agree_px
+        reach = HALF_PX * scales
+        for along, size in zip(at.T, image.shape[::-1], strict=True):
+            held &= (along >= reach) & (along <= np.float32(size) - 1 - reach)
         found = np.where(held[:, None], at.astype(np.float64), raw)
         scales = np.where(held, scales, templates.scales)
         now = Templates(templates.patches, templates.slopes, templates.solve, scales)
@@ -186,13 +189,18 @@ class TemplateMatcher:
         """(N, P) grey levels of the patches around points, bilinear; beyond the border that of the border."""
         if not len(at):
             return np.zeros((0, self._spots.shape[1]), np.float32)
-        x, y = (at[:, axis, None] + scales[:, None] * self._spots[axis] for axis in (0, 1))
+        # Columns and rows of a patch are the same for all of its rows and columns.
+        along = at[:, :, None] + scales[:, None, None] * self._side
+        x, y = np.empty((2, len(at), len(self._side), len(self._side)), np.float32)
+        x[:], y[:] = along[:, 0, None], along[:, 1, :, None]
+        x, y = x.reshape(len(at), -1), y.reshape(len(at), -1)
         found = cv2.remap(grey, x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
         return np.asarray(found, dtype=np.float32)
 
     def _normalised(self, grey: Floats) -> tuple[Floats, Floats]:
-        """(N, P) with mean 0 and deviation 1, and (N, 1) the deviation it had."""
-        centred = grey - np.einsum("np,p->n", grey, self._weights)[:, None]
-        spread = np.sqrt(np.einsum("np,np,p->n", centred, centred, self._weights))[:, None]
+        """(N, P) with mean 0 and deviation 1, in place, and (N, 1) the deviation it had."""
+        grey -= np.einsum("np,p->n", grey, self._weights)[:, None]
+        spread = np.sqrt(np.einsum("np,np,p->n", grey, grey, self._weights))[:, None]
         spread = np.maximum(spread, np.float32(FAINT))
-        return centred / spread, spread
+        grey /= spread
+        return grey, spread

@@ -10,6 +10,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.arrays import lengths
 from mapweave.agent.settings import TrackerSettings
 from mapweave.agent.vision.template import TemplateMatcher, Templates
 from mapweave.hybridmap.errors import InvalidValue
@@ -97,7 +98,7 @@ class Tracker:
         start = self.raw.astype(np.float32)[:, None]
         guess = start.copy()
         if expected is not None:
-            known = np.isfinite(expected).all(axis=1)
+            known = np.isfinite(expected[:, 0]) & np.isfinite(expected[:, 1])
             guess[known, 0] = self._lens.distort(expected[known])
         guess_given = guess.copy()
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
@@ -115,9 +116,9 @@ class Tracker:
         height, width = image.shape
         forward, backward = forward[:, 0], backward[:, 0]
         kept = (found_forward[:, 0] == 1) & (found_back[:, 0] == 1)
-        kept &= np.linalg.norm(backward - start[:, 0], axis=1) <= BACKWARD_PX
-        kept &= (forward >= BORDER_PX).all(axis=1)
-        kept &= (forward[:, 0] < width - BORDER_PX) & (forward[:, 1] < height - BORDER_PX)
+        kept &= lengths(backward - start[:, 0]) <= BACKWARD_PX
+        for along, size in zip(forward.T, (width, height), strict=True):
+            kept &= (along >= BORDER_PX) & (along < size - BORDER_PX)
         lost: NDArray[np.int64] = self.ids[~kept]
         self.raw = forward.astype(np.float64)
         self.keep(kept)

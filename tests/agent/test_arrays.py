@@ -7,7 +7,7 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.agent.arrays import among, median, same_image
+from mapweave.agent.arrays import among, lengths, median, same_image
 
 
 @pytest.mark.parametrize("others", [0, 1, 7, 40])
@@ -40,3 +40,14 @@ def test_images_are_the_same_to_the_last_grey_level() -> None:
     assert not same_image(image, other)
     assert not same_image(image, image[:-1])
     assert not same_image(image, image[:, :-1])
+
+
+@pytest.mark.parametrize("kind", [np.float64, np.float32])
+def test_lengths_are_those_of_numpy(kind: type) -> None:
+    rng = np.random.default_rng(4)
+    for count in (0, 1, 90):
+        vectors = (30.0 * rng.standard_normal((count, 2))).astype(kind)
+        vectors[: count // 10] = np.nan
+        found = lengths(vectors)
+        assert found.dtype == kind
+        assert np.array_equal(found, np.linalg.norm(vectors, axis=1), equal_nan=True)

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapweave.agent.blind_zone import BlindZone
+from mapweave.agent.blind_zone import BlindZone, _within_turn
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.hybridmap.pose import Pose2
 from tests.agent.ranged_body import BEARINGS, BODY, ROOM, rangers
@@ -112,3 +112,9 @@ def test_a_robot_that_was_lifted_knows_nothing() -> None:
 def test_robots_without_rangers_are_left_alone() -> None:
     observation = Observation(0, Odometry(0.1, 0.0))
     assert BlindZone(BODY).fill(observation) is observation
+
+
+def test_an_angle_is_brought_into_one_turn_as_by_the_remainder() -> None:
+    angles = np.random.default_rng(6).uniform(-15.0, 15.0, (16, 40))
+    angles[0, :5] = 0.0, -1e-20, math.tau, -math.tau, np.nextafter(math.tau, 0.0)
+    assert np.array_equal(_within_turn(angles.copy()), angles % math.tau)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.calibration.estimator import Estimator
-from mapweave.agent.calibration.online import NAMED_ONLY, OnlineCalibration
+from mapweave.agent.calibration.online import NAMED_ONLY, OnlineCalibration, _common
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from synthetic.room_drive import CAMERA, SIDE, RoomDrive, camera_poses, drive
@@ -177,3 +177,14 @@ def test_hours_without_pairs_take_no_memory(forward: float):
     grown, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
     assert grown < 200_000
+
+
+@pytest.mark.parametrize(("mine", "others"), [(0, 0), (0, 9), (9, 0), (1, 1), (60, 70)])
+def test_tracks_of_two_images_are_matched_as_by_numpy(mine: int, others: int):
+    rng = np.random.default_rng(mine)
+    for _ in range(20):
+        ordered, ids = np.sort(rng.permutation(90)[:mine]), rng.permutation(90)[:others]
+        _, first, second = np.intersect1d(ordered, ids, assume_unique=True, return_indices=True)
+        found = _common(ordered, ids)
+        assert np.array_equal(found[0], first)
+        assert np.array_equal(found[1], second)
