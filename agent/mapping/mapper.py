@@ -71,9 +71,9 @@ class Mapper:
         self._composed = HERE, HERE, HERE
         self._anchor: View | None = None
         self._further: list[View] = []
-        # A thread extracts features. Those of a further view are used in the next tick, which begins by
-        # waiting for them: no result depends on speed. The next anchor's are needed at once: episodes that
-        # begin a tick later cost a robot a quarter of its nodes.
+        # A thread extracts features, which are used when the next tick begins, by waiting for them: no result
+        # depends on speed. Those of the next anchor are used earlier if a behaviour asks for its features:
+        # episodes that begin a tick later cost a robot a quarter of its nodes.
         self._extraction = ThreadPoolExecutor(1, "features")
         self._extracting: tuple[Future[Features], Callable[[Features], None]] | None = None
 
@@ -146,12 +146,12 @@ class Mapper:
 
     @property
     def tracks(self) -> tuple[object, NDArray[np.int64], Array]:
-        """Whose tracks, their (N,) ids and (N, 2) px in the real image."""
+        """Whose tracks, their (N,) ids and (N, 2) px in the real image; see `tracked`."""
         return (self._tracking, *self._tracking.raw_tracks)
 
     @property
     def tracked(self) -> int:
-        """Tracks alive."""
+        """Tracks alive; in the tick that ends an episode perhaps still without the next anchor's features."""
         return len(self._tracking.ids)
 
     @property
@@ -162,16 +162,19 @@ class Mapper:
     @property
     def anchored(self) -> int:
         """Features of the anchor view that are still tracked."""
+        self._use_extracted()
         return 0 if self._anchor is None else int(among(self._tracking.ids, self._anchor.tracks).sum())
 
     @property
     def anchor_features(self) -> int:
         """Features that the anchor view had."""
+        self._use_extracted()
         return 0 if self._anchor is None else len(self._anchor.features)
 
     @property
     def bearings(self) -> Array:
         """(N,) rad, bearings of the tracks, positive to the left."""
+        self._use_extracted()
         return self._description.camera.bearings(self._tracking.pixels)
 
     @property
@@ -319,10 +322,15 @@ class Mapper:
         tracking.remember(force=True)
         estimate = tracking.estimate
         moved = tracking.reanchor()
-        self._anchor, self._further = tracking.take(observation, features.result(), HERE), []
-        tracking.follow(self._anchor)
+
+        def take(features: Features) -> None:
+            self._anchor = tracking.take(observation, features, HERE)
+            tracking.follow(self._anchor)
+
+        self._extracting, self._further = (features, take), []
 
         def known(landmarks: Landmarks | None) -> None:
+            self._use_extracted()
             if landmarks is None:
                 self._trajectory.move_anchor(moved.mean)
             else:
@@ -332,6 +340,8 @@ class Mapper:
 
         # The tick that waits for the features leaves the landmarks to the next one.
         self._keyframes.place(anchor, further, estimate, self._trajectory, moved, known)
+        if self._pending is not None:
+            self._use_extracted()
         if self._take_up_pending():
             # Tracks and features of another lens are of no use to a filter of this one.
             self._tracking = Tracking(self._description, self._lens, self._settings)

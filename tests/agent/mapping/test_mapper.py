@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from dataclasses import replace
 from itertools import pairwise
 
@@ -16,6 +17,7 @@ from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.registration.selection import choose
 from mapweave.vision.lens import Lens
+from mapweave.vision.sift import Sift
 
 
 def drive(mapper, walls, positions, start=1):
@@ -108,6 +110,49 @@ def test_the_tick_that_ends_an_episode_leaves_its_landmarks_to_the_next(walls, d
     (node,) = mapper.map.nodes.values()
     assert chosen == 1
     assert mapper.typical_depth == np.median(node.landmarks.depths)
+
+
+def test_no_tick_waits_for_features_that_are_not_asked_for(walls, description, monkeypatch):
+    """It takes as long to extract them as to do the rest of that tick."""
+    mapper, may_go_on, extract = Mapper(MapId("r0", 1), description), threading.Event(), Sift.extract
+    last = drive(mapper, walls, np.arange(0.0, 0.6, 0.025))
+    assert mapper.anchored < mapper.anchor_features
+
+    def held(*arguments: object) -> object:
+        assert may_go_on.wait(20.0), "the tick waits for the features"
+        return extract(*arguments)
+
+    monkeypatch.setattr(Sift, "extract", held)
+    mapper.finish(last)
+    assert mapper.tracked > 0
+    assert mapper.health == ""
+    may_go_on.set()
+    assert mapper.anchored == mapper.anchor_features, "the next anchor's, as soon as they are asked for"
+
+
+@pytest.mark.parametrize("asking", ["anchored", "anchor_features", "bearings"])
+def test_a_map_is_the_same_when_features_of_the_next_anchor_are_asked_for(walls, description, asking):
+    """In the tick that ends an episode, or not before they are used; at the end of the process as well."""
+    maps = []
+    for asks in (True, False):
+        mapper = Mapper(MapId("r0", 1), description)
+        for start, stretch in enumerate((np.arange(0.0, 0.5, 0.025), np.arange(0.475, 0.9, 0.025))):
+            last = drive(mapper, walls, stretch, 1 + 50 * start)
+            mapper.finish(last)
+            if asks:
+                assert np.size(getattr(mapper, asking)) > 0
+        mapper.finish_pending()
+        maps.append((mapper.map, mapper.anchored, mapper.map_from_robot))
+    (one, anchored, pose), (other, other_anchored, other_pose) = maps
+    assert len(one.nodes) == len(other.nodes) == 2
+    assert (anchored, pose.mean) == (other_anchored, other_pose.mean)
+    for a, b in zip(one.nodes.values(), other.nodes.values(), strict=True):
+        assert a.map_from_robot.mean == b.map_from_robot.mean
+        assert np.array_equal(a.landmarks.codes, b.landmarks.codes)
+        assert np.array_equal(a.landmarks.depths, b.landmarks.depths)
+    for edge, its_twin in zip(one.edges.values(), other.edges.values(), strict=True):
+        assert edge.a_from_b.mean == its_twin.a_from_b.mean
+        assert np.array_equal(edge.shared, its_twin.shared)
 
 
 @pytest.mark.parametrize("forward", [0.3, -0.2])
