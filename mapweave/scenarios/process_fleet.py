@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 
@@ -14,10 +15,17 @@ from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus
 
+log = logging.getLogger(__name__)
+
 PATIENCE = 60.0
 """How long a process may take to come up, s."""
+COMPILING = 300.0
+"""How long the first agents may take, s: on a computer that has run none, each compiles what runs often, one
+beside the other."""
 CHECK_EVERY = 2.0
 """How often the processes are checked while time passes, s."""
+SAY_EVERY = 15.0
+"""While it waits for a process it says so, s."""
 
 
 class ProcessFleet:
@@ -54,7 +62,7 @@ class ProcessFleet:
         self._until(self._simulating, "the simulator does not come up")
         for robot in stage.robots:
             self._start_agent(robot)
-        self._until(lambda: self._active() == set(stage.robots), "an agent does not come up")
+        self._until(lambda: self._active() == set(stage.robots), "an agent does not come up", COMPILING)
 
     def advance(self, tick: int) -> None:
         """Let the simulator go on, and check the processes now and then."""
@@ -138,13 +146,19 @@ class ProcessFleet:
     def _active(self) -> set[str]:
         return {name for name, robot in self.control.status().robots.items() if robot.active}
 
-    def _until(self, condition: Callable[[], bool], complaint: str) -> None:
-        end = time.monotonic() + PATIENCE
+    def _until(self, condition: Callable[[], bool], complaint: str, patience: float | None = None) -> None:
+        patience, began, logs = patience or PATIENCE, time.monotonic(), self._stage.out / "logs"
+        say_at = began + SAY_EVERY
         while not condition():
             self._children.check()
-            if time.monotonic() > end:
-                logs = self._stage.out / "logs"
-                raise MapweaveError(f"{complaint} (waited {PATIENCE:.0f} s; see {logs})")
+            now = time.monotonic()
+            if now > began + patience:
+                raise MapweaveError(f"{complaint} (waited {patience:.0f} s; see {logs})")
+            if now > say_at:
+                log.warning(
+                    "%s yet: waiting for %.0f s, up to %.0f; see %s", complaint, now - began, patience, logs
+                )
+                say_at = now + SAY_EVERY
             time.sleep(0.02)
 
 
