@@ -45,6 +45,8 @@ def test_what_is_closed_from_the_shell_holds_for_all(
     try:
         with MapServer(router, KEYS, mapped.path, "s0") as server, Fleet(endpoint, by="anna") as fleet:
             eventually(lambda: server.status()["nodes"] == 7)
+            # Until all is merged, the map lacks the edge that the closure shall close.
+            assert server.settle(60.0)
             control = MissionControl("r0")
             link = FleetClient(robot, KEYS, ROBOT, control)
             standing = Status("standing", "", 7, 0, Pose2(), False, "explore", located=True)
@@ -97,7 +99,7 @@ def test_what_is_closed_from_the_shell_holds_for_all(
                 (["close"], USAGE), (["close", "a", "b", "c"], USAGE),
                 (["close", "kitchen", "--until", "soon"], USAGE),
                 (["prefer", "kitchen", "--factor", "2"], USAGE),
-                (["close", "nowhere"], NO), (["close", str(first), str(first)], NO),
+                (["close", "nowhere"], NO), (["close", str(first), str(first)], USAGE),
                 (["close", "kitchen", "--until", "1999-01-01"], NO), (["reopen", "nothing"], NO),
             ):  # fmt: skip
                 status, _, err = shell(*wrong)
