@@ -384,8 +384,8 @@ class Merger:
         """Search for nodes similar to those that were read, or to so many of them."""
         # A server merges before it has read its store if manual constraints come first.
         if self._record is not None and self.maps:
-            self._resume(self._record)
-            self._record = None
+            record, self._record = self._record, None
+            self._resume(record)
         self._comparisons.search_pairs(most)
 
     def _resume(self, record: RestartRecord) -> None:

@@ -23,6 +23,9 @@ RECORD_SUFFIX = ".superseded"
 """Of the other file."""
 SHARE = 0.05
 """Of the time that it may take to save."""
+QUICK = 0.05
+"""s, in which what is superseded is written on most disks. Where it takes longer, acknowledgements would wait
+for the disk."""
 WORTHWHILE = 0.02
 """Share of the pairs that must be new before a running server saves them."""
 RETRY = 60.0
@@ -48,6 +51,7 @@ class VerificationCacheKeeper:
         self._rest_until = 0.0
         self._record: RestartRecord | None = None
         self._merges = 0
+        self._record_rest_until = 0.0
         self._failures: dict[str, tuple[str, float]] = {}
 
     def restore(self, merger: Merger) -> None:
@@ -84,7 +88,7 @@ class VerificationCacheKeeper:
             return  # The files have more than this process yet.
         self._save_findings(merger, last)
         # It is small: a server that is killed goes on from its last merge.
-        if merger.counters.merges != self._merges:
+        if merger.counters.merges != self._merges and (self._clock() >= self._record_rest_until or last):
             self._save_record(merger, last)
 
     def _save_findings(self, merger: Merger, last: bool) -> None:
@@ -99,11 +103,14 @@ class VerificationCacheKeeper:
             self._rest_until = self._clock() + (self._clock() - began) / SHARE
 
     def _save_record(self, merger: Merger, last: bool) -> None:
-        record, words = merger.record(), "the next start may supersede other nodes"
+        began, words = self._clock(), "the next start may supersede other nodes"
+        record = merger.record()
         if record == self._record or self._tried(
             lambda: restart_record_file.save(self._record_path, record, _made_by(merger)), words, last
         ):
             self._record, self._merges = record, merger.counters.merges
+            if (took := self._clock() - began) > QUICK:
+                self._record_rest_until = self._clock() + took / SHARE
 
     def _tried(self, write: Callable[[], None], otherwise: str, last: bool) -> bool:
         """Write a file, but not soon after a failure; whether it was written."""

@@ -33,6 +33,7 @@ from mapweave.mapserver.merging.verification_cache_keeper import (
     RECORD_SUFFIX,
     SUFFIX,
     VerificationCacheKeeper,
+    _made_by,
 )
 from mapweave.merge.map_maintenance import comparisons
 from mapweave.merge.pose_graph import verification
@@ -368,6 +369,26 @@ def test_a_record_without_a_verification_cache_is_used(tmp_path: Path) -> None:
     assert again.merger.counters.verified > 50
     same = before.merger.merged().superseded.keys() & again.merger.merged().superseded.keys()
     assert len(same) > 0.8 * len(before.merger.merged().superseded)
+
+
+def test_a_slow_disk_is_used_a_twentieth_of_the_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now, written = [0.0], list[float]()
+
+    def slowly(path: Path, record: RestartRecord, made_by: str) -> None:
+        written.append(now[0])
+        now[0] += 1.0
+        save(path, record, made_by)
+
+    monkeypatch.setattr(restart_record_file, "save", slowly)
+    merger, keeper = Merger(compare=compare), VerificationCacheKeeper(tmp_path / "x", clock=lambda: now[0])
+    for map_id, body in drives()[:12]:
+        merger.on_change(Change(map_id, 1, 0, body))
+        merger.merged()
+        keeper.save(merger)
+        now[0] += 4.0
+    assert len(written) == 3 and min(np.diff(written)) >= 20.0
+    keeper.save(merger, last=True)
+    assert len(written) == 4 and load(tmp_path / f"x{RECORD_SUFFIX}", _made_by(merger)) == merger.record()
 
 
 def test_a_full_disk_is_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
