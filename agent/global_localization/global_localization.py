@@ -261,21 +261,23 @@ class GlobalLocalization:
         around the corner. A node that was recognised, though not well enough, is better seen from nearby.
         """
         motion = self._motion
-        way, direction = motion.freest(MOVE)
-        if self._hint is not None:
-            _, odom_from_node = self._hint
-            node = motion.odom_from_robot.inverse() @ odom_from_node
-            toward = math.atan2(node.y, node.x)
-            distance = min(motion.room(toward), math.hypot(node.x, node.y))
-            if distance >= LEAST_MOVE:
-                way, direction = min(distance, MOVE), toward
-        if way < LEAST_MOVE:
-            self.detail = "no room to search from elsewhere"
-            return False
         why = "nothing here is known" if self._hint is None else "nothing here is known well enough"
         why = f"ambiguous, {self._ambiguous}" if self._ambiguous else why
+        way = 0.0
+        if self._hint is not None:
+            node = motion.odom_from_robot.inverse() @ self._hint[1]
+            if (distance := math.hypot(node.x, node.y)) >= LEAST_MOVE:
+                # Rangers may not point there yet.
+                self.detail = f"{why}: turning to what is known"
+                yield from motion.turn(math.atan2(node.y, node.x), TURN_RATE)
+                way = min(motion.room(0.0), distance, MOVE)
+        if way < LEAST_MOVE:
+            way, direction = motion.freest(MOVE)
+            if way < LEAST_MOVE:
+                self.detail = "no room to search from elsewhere"
+                return False
+            yield from motion.turn(math.remainder(direction, math.tau), TURN_RATE)
         self.detail, self._ambiguous = f"{why}: driving on to search from elsewhere", ""
-        yield from motion.turn(math.remainder(direction, math.tau), TURN_RATE)
         yield from motion.drive_on(way, SPEED)
         return True
 

@@ -9,10 +9,12 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from mapweave.agent.global_localization.global_localization import MOVE
+from mapweave.agent.global_localization.candidates import OwnMap
+from mapweave.agent.global_localization.global_localization import MOVE, GlobalLocalization
 from mapweave.agent.global_localization.pose_consistency import OTHER_VIEW
 from mapweave.agent.global_localization.resumption import Resumption
 from mapweave.agent.global_localization.search_policy import TO_MAP, SearchPolicy
+from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -296,3 +298,27 @@ def test_the_same_observations_give_the_same_search(home, own_map):
     first, second = (result.recognition.node_from_robot for result in (a.found, b.found))
     assert first.mean == second.mean
     assert np.array_equal(first.covariance, second.covariance)
+
+
+@pytest.mark.parametrize("direction", np.linspace(-2.9, 2.9, 11).tolist())
+def test_it_drives_toward_what_it_has_recognised_wherever_that_is(
+    own_map: HybridMap, direction: float
+) -> None:
+    """Where nothing is near, no reading lies on a way between two rangers, and it drove somewhere else."""
+    motion = MotionPrimitives(BODY)
+    motion.take_in(Observation(0, Odometry(0.0, 0.0), proximity=FREE), ())
+    localization = GlobalLocalization(
+        BODY, Body(None, Pose2()), motion, OwnMap(own_map, np.random.default_rng(0)), QUICK  # type: ignore[arg-type]
+    )  # fmt: skip
+    node = Pose2(0.8 * math.cos(direction), 0.8 * math.sin(direction))
+    localization._hint = 40, node
+    move, moved = localization._move(), None
+    while moved is None:
+        try:
+            command = next(move)
+        except StopIteration as end:
+            moved = end.value
+            continue
+        step = Odometry(0.1 * command.forward, 0.1 * command.turn)
+        motion.take_in(Observation(0, step, proximity=FREE), ())
+    assert moved and motion.odom_from_robot.distance(node) < 0.15
