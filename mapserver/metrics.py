@@ -35,7 +35,13 @@ MERGE_BUCKETS = (0.01, 0.05, 0.1, 0.5, 1.0, 5.0, 10.0, 60.0, 300.0)
 """s"""
 FAILED = "failed"
 """In place of the certainty of an answer."""
-FILES = {"log": "", "write_ahead_log": "-wal", "places": ".places", "verdicts": ".verdicts"}
+FILES = {
+    "log": "",
+    "write_ahead_log": "-wal",
+    "places": ".places",
+    "verdicts": ".verdicts",
+    "superseded": ".superseded",
+}
 """What the server keeps on the disk, and how it is called behind the name of the store."""
 
 INGEST = {
