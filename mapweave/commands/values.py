@@ -65,14 +65,18 @@ def title(text: str) -> str:
 
 
 def remark(text: str) -> str:
-    """Who and why."""
+    """Who and why. The usual default is nothing, which needs no library to be checked."""
+    if not text:
+        return text
     from mapweave.hybridmap.manual_constraint import MOST_WORDS
 
     return _line(text, 0, MOST_WORDS)
 
 
 def note(text: str) -> str:
-    """For who takes a robot through a portal."""
+    """For who takes a robot through a portal; likewise."""
+    if not text:
+        return text
     from mapweave.hybridmap.portal import MOST_NOTE
 
     return _line(text, 0, MOST_NOTE)
