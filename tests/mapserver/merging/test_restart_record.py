@@ -321,6 +321,7 @@ def test_a_damaged_record_is_thrown_away(
         # Another version may supersede by other rules.
         monkeypatch.setattr(verification_cache_keeper, "version", lambda _: "0.0.0")
     merger, plain = Merger(settings=merging, compare=compare), Merger(settings=merging, compare=compare)
+    caplog.clear()
     with caplog.at_level(logging.INFO):
         VerificationCacheKeeper(tmp_path / "store").restore(merger)
     other_program = damage in ("version", "merging")
