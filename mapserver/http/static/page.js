@@ -227,7 +227,7 @@ watch({
   },
   events({ history }) {
     addEvents(history, name => model.rowOf(name) === undefined ? find(name) : selectNode(name));
-    if (page.heard) byId("announcement").textContent = history.at(-1)?.words || "";
+    if (page.heard) byId("announcement").textContent = history.slice(-3).map(({ words }) => words).join("; ");
     page.heard = true;
     if (history.some(({ kind }) => kind === "annotated")) loadSaid();
     if (!page.loading) listCorrections();
