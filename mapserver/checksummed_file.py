@@ -7,15 +7,18 @@ from __future__ import annotations
 
 import hashlib
 import io
-from collections.abc import Iterable, Iterator
+import json
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.storage.atomic_file import write_whole
+
+Value = TypeVar("Value")
 
 DIGEST = 32
 """Bytes of SHA-256."""
@@ -59,6 +62,40 @@ def unseal(path: Path, magic: bytes) -> Iterator[NDArray[Any]]:
     if len(data) < len(magic) + DIGEST or hashlib.sha256(content).digest() != data[-DIGEST:]:
         raise InvalidFile(f"{path}: is damaged or cut off")
     return _arrays(io.BytesIO(content[len(magic) :]), len(content) - len(magic))
+
+
+def read_sealed(
+    path: Path, magic: bytes, header: Any, read: Callable[[Iterator[NDArray[Any]]], Value], lack: str
+) -> Value:
+    """What a file has behind a header.
+
+    Args:
+        path: of the file.
+        magic: its first line.
+        header: what `json_part` has made its first array of.
+        read: makes the value of the other arrays.
+        lack: what it is if they make none, for example "is no map".
+
+    Raises:
+        InvalidFile: there is none, it is damaged, it has another header, or it is no such value.
+    """
+    parts = unseal(path, magic)
+    try:
+        if read_json(next(parts)) != header:
+            raise InvalidFile(f"{path}: of another version of this program, or with other settings")
+        return read(parts)
+    except (ValueError, KeyError, TypeError, IndexError, EOFError, StopIteration, InvalidValue) as error:
+        raise InvalidFile(f"{path}: {lack} ({error})") from None
+
+
+def json_part(words: Any) -> NDArray[np.uint8]:
+    """Words as an array."""
+    return np.frombuffer(json.dumps(words).encode(), np.uint8)
+
+
+def read_json(part: NDArray[Any]) -> Any:
+    """Such an array's words again."""
+    return json.loads(part.tobytes())
 
 
 def _arrays(file: io.BytesIO, size: int) -> Iterator[NDArray[Any]]:

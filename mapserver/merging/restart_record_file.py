@@ -15,14 +15,13 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.hybridmap.limits import MAX_LANDMARKS, MAX_NUMBER, MAX_POSITION
 from mapweave.hybridmap.superseded import Superseded
-from mapweave.mapserver.checksummed_file import seal, unseal
+from mapweave.mapserver.checksummed_file import json_part, read_json, read_sealed, seal
 from mapweave.mapserver.merging.restart_record import RestartRecord
 from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, RecentComparisons
-from mapweave.mapserver.merging.verification_cache_file import json_part, read_json
 from mapweave.merge.pose_graph.candidates import Pair
 
 MAGIC = b"mapweave superseded\n"
@@ -55,13 +54,7 @@ def load(path: Path, made_by: str) -> RestartRecord:
     Raises:
         InvalidFile: there is none, it is damaged, or it was made otherwise; with the reason.
     """
-    parts = unseal(path, MAGIC)
-    try:
-        if read_json(next(parts)) != _header(made_by):
-            raise InvalidFile(f"{path}: of another version of this program, or with other settings")
-        return _read(parts)
-    except (ValueError, KeyError, TypeError, IndexError, EOFError, StopIteration, InvalidValue) as error:
-        raise InvalidFile(f"{path}: is no record of this version ({error})") from None
+    return read_sealed(path, MAGIC, _header(made_by), _read, "is no record of this version")
 
 
 def _header(made_by: str) -> dict[str, Any]:

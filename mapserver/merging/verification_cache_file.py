@@ -6,7 +6,6 @@ header (JSON), agents (JSON), nodes, prints, overlaps, verdicts, reasons (JSON),
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from pathlib import Path
@@ -15,11 +14,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.landmark_tables import VERSION as TABLES
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.mapserver.checksummed_file import seal, unseal
+from mapweave.mapserver.checksummed_file import json_part, read_json, read_sealed, seal
 from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, VerificationCache
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink
@@ -53,13 +51,7 @@ def load(path: Path, made_by: str) -> VerificationCache:
     Raises:
         InvalidFile: there is none, it is damaged, or it was made otherwise; with the reason.
     """
-    parts = unseal(path, MAGIC)
-    try:
-        if read_json(next(parts)) != _header(made_by):
-            raise InvalidFile(f"{path}: of another version of this program, or with other settings")
-        return _read(parts)
-    except (ValueError, KeyError, TypeError, IndexError, EOFError, StopIteration, InvalidValue) as error:
-        raise InvalidFile(f"{path}: are no verdicts of this version ({error})") from None
+    return read_sealed(path, MAGIC, _header(made_by), _read, "are no verdicts of this version")
 
 
 def _header(made_by: str) -> dict[str, Any]:
@@ -130,13 +122,3 @@ def _rows(pairs: Sequence[Pair], row: dict[NodeId, int]) -> NDArray[np.int64]:
 
 def _pairs(rows: NDArray[np.int64], nodes: Sequence[NodeId]) -> list[Pair]:
     return [(nodes[a], nodes[b]) for a, b in rows.tolist()]
-
-
-def json_part(words: Any) -> NDArray[np.uint8]:
-    """Words as a part of a file."""
-    return np.frombuffer(json.dumps(words).encode(), np.uint8)
-
-
-def read_json(part: NDArray[Any]) -> Any:
-    """Such a part again."""
-    return json.loads(part.tobytes())
