@@ -3,16 +3,26 @@
 from __future__ import annotations
 
 from contextlib import ExitStack
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.agent_status import MAX_ROBOTS, AgentStatus, FleetStatus, RobotEntry, Status
+from mapweave.hybridmap.agent_status import (
+    LONGEST_STATUS_PERIOD,
+    MAX_ROBOTS,
+    SILENT,
+    AgentStatus,
+    FleetStatus,
+    RobotEntry,
+    Status,
+)
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MAX_VIA, MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver import http
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.quotas import Quotas
 from mapweave.mapserver.roster import MOST_ALIVE, Roster
@@ -59,6 +69,13 @@ def test_robots_that_begin_together_report_apart_after_two_periods() -> None:
     times = np.arange(50)[:, None] * periods
     for begin in np.arange(5.0, 30.0, 0.5):
         assert np.count_nonzero((times >= begin) & (times < begin + 0.5)) < 2 * 0.5 * rate
+
+
+def test_a_robot_that_reports_as_rarely_as_it_may_is_not_called_silent() -> None:
+    """It looks every half second whether a status is due. The page has the same limit as the command."""
+    assert SILENT > LONGEST_STATUS_PERIOD + 0.5
+    page = Path(http.__file__).parent / "static" / "robot_panel.js"
+    assert f"const QUIET = {SILENT:g};" in page.read_text()
 
 
 @pytest.mark.slow
