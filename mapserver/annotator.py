@@ -17,7 +17,7 @@ from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_effects import effects_of
 from mapweave.mapserver.floor_plans import check_plan
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import Places, why_left_out
 from mapweave.mapserver.portals import Portals, check_portal
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.services import guarded
@@ -188,7 +188,10 @@ def check_annotation(
     anchor = body.anchor
     merged.check(anchor)
     if merged.component_of(anchor) is None:
-        raise InvalidValue(f"node {anchor} is not in the merged map")
+        retired = merged.constraints.retires(anchor)
+        if retired is not None and constraints.standing(retired.about) is None:
+            raise InvalidValue(f"node {anchor} is in use again with the next merge: say it again then")
+        raise InvalidValue(f"node {anchor} is not in the merged map{why_left_out(merged, anchor)}")
     match body:
         case FloorPlan():
             check_plan(body, merged)

@@ -95,7 +95,7 @@ class Places:
         self.merged.check(node)
         number = self.merged.component_of(node)
         if number is None:
-            raise InvalidValue(f"node {node} is not in the merged map{self._why_not(node)}")
+            raise InvalidValue(f"node {node} is not in the merged map{why_left_out(self.merged, node)}")
         return Resolved(node, self.merged.pose(node), number)
 
     def name_at(self, component: int, pose: Pose2) -> str:
@@ -172,19 +172,12 @@ class Places:
             if distance <= REACH:
                 number = self.merged.component_of(node)
                 assert number is not None, "an active node has a pose"
-                note = f"{anchor} takes no part{self._why_not(anchor)}; the nearest active node is {node}"
+                note = f"{anchor} takes no part{why_left_out(self.merged, anchor)}; the nearest active node is {node}"
                 return Resolved(node, self.merged.pose(node), number, note=note)
         raise InvalidValue(
-            f"place {entry.name} is at {anchor}, which is not in the merged map{self._why_not(anchor)}; "
+            f"place {entry.name} is at {anchor}, which is not in the merged map{why_left_out(self.merged, anchor)}; "
             f"no active node of its map is within {REACH:g} m"
         )
-
-    def _why_not(self, node: NodeId) -> str:
-        retired = self.merged.constraints.retires(node)
-        apart = self.merged.set_apart.get(node.map)
-        if retired is not None:
-            return f" ({reason_of(retired)})"
-        return f" (map {node.map} is set apart: {apart})" if apart is not None else ""
 
     def _active(self, component: int) -> list[NodeId]:
         if not self.merged.components:
@@ -229,3 +222,12 @@ def position_of(word: str) -> tuple[float, float] | None:
     if not (math.isfinite(x) and math.isfinite(y)):
         raise InvalidValue(f"{word!r}: {FORMS}")
     return x, y
+
+
+def why_left_out(merged: MergedMap, node: NodeId) -> str:
+    """Why a node is not in the merged map, in parentheses behind a blank; empty if nothing is known of it."""
+    retired = merged.constraints.retires(node)
+    apart = merged.set_apart.get(node.map)
+    if retired is not None:
+        return f" ({reason_of(retired)})"
+    return f" (map {node.map} is set apart: {apart})" if apart is not None else ""

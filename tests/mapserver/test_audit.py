@@ -65,6 +65,7 @@ def test_the_records_name_the_holder_of_the_key(
         assert "retired by anna on 2" in words()[-1] and words()[-1].endswith('UTC: "a mirror"')
         anna.undo(1, because="a window")
         assert "in use again, by anna on 2" in words()[-1] and words()[-1].endswith('UTC: "a window"')
+        assert server.settle(30)
 
         # A program that says another name in the message.
         session = bus("anna")

@@ -8,9 +8,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.annotation import Annotation, Annotations, Floor
+from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
-from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredMap
+from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredMap, RetiredNodes
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
@@ -227,6 +227,22 @@ def test_links_by_hand_and_labels_of_floors_know_of_each_other(seam: Scene) -> N
     check_annotation(merged, Annotations((first,)), same_floor, seam.constraints)
     undone = ManualConstraints([*seam.constraints.made, replace(seam.constraints.made[0], holds=False)])
     check_annotation(merged, Annotations((first,)), second, undone)
+
+
+def test_a_place_at_a_retired_node_is_refused_with_what_retired_it(seam: Scene) -> None:
+    retired = ManualConstraint(RetiredNodes((LAST,)), True, "anna", 10**18, "a mirror")
+    seam.merger.constrain(ManualConstraints([retired]))
+    merged, kitchen = seam.merger.merged(), Annotation("kitchen", Place(LAST), False, "anna", 1)
+    with pytest.raises(
+        InvalidValue, match=rf'{LAST} is not in the merged map \(.*retired by anna .*: "a mirror"'
+    ):
+        check_annotation(merged, Annotations(()), kitchen, ManualConstraints([retired]))
+    # Taken back, and not merged yet.
+    taken_back = ManualConstraints([retired, replace(retired, holds=False)])
+    with pytest.raises(InvalidValue, match=f"{LAST} is in use again with the next merge: say it again then"):
+        check_annotation(merged, Annotations(()), kitchen, taken_back)
+    seam.merger.constrain(taken_back)
+    check_annotation(seam.merger.merged(), Annotations(()), kitchen, taken_back)
 
 
 def test_a_drive_from_map_to_map_is_evidence_against_labels_and_likeness_is_not() -> None:
