@@ -159,7 +159,7 @@ class Places:
 
     def _beside(self, entry: Annotation, anchor: NodeId) -> Resolved:
         """The nearest active node of the same robot's map to a node that takes no part in the merged map."""
-        own = self.merged.maps.get(anchor.map)
+        own, why = self.merged.maps.get(anchor.map), why_left_out(self.merged, anchor)
         gone = None if own is None else own.nodes.get(anchor)
         if own is not None and gone is not None:
             pose = gone.map_from_robot.mean
@@ -172,10 +172,10 @@ class Places:
             if distance <= REACH:
                 number = self.merged.component_of(node)
                 assert number is not None, "an active node has a pose"
-                note = f"{anchor} takes no part{why_left_out(self.merged, anchor)}; the nearest active node is {node}"
+                note = f"{anchor} takes no part{why}; the nearest active node is {node}"
                 return Resolved(node, self.merged.pose(node), number, note=note)
         raise InvalidValue(
-            f"place {entry.name} is at {anchor}, which is not in the merged map{why_left_out(self.merged, anchor)}; "
+            f"place {entry.name} is at {anchor}, which is not in the merged map{why}; "
             f"no active node of its map is within {REACH:g} m"
         )
 
