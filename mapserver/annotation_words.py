@@ -17,7 +17,7 @@ from mapweave.hybridmap.named_nodes import Resolve
 from mapweave.hybridmap.query import Resolved, ResolveRequest
 from mapweave.hybridmap.wall_time import read_time
 from mapweave.mapserver.field_words import field_words
-from mapweave.mapserver.places import position_of
+from mapweave.mapserver.places import others_of, position_of
 from mapweave.wire.typed import packed, value_of
 
 NODES = ("node", "anchor", "a", "b", "merged_from_node")
@@ -82,7 +82,7 @@ def body_of_words(
     if (place := plain.pop("place", None)) is not None:
         entry = annotations.last("place", str(place))
         if entry is None:
-            raise InvalidValue(f"there is no place {place}")
+            raise not_there("place", str(place), annotations)
         if isinstance(entry.body, Place) and entry.body.area is not None:
             plain["area"], radius = packed(entry.body.area), None
         else:
@@ -105,6 +105,12 @@ def body_of_words(
     if unknown:
         raise InvalidValue(f"a {kind} has no {', '.join(sorted(unknown))}")
     return _value(body, BODIES[kind])
+
+
+def not_there(kind: str, name: str, annotations: Annotations) -> InvalidValue:
+    """That no entry of this kind has this name, and which have one."""
+    names = [entry.name for entry, _ in annotations.in_force(BODIES[kind])]
+    return InvalidValue(f"there is no {kind} {name}{others_of(name, names)}")
 
 
 def _value(plain: Any, kind: type[Value], within: str = "") -> Value:
@@ -196,7 +202,7 @@ def annotation_of_words(
     if removed:
         before = annotations().last(kind, name)
         if before is None:
-            raise InvalidValue(f"there is no {kind} {name}")
+            raise not_there(kind, name, annotations())
         body = before.body
     else:
         body = body_of_words(kind, fields, resolve, annotations(), stamp_ns)

@@ -15,6 +15,7 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_effects import effects_of
+from mapweave.mapserver.annotation_words import not_there
 from mapweave.mapserver.floor_plans import check_plan
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.places import Places, why_left_out
@@ -176,7 +177,7 @@ def check_annotation(
     before = annotations.last(kind, name)
     if annotation.removed:
         if before is None:
-            raise InvalidValue(f"there is no {kind} {name}")
+            raise not_there(kind, name, annotations)
         return
     if before is not None and before.body == annotation.body:
         raise InvalidValue(f"that is known already: {before.words}")

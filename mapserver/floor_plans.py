@@ -76,11 +76,18 @@ def placed_plans(annotations: Annotations, merged: MergedMap) -> PlacedPlans:
 
 
 def check_plan(plan: FloorPlan, merged: MergedMap) -> PlacedPlan:
-    """Refuse a plan that lies under no component.
+    """Refuse a plan that lies under no component, and a pixel that its image does not have.
 
     Raises:
         InvalidValue: with the reason.
     """
+    width, height = plan.image.width, plan.image.height
+    for k, pair in enumerate(plan.pairs, 1):
+        if not (0.0 <= pair.u <= width and 0.0 <= pair.v <= height):
+            raise InvalidValue(
+                f"pair {k} ({pair.node}): pixel {pair.u:g},{pair.v:g} is outside of the image, which is "
+                f"{width} x {height} px"
+            )
     placed = placed_plan("plan", plan, merged)
     if not placed.parts:
         raise InvalidValue(placed.reason)

@@ -31,7 +31,7 @@ from mapweave.hybridmap.mission_order import (
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.mapserver.goals import node_of_goal
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import Places, others_of
 from mapweave.mapserver.roster import Roster
 from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.each_robot import in_parallel
@@ -191,7 +191,8 @@ class MissionRelay:
         via: tuple[NodeId, ...] = ()
         status = None if self.roster is None else self.roster.status(robot)
         if status is None and not (self.roster is not None and self.roster.alive(robot)):
-            raise InvalidValue(f"no robot {robot} has been heard of")
+            heard = () if self.roster is None else tuple(self.roster.presence())
+            raise InvalidValue(f"no robot {robot} has been heard of{others_of(robot, heard)}")
         if request.goal:
             map_id = MapId(robot, 0 if status is None else status.epoch)
             places = self._places()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import difflib
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -34,6 +35,8 @@ FAR = 1e6
 """m; of a longer distance the digits say nothing."""
 NEARBY = 1.5
 """A place that is a node reaches so far, m: a robot there sees the same as from the node."""
+MOST_NAMES = 20
+"""That a refusal gives."""
 FORMS = "give a node (r0.1.17), the name of a place, or a position in the merged map (3.1,-2.0)"
 
 
@@ -204,9 +207,20 @@ class Places:
 
     def alike(self, word: str) -> str:
         """Names that a mistyped one may be."""
-        names = [entry.name for entry, _ in self.annotations.in_force(Place)]
-        close = difflib.get_close_matches(word, names, 3, 0.6)
-        return f" (is it {' or '.join(close)}?)" if close else ""
+        return _alike(word, [entry.name for entry, _ in self.annotations.in_force(Place)])
+
+
+def others_of(word: str, names: Sequence[str]) -> str:
+    """For a name that is none of these: those that it may be, else the first ones; empty if there is none."""
+    if close := _alike(word, names):
+        return close
+    more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""
+    return f"; there are: {', '.join(names[:MOST_NAMES])}{more}" if names else ""
+
+
+def _alike(word: str, names: Sequence[str]) -> str:
+    close = difflib.get_close_matches(word, names, 3, 0.6)
+    return f" (is it {' or '.join(close)}?)" if close else ""
 
 
 def position_of(word: str) -> tuple[float, float] | None:

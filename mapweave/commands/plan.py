@@ -106,6 +106,7 @@ def run_add(arguments: argparse.Namespace) -> int:
     """Read the image, keep it, and say how it fits."""
     from mapweave.commands.usage import UsageError
     from mapweave.formats.plan_export import plan_words
+    from mapweave.hybridmap.errors import InvalidFile
     from mapweave.storage.nav2_map import SUFFIXES, read_nav2_map
     from mapweave.storage.plan_image import read_plan_file
     from mapweave.wire.typed import packed
@@ -121,7 +122,10 @@ def run_add(arguments: argparse.Namespace) -> int:
             raise UsageError("--metres-per-pixel goes with an image: a map.yaml has its resolution")
         described = read_nav2_map(path)
         fields |= {"metres_per_pixel": described.resolution, "origin": packed(described.origin)}
-        kept = read_plan_file(described.image, described.negate)
+        try:
+            kept = read_plan_file(described.image, described.negate)
+        except InvalidFile as error:
+            raise InvalidFile(f"the image that {path} names, {error}") from None
     else:
         kept = read_plan_file(path)
         if scale is not None:
@@ -239,8 +243,9 @@ def _merged(record: Fleet | OfflineAnnotations, arguments: argparse.Namespace) -
     from mapweave.commands.network import settings_of
     from mapweave.fleet import Fleet
     from mapweave.mapserver.map_files import merged_of
-    from mapweave.storage.map_file import unpack_map_file
+    from mapweave.terminal import Bar, plain_or_terminal
 
     if isinstance(record, Fleet):
-        return merged_of(unpack_map_file(record.map_bytes()), settings_of(arguments).merge)
+        with Bar(plain_or_terminal(), "fetching the map", None, transient=True):
+            return merged_of(record.map(), settings_of(arguments).merge)
     return record.merged

@@ -165,6 +165,17 @@ def test_a_robot_that_was_never_heard_of_gets_no_mission(house: House) -> None:
         house.person.explore("r7")
 
 
+def test_the_refusal_names_the_robots_that_there_are(house: House) -> None:
+    with pytest.raises(InvalidValue, match=r"no robot r7 has been heard of$"):
+        house.person.explore("r7")
+    link, _ = house.robot()
+    eventually(lambda: house.entry("r0").alive)
+    for name, rest in (("r00", r" \(is it r0\?\)$"), ("gustav", "; there are: r0$")):
+        with pytest.raises(InvalidValue, match=f"no robot {name} has been heard of{rest}"):
+            house.person.explore(name)
+    link.close()
+
+
 def test_a_robot_says_nothing_of_the_missions_of_others(house: House) -> None:
     """Neither in its status, nor as the answer to an order of its own."""
     link, control = house.robot()

@@ -72,6 +72,11 @@ def test_a_place_stands_wherever_a_node_may_stand_and_outlasts_the_server(house:
         InvalidValue, match=r"'kitchn' is no place of this map \(is it kitchen\?\): give a node"
     ):
         person.go("r0", "kitchn")
+    for name, rest in (("kitchn", r" \(is it kitchen\?\)$"), ("cellar", "; there are: hall, kitchen$")):
+        with pytest.raises(InvalidValue, match=f"there is no place {name}{rest}"):
+            person.withdraw("place", name)
+    with pytest.raises(InvalidValue, match=r"there is no closure kitchen$"):
+        person.withdraw("closure", "kitchen")
     person.withdraw("place", "kitchen")
     with pytest.raises(InvalidValue, match="goal 'kitchen' is no place of this map: give a node"):
         person.go("r0", "kitchen")

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
+import re
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
@@ -225,6 +226,29 @@ def test_a_plan_of_a_server_is_drawn(
     assert main(["plan", "show", "flat", "-o", str(picture)]) == 0
     assert capsys.readouterr().out.endswith(f"{picture}\n")
     assert cv2.imread(str(picture)).shape[0] > 300
+
+
+def test_a_pixel_outside_of_the_image_is_refused(house: House) -> None:
+    """Of a pixel with a zero too many it was said that some pair is wrong."""
+    assert house.server.settle(20.0)
+    house.person.put_plan_image(PNG.png)
+    pairs = fields()["pairs"]
+    for u, v in ((4000.0, 30.0), (-1.0, 30.0), (30.0, 5000.0)):
+        wrong = [*pairs, {"at": "r0.1.3", "u": u, "v": v}]  # type: ignore[misc]
+        words = f"pair 5 (r0.1.3): pixel {u:g},{v:g} is outside of the image, which is 400 x 500 px"
+        with pytest.raises(InvalidValue, match=re.escape(words)):
+            house.person.annotate("plan", "flat", **{**fields(), "pairs": wrong})
+    assert house.server.plans().plans == ()
+
+
+def test_a_map_yaml_whose_image_is_missing_is_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    described = tmp_path / "map.yaml"
+    described.write_text("image: flat.pgm\nresolution: 0.02\norigin: [1.0, -2.0, 0.5]\nnegate: 1\n")
+    assert main(["plan", "add", str(described), "--pair", "r0.1.3=1,2"]) == FAILED
+    said = f"mapweave: the image that {described} names, {tmp_path / 'flat.pgm'}: cannot be read"
+    assert capsys.readouterr().err.startswith(said)
 
 
 @pytest.mark.slow
