@@ -50,9 +50,16 @@ class FleetMap(FleetQuestions, Map):
         Raises:
             NotConnected: no map server answers.
         """
+        return self.map_and_bytes()[1]
+
+    def map_and_bytes(self) -> tuple[MapFile, bytes]:
+        """The content of the merged map, fetched now, and the bytes of its map file.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
         packed = self._packed()
-        unpack_map_file(packed)  # what is damaged is not handed on
-        return packed
+        return unpack_map_file(packed), packed  # what is damaged is not handed on
 
     def refresh(self) -> None:
         """Fetch the merged map again: from now on it is what `nodes`, `graph`, `plot` and `export` show.

@@ -162,7 +162,9 @@ class Bar:
     def _say(self, since: str = "") -> None:
         with self._saying:
             of = "" if self._total is None else f" of {self._total:g}"
-            line = f"{self._words}: {self._done:g}{of}{', ' * bool(self._detail)}{self._detail}{since}"
+            # Of what has no steps nothing is counted.
+            count = f": {self._done:g}{of}" if self._done or of else ""
+            line = f"{self._words}{count}{', ' * bool(self._detail)}{self._detail}{since}"
             if line != self._said:
                 self._console.print(line, markup=False, highlight=False, soft_wrap=True)
             self._said, self._said_at = line, self._clock()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import shutil
 from collections.abc import Iterator
+from contextlib import nullcontext
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
@@ -16,6 +17,7 @@ import pytest
 import mapweave
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission_control import MissionControl
+from mapweave.cli import main
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.explanation import PairExplanation
@@ -70,6 +72,24 @@ def running(tmp_path: Path) -> Iterator[Running]:
             yield Running(fleet, other, places, made)
     for bus in (served, person, other):
         bus.close()
+
+
+def test_a_map_is_fetched_into_a_file_and_read_once(
+    running: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """It was read twice, a second each for 250 nodes; that takes as long as fetching them."""
+    read: list[int] = []
+    monkeypatch.setattr(
+        "mapweave.fleet_map.unpack_map_file", lambda data: read.append(len(data)) or unpack_map_file(data)
+    )
+    monkeypatch.setattr(
+        "mapweave.storage.map_file.unpack_map_file", lambda data: pytest.fail("it is read again")
+    )
+    monkeypatch.setattr("mapweave.commands.map_fetch.fleet_of", lambda _: nullcontext(running.fleet))
+    out = tmp_path / "office.mapweave"
+    assert main(["map", "fetch", str(out)]) == 0
+    assert read == [out.stat().st_size]
+    assert capsys.readouterr().out == f"{out}: {running.fleet.map().title}, {read[0] / 1e6:.1f} MB\n"
 
 
 def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path: Path) -> None:

@@ -171,6 +171,15 @@ def test_progress_goes_on_while_one_step_takes_long(monkeypatch: pytest.MonkeyPa
     assert threading.active_count() == before
 
 
+def test_what_has_no_steps_is_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a map that a server packs nothing is known but that it takes long."""
+    monkeypatch.setattr(terminal, "EVERY", 0.05)
+    console, file = plain()
+    with Bar(console, "fetching the map", None):
+        eventually(lambda: file.getvalue().count("\n") >= 2)
+    assert all(re.fullmatch(r"fetching the map(, \d+ s)?", line) for line in file.getvalue().splitlines())
+
+
 def test_a_long_detail_leaves_the_numbers_of_a_bar() -> None:
     """On 80 columns they were cut away: `d… 11 nodes, 51 of 53 features left ...`."""
     file = io.StringIO()
