@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import socket
 import ssl
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -13,6 +15,11 @@ if TYPE_CHECKING:
     from mapweave.mapserver.http.last_shown import LastShown
     from mapweave.mapserver.http.web import Web
     from mapweave.wire.credentials import Credentials
+
+
+ALL_ADDRESSES = ("0.0.0.0", "::")
+"""To listen at, not to open."""
+OWN = "localhost"
 
 
 @dataclass(frozen=True)
@@ -31,8 +38,10 @@ class HttpAccess:
 
     @property
     def url(self) -> str:
-        """For people."""
+        """For people: where all addresses are served, by a name that the certificate has."""
         host, port = self.address
+        if self.logins is not None and host in ALL_ADDRESSES:
+            host = _name_of(self.logins.hosts)
         scheme = "http" if self.tls is None else "https"
         return f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}/"
 
@@ -54,6 +63,15 @@ class HttpAccess:
 
         if self.tls is not None:
             load(self.tls, own)
+
+
+def _name_of(hosts: Sequence[str]) -> str:
+    """The one name by which other machines reach the fleet's server; its own of several or of none."""
+    from mapweave.mapserver.http.same_site import is_loopback
+
+    machine = (OWN, socket.gethostname())
+    others = [host for host in hosts if host not in machine and not is_loopback(host)]
+    return others[0] if len(others) == 1 else OWN
 
 
 def http_access(words: str, folder: KeyFolder | None, server: str) -> HttpAccess:
