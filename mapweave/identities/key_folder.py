@@ -240,7 +240,9 @@ class KeyFolder:
     def _add(self, name: str, role: Role, days: float) -> Path:
         known = self.find(name)
         if known is not None and not known.revoked and known.role is not role:
-            raise Refused(f"{name} is a {known.role} already; revoke that key first")
+            article = "an" if known.role is Role.OPERATOR else "a"
+            first = f"revoke that key first: mapweave keys revoke {name}"
+            raise Refused(f"{name} is {article} {known.role} already; {first}")
         issued_at = datetime.now(UTC).isoformat(timespec="seconds")
         void = () if known is None else known.void
         subject = f"{name}~{len(void)}" if void and self.profile is Profile.PRODUCTION else name

@@ -146,6 +146,9 @@ def test_mistakes_are_one_line(keys: Path, tmp_path: Path, capfd: pytest.Capture
     assert "r0 is a robot already" in complaint(
         capfd, "keys", "add", "r0", "--role", "viewer", *where, status=NO
     )
+    assert main(["keys", "add", "ann", "--role", "operator", *map(str, where)]) == 0
+    said = complaint(capfd, "keys", "add", "ann", "--role", "viewer", *where, status=NO)
+    assert "ann is an operator already; revoke that key first: mapweave keys revoke ann" in said
     assert "no keys are here" in complaint(capfd, "server", "--keys", tmp_path, "--data", tmp_path / "d")
     fresh = ("--keys", tmp_path / "fresh")
     for host in ('a"b', "a b", "-x", "a/b", ""):
