@@ -71,9 +71,11 @@ def verify(a: Node, b: Node) -> Verdict:
     return known["verdict"]  # type: ignore[no-any-return]
 
 
-@pytest.fixture(autouse=True)
-def _each_pair_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(comparisons, "verify", verify)
+@pytest.fixture(scope="module", autouse=True)
+def each_pair_once() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(comparisons, "verify", verify)
+        yield
 
 
 @cache
@@ -104,7 +106,8 @@ class Server:
 
     def __init__(self, path: Path, log: Log, constraints: ManualConstraints | None = None) -> None:
         self.merger = Merger(compare=compare)
-        self.keeper = VerificationCacheKeeper(path)
+        # Its clock stands still: on a slow disk not every merge is written, and another table is right then.
+        self.keeper = VerificationCacheKeeper(path, clock=lambda: 0.0)
         self.keeper.restore(self.merger)
         if constraints is not None:
             self.merger.constrain(constraints)
@@ -151,12 +154,28 @@ def by_drive(path: Path, log: Log) -> Server:
     return server
 
 
+@pytest.fixture(scope="module")
+def driven(each_pair_once: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Server, dict[str, bytes]]:
+    """A server that has merged after each drive, and the files that it leaves."""
+    folder = tmp_path_factory.mktemp("driven")
+    server = by_drive(folder / "store", drives())
+    return server, {file.name: file.read_bytes() for file in folder.iterdir()}
+
+
+@pytest.fixture
+def before(driven: tuple[Server, dict[str, bytes]], tmp_path: Path) -> Server:
+    """That server, to be looked at only; copies of its files lie in the test's folder."""
+    server, files = driven
+    for name, data in files.items():
+        (tmp_path / name).write_bytes(data)
+    return server
+
+
 def retired(map_id: MapId) -> ManualConstraints:
     return ManualConstraints([ManualConstraint(RetiredMap(map_id), True, "anna", 1, "moved")])
 
 
-def test_a_restarted_server_supersedes_what_it_had(tmp_path: Path) -> None:
-    before = by_drive(tmp_path / "store", drives())
+def test_a_restarted_server_supersedes_what_it_had(before: Server, tmp_path: Path) -> None:
     assert len(before.merger.merged().superseded) > 10
     assert decisions(Server(tmp_path / "store", drives())) == decisions(before)
     # Without the record it would have been another table.
@@ -300,11 +319,11 @@ def test_parts_that_do_not_fit_are_refused(
 
 
 @pytest.mark.parametrize("damage", first_quick(["flipped", "version", "merging", "cut", "empty", "other"], 3))
+@pytest.mark.usefixtures("before")
 def test_a_damaged_record_is_thrown_away(
     tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = drives()
-    by_drive(tmp_path / "store", log)
     path = tmp_path / f"store{RECORD_SUFFIX}"
     data = bytearray(path.read_bytes())
     if damage == "cut":
@@ -363,8 +382,7 @@ def _moved(map_id: MapId, put: NodePut) -> NodePut:
     return NodePut(replace(put.node, id=NodeId(*map_id, put.node.id.number)))
 
 
-def test_a_record_without_a_verification_cache_is_used(tmp_path: Path) -> None:
-    before = by_drive(tmp_path / "store", drives())
+def test_a_record_without_a_verification_cache_is_used(before: Server, tmp_path: Path) -> None:
     (tmp_path / f"store{SUFFIX}").unlink()
     again = Server(tmp_path / "store", drives())
     assert again.merger.counters.verified > 50
