@@ -29,6 +29,8 @@ FIRST_PAUSE, LONGEST_PAUSE = 1.0, 15.0
 SILENCE = 30.0
 """s without any answer to what was asked, after which the child is started again: Ray notices only after more
 than a minute that its head is gone."""
+SAID_EVERY = 15.0
+"""s; so often a server says that it waits for its cluster."""
 PROCESS = "mapweave.mapserver.cluster.gateway_process"
 
 
@@ -135,10 +137,16 @@ class Gateway:
 
     def _serve(self, child: _Child) -> str:
         """Hand on answers until the child ends: why, in words."""
-        connection = child.connection
+        connection, began, said = child.connection, time.monotonic(), 0.0
         while not connection.poll(1.0):
             if self._closing.is_set():
                 return ""
+            if (waited := time.monotonic() - began) > said + SAID_EVERY:
+                said = waited
+                log.info(
+                    "the cluster at %s is not reached yet, after %.0f s: this process works alone meanwhile",
+                    self._address, waited,
+                )  # fmt: skip
         workers, words = pickle.loads(connection.recv_bytes())
         if words:
             return str(words)

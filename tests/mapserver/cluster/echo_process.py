@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import pickle
 import sys
+import time
 from multiprocessing.connection import Connection
 
 
@@ -13,6 +14,8 @@ def main() -> None:
     if sys.argv[2] == "nowhere":
         connection.send_bytes(pickle.dumps((0, "nothing listens at nowhere")))
         return
+    if sys.argv[2] == "slow":
+        time.sleep(2.0)
     connection.send_bytes(pickle.dumps((int(sys.argv[3]), "")))
     while True:
         try:

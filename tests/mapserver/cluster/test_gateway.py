@@ -64,3 +64,16 @@ def test_without_a_cluster_every_request_fails_at_once_and_the_log_says_why(
         assert opened.workers == 0
         with pytest.raises(ClusterGone):
             opened.ask(0, b"hello").result(0.0)
+
+
+def test_a_server_says_that_it_waits_for_its_cluster(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(gateway_module, "SAID_EVERY", 0.2)
+    with caplog.at_level("INFO"), gateway(monkeypatch, "slow") as opened:
+        eventually(lambda: opened.workers == 3)
+    waiting, reached = (
+        "the cluster at slow is not reached yet, after ",
+        "in the cluster at slow, with 3 workers",
+    )
+    assert waiting in caplog.text and caplog.text.index(waiting) < caplog.text.index(reached)
