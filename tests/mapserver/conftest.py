@@ -33,9 +33,12 @@ def mapped_room(tmp_path_factory: pytest.TempPathFactory) -> Callable[[], Mapped
     nodes, edges = take_map(world, ROBOT, stops, rng)
     truth = {node.id: stop for node, stop in zip(nodes, stops, strict=True)}
     log = {ROBOT: changes_of(nodes, edges)}
+    stored = write_store(tmp_path_factory.mktemp("written") / "s0.sqlite", log).read_bytes()
 
     def make() -> MappedRoom:
-        return MappedRoom(write_store(tmp_path_factory.mktemp("store") / "s0.sqlite", log), world, truth)
+        path = tmp_path_factory.mktemp("store") / "s0.sqlite"
+        path.write_bytes(stored)
+        return MappedRoom(path, world, truth)
 
     return make
 

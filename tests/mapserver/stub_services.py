@@ -126,6 +126,7 @@ class StubServices:
         return done
 
 
+@cache
 def _explained(request: ExplainRequest) -> Explanation:
     merged = two_maps()
     if request.ends is None:

@@ -60,6 +60,7 @@ def views() -> list[View]:
     return [take_view(WORLD, TOUR[k] @ beside, np.random.default_rng(k))[0] for k in range(2)]
 
 
+@cache
 def sound_logs() -> dict[MapId, list[bytes]]:
     """Two robots that have mapped one room, as messages."""
     logs = map_tours(WORLD, dict.fromkeys(SOUND, TOUR), np.random.default_rng(2))

@@ -46,9 +46,16 @@ def browser(chromium: Browser) -> Iterator[Browser]:
     chromium.errors()
 
 
+@pytest.fixture(scope="session")
+def stored(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """The bytes of a server's store, with the maps of two robots."""
+    return write_store(tmp_path_factory.mktemp("written") / "s0.sqlite", logs()).read_bytes()
+
+
 @pytest.fixture
-def server(tmp_path: Path) -> Iterator[MapServer]:
-    path = write_store(tmp_path / "s0.sqlite", logs())
+def server(stored: bytes, tmp_path: Path) -> Iterator[MapServer]:
+    path = tmp_path / "s0.sqlite"
+    path.write_bytes(stored)
     with MapServer(MemoryBus(MemoryHub()), Keys("demo"), path, "s0") as server:
         assert server.settle(60.0)
         yield server
