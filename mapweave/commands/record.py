@@ -33,11 +33,13 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Record until the robot ends or the process is stopped."""
     from mapweave.agent.drivers.recorded import RecordedRobot
+    from mapweave.agent.recordings.mcap_writer import check_new
     from mapweave.terminal import Bar, plain_or_terminal
 
     name: str = arguments.name
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
+    check_new(arguments.out)
     stop = stop_on_signals()
     if arguments.body:
         network = replace(network, endpoints=(arguments.body,))

@@ -69,6 +69,18 @@ def test_a_recording_is_not_overwritten(
     assert [p.name for p in (tmp_path / "drive").iterdir()] == ["notes.txt"]
 
 
+def test_no_robot_is_opened_for_a_folder_that_is_in_use(
+    driver: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It stayed open, and the thread of its camera aborted the process while that ended: status 134."""
+    (tmp_path / "rolling.py").write_text(DRIVER.replace("self.count = 0", "raise SystemExit('it is opened')"))
+    (tmp_path / "drive").mkdir()
+    (tmp_path / "drive" / "notes.txt").write_text("mine")
+    out = ["--out", str(tmp_path / "drive"), "--robot", driver, "--connect", "tcp/127.0.0.1:1"]
+    assert main(["record", "r0", *out]) == 1
+    assert "not empty" in capfd.readouterr().err
+
+
 def test_a_full_disk_ends_the_command(
     driver: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
