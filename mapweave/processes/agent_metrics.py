@@ -123,7 +123,8 @@ class AgentMetrics(Collector):
         try:
             server, thread = start_http_server(port, HOST, self._registry)
         except OSError as error:
-            raise NotConnected(f"--metrics: cannot listen at {HOST}:{port} ({error.strerror})") from error
+            where = f"{HOST}:{port} ({error.strerror})"
+            raise NotConnected(f"--metrics: cannot listen at {where}; choose another port") from error
 
         def close() -> None:
             server.shutdown()

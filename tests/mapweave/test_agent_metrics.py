@@ -178,7 +178,7 @@ def test_a_running_agent_is_scraped_and_waits_for_no_one(tmp_path: Path) -> None
 
 
 def test_a_port_that_cannot_be_had(port: int) -> None:
-    with pytest.raises(NotConnected, match=f"127.0.0.1:{port} .*in use"):
+    with pytest.raises(NotConnected, match=rf"127.0.0.1:{port} .*in use\); choose another port$"):
         AgentMetrics("r0").serve(port)
     for wrong in (0, -1, 70_000):
         with pytest.raises(SettingsError, match=f"--metrics {wrong}: give a port"):
