@@ -136,13 +136,6 @@ class Factors:
             out.append(ring)
         return np.concatenate(out)
 
-    def strains(self, means: Array) -> Array:
-        """(M,) how far nodes are from where measurements have them, chi-square with 3 degrees of freedom."""
-        between = compose_poses(inverse_poses(means[self.a]), means[self.b])
-        off = compose_poses(inverse_poses(self.means), between)
-        out: Array = np.einsum("ni,nij,nj->n", off, self.weights, off)
-        return out
-
     def information(self, means: Array) -> sparse.csc_matrix:
         """(3N, 3N) of the right perturbations of all nodes.
 

@@ -26,15 +26,15 @@ def vector(motion: Array) -> Array:
     return np.array([motion[0, 2], motion[1, 2], math.atan2(motion[1, 0], motion[0, 0])])
 
 
-def drawn(seed: int, noise: float) -> tuple[Array, list[Measurement]]:
-    """(N, 3) poses, and measurements between them, some of which may be wrong."""
+def drawn(seed: int) -> tuple[Array, list[Measurement]]:
+    """(N, 3) poses, and measurements between them that are nearly right."""
     rng = np.random.default_rng(seed)
     means = rng.normal(0.0, 1.0, (NODES, 3))
     measurements = []
     for a in range(NODES):
         for b in range(a + 1, NODES):
             root = 0.1 * rng.normal(0.0, 1.0, (3, 3))
-            off = matrix(rng.normal(0.0, noise, 3))
+            off = matrix(rng.normal(0.0, 1e-5, 3))
             between = vector(np.linalg.inv(matrix(means[a])) @ matrix(means[b]) @ off)
             text = PoseGaussian(Pose2.from_vector(between), root @ root.T + 0.01 * np.eye(3))
             measurements.append(Measurement(NodeId("a", 1, a), NodeId("a", 1, b), text, bool((a + b) % 2)))
@@ -51,19 +51,9 @@ def residual(m: Measurement, a: Array, b: Array) -> Array:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_strains_are_those_of_the_group(seed: int) -> None:
-    means, measurements = drawn(seed, 0.3)
-    result = factors_of(measurements).strains(means)
-    for m, strain in zip(measurements, result, strict=True):
-        off = residual(m, means[m.a.number], means[m.b.number])
-        information = np.linalg.inv(m.covariance)
-        assert strain == pytest.approx(off @ information @ off)
-
-
-@pytest.mark.parametrize("seed", range(3))
 def test_information_is_that_of_finite_differences(seed: int) -> None:
     """To first order in the residuals, so they are small here."""
-    means, measurements = drawn(seed, 1e-5)
+    means, measurements = drawn(seed)
     result = factors_of(measurements).information(means).toarray()
     expected = np.zeros((3 * NODES, 3 * NODES))
     for m in measurements:
