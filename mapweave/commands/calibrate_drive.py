@@ -28,12 +28,14 @@ def add_to(actions: Any) -> None:
         description="Estimate the wheels' scales, the camera's mount and the delay between camera and wheels "
         "from a drive, each with its standard deviation and whether the drive shows it, and keep them under "
         "the robot's name for `mapweave agent` and `mapweave replay`. Drive for half a minute, with turns to "
-        "both sides. The drive is a recording, or with --robot what a robot senses now; it gets no commands.",
+        "both sides. The drive is a recording, or with --name and --robot or --settings what a robot senses "
+        "now; it gets no commands.",
     )
     add_recording(parser, optional=True)
     parser.add_argument(
         "--robot", metavar="NAME|DRIVER",
-        help="of a recording: one of the robots in its splits.toml; without one: the driver, as for `agent`",
+        help="of a recording: one of the robots in its splits.toml; without one: the driver, as for `agent` "
+        "(default: [robot] driver of the settings)",
     )  # fmt: skip
     parser.add_argument(
         "--name", type=values.name, help="the robot's name in the fleet (default: as `replay` names it)"
@@ -69,8 +71,8 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.processes.agent import measured
     from mapweave.terminal import plain_or_terminal
 
-    if arguments.recording is None and not (arguments.robot and arguments.name):
-        raise UsageError("give a recording, or --robot DRIVER and --name NAME of a robot")
+    if arguments.recording is None and not (arguments.name and (arguments.robot or arguments.settings)):
+        raise UsageError("give a recording, or --name NAME of a robot and --robot DRIVER or --settings FILE")
     cv2.setNumThreads(1)
     name = name_of(arguments)
     file = calibration_of(arguments, name)

@@ -201,9 +201,11 @@ def name_of(arguments: argparse.Namespace) -> str:
 
     from mapweave.hybridmap.ids import check_name
 
+    if arguments.name:
+        return check_name(arguments.name)
     given = (arguments.robot or arguments.recording.resolve().stem).lower()
     fallback = re.sub("[^a-z0-9_-]", "-", given).strip("-_")[:32]  # a longer name is refused
-    return check_name(arguments.name or fallback or "recording")
+    return check_name(fallback or "recording")
 
 
 def _report(damage: Sequence[str]) -> int:

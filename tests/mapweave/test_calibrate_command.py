@@ -172,5 +172,8 @@ def test_a_robot_that_fails_while_it_is_calibrated_is_closed_and_named(
     Path("live.py").write_text(f"SILENT = {silent}\n{LIVE}")
     said = complaint(capfd, "calibrate", "drive", "--robot", "live.py:Live", "--name", "r0")
     assert ("no answer" if silent else "the camera gives no image") in said
+    # As the guide has it, with the driver of the settings.
+    Path("r0.toml").write_text('[robot]\ndriver = "live.py:Live"\n')
+    assert complaint(capfd, "calibrate", "drive", "--settings", "r0.toml", "--name", "r0") == said
     assert Path("closed").exists()
     assert not Path("out").exists()
