@@ -16,7 +16,7 @@ from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.wire.codec import encode_change
-from synthetic.world import World, take_map
+from synthetic.world import World, room, take_map
 
 LOG_ID = 7
 """Of every log in a store that is written here."""
@@ -44,6 +44,12 @@ def map_tours(
         map_id: changes_of(*take_map(world, map_id, list(tour), rng, None, sigma_xy, sigma_heading))
         for map_id, tour in tours.items()
     }
+
+
+def looked_around(maps: Iterable[MapId], seed: int, stops: int = 4) -> dict[MapId, list[ChangeBody]]:
+    """The changes of robots that each look around in one room, all drawn with a seed."""
+    rng = np.random.default_rng(seed)
+    return map_tours(room(0, 0, 5, 4, 700, rng), dict.fromkeys(maps, looking_around(stops)), rng)
 
 
 def merger_of(logs: Mapping[MapId, Iterable[ChangeBody]]) -> Merger:

@@ -34,8 +34,7 @@ from mapweave.merge.explanation.map_explanation import explain_fleet, explain_ma
 from mapweave.merge.explanation.node_explanation import explain_nodes
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.log_messages import Scalar
-from synthetic.maps import looking_around, map_tours, merger_of
-from synthetic.world import room
+from synthetic.maps import looked_around, merger_of
 
 HERE = PoseGaussian.from_sigmas(Pose2(0.5, -0.25, 0.1), 0.02, 0.01)
 ANSWER = RelocalizeAnswer(
@@ -142,9 +141,7 @@ def _explained(request: ExplainRequest) -> Explanation:
 @cache
 def two_maps() -> MergedMap:
     """Two robots have looked around in one room."""
-    rng = np.random.default_rng(6)
-    tours = dict.fromkeys((MapId("r0", 1), MapId("r1", 1)), looking_around(4))
-    return merger_of(map_tours(room(0, 0, 5, 4, 700, rng), tours, rng)).merged()
+    return merger_of(looked_around((MapId("r0", 1), MapId("r1", 1)), seed=6)).merged()
 
 
 def picture(width: int = 160, height: int = 120, kind: str = ".png") -> bytes:

@@ -7,7 +7,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mapweave.agent.replication.epochs import newest_on_server
@@ -29,8 +28,7 @@ from mapweave.offline_merge import merge_parts
 from mapweave.wire.codec import encode_body
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from synthetic.maps import looking_around, map_tours
-from synthetic.world import room
+from synthetic.maps import looked_around
 from tests.waiting import eventually
 
 KEYS = Keys("base")
@@ -38,13 +36,7 @@ R0, R1, R2 = MapId("r0", 4), MapId("r1", 1), MapId("r2", 1)
 JOINED = MapEvent(7, MapEventKind.JOINED, "r0.4 and r1.1 are one map now")
 
 
-def logs() -> dict[MapId, list[ChangeBody]]:
-    """Three robots in one room."""
-    rng = np.random.default_rng(8)
-    return map_tours(room(0, 0, 5, 4, 700, rng), dict.fromkeys((R0, R1, R2), looking_around(4)), rng)
-
-
-LOGS = logs()
+LOGS = looked_around((R0, R1, R2), seed=8)
 BASE = BaseMap("office.mapweave", {map_id: HybridMap(LOGS[map_id]) for map_id in (R0, R1)}, history=(JOINED,))
 
 

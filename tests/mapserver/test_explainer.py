@@ -44,8 +44,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode
-from synthetic.maps import looking_around, map_tours, write_store
-from synthetic.world import room
+from synthetic.maps import looked_around, write_store
 
 A, B = MapId("a", 1), MapId("b", 1)
 KEYS = Keys("fleet")
@@ -53,8 +52,7 @@ KEYS = Keys("fleet")
 
 def logs() -> dict[MapId, list[ChangeBody]]:
     """Two robots have looked around in one room."""
-    rng = np.random.default_rng(6)
-    return map_tours(room(0, 0, 5, 4, 700, rng), dict.fromkeys((A, B), looking_around(6)), rng)
+    return looked_around((A, B), seed=6, stops=6)
 
 
 @pytest.fixture(scope="module")

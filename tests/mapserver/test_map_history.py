@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import NodeRetired
@@ -28,8 +27,7 @@ from mapweave.merge.pose_graph.links import refuse
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.messages import KeptHistory, decode, encode
 from mapweave.wire.packing import pack
-from synthetic.maps import looking_around, map_tours, merger_of
-from synthetic.world import room
+from synthetic.maps import looked_around, merger_of
 
 A, B = MapId("a", 1), MapId("b", 1)
 APART = ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", 10**18, "two kitchens")])
@@ -38,9 +36,7 @@ APART = ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", 10**18,
 @pytest.fixture(scope="module")
 def merger() -> Merger:
     """Two robots have looked around in one room."""
-    rng = np.random.default_rng(6)
-    tours = dict.fromkeys((A, B), looking_around(4))
-    return merger_of(map_tours(room(0, 0, 5, 4, 700, rng), tours, rng))
+    return merger_of(looked_around((A, B), seed=6))
 
 
 @pytest.fixture(scope="module")

@@ -18,8 +18,7 @@ from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.offline_merge import merge_parts
 from mapweave.storage.map_file import write_map_file
-from synthetic.maps import looking_around, map_tours
-from synthetic.world import room
+from synthetic.maps import looked_around
 from tests.mapweave.command_line import commands, parsers
 
 CASES: dict[str, list[tuple[int, str]]] = {
@@ -220,9 +219,7 @@ CASES: dict[str, list[tuple[int, str]]] = {
 @pytest.fixture(scope="module")
 def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The merged map of two robots in one room."""
-    rng = np.random.default_rng(8)
-    tours = {MapId(name, 1): looking_around(4) for name in ("r0", "r1")}
-    logs = map_tours(room(0, 0, 5, 4, 700, rng), tours, rng)
+    logs = looked_around((MapId("r0", 1), MapId("r1", 1)), seed=8)
     merged = merge_parts({name: HybridMap(log) for name, log in logs.items()}, ManualConstraints())
     path = tmp_path_factory.mktemp("map") / "merged.mapweave"
     write_map_file(path, map_file_of(merged))

@@ -11,7 +11,6 @@ from collections.abc import Iterable
 from importlib.metadata import packages_distributions
 from pathlib import Path
 
-import numpy as np
 import pytest
 
 from mapweave.cli import main
@@ -24,8 +23,7 @@ from mapweave.mapserver.map_files import map_file_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.offline_merge import merge_parts
 from mapweave.storage.map_file import MapFile, write_map_file
-from synthetic.maps import looking_around, map_tours
-from synthetic.world import room
+from synthetic.maps import looked_around
 from tests.mapweave.command_line import commands
 from tests.simulator import needs_simulator
 
@@ -138,9 +136,7 @@ CASES: list[tuple[str, str, str]] = [
 @pytest.fixture(scope="module")
 def merged() -> MergedMap:
     """Two robots in one room."""
-    rng = np.random.default_rng(8)
-    tours = {MapId(name, 1): looking_around(4) for name in ("r0", "r1")}
-    logs = map_tours(room(0, 0, 5, 4, 700, rng), tours, rng)
+    logs = looked_around((MapId("r0", 1), MapId("r1", 1)), seed=8)
     return merge_parts({name: HybridMap(log) for name, log in logs.items()}, ManualConstraints())
 
 

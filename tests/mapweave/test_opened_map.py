@@ -41,8 +41,7 @@ from mapweave.opened_map import MapSource, open_map
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, RefusedPair, pack_map_file, unpack_map_file, write_map_file
 from mapweave.wire.messages import KeptHistory, encode
-from synthetic.maps import fill_store, looking_around, map_tours
-from synthetic.world import room
+from synthetic.maps import fill_store, looked_around
 from tests.mapweave.command_line import complaint
 from tests.waiting import eventually
 
@@ -52,13 +51,7 @@ KITCHEN = Annotation("kitchen", Place(NodeId("r0", 1, 3)), False, "anna", 6)
 EVENT = MapEvent(7, MapEventKind.JOINED, "r0.1 and r1.1 are one map now")
 
 
-def logs() -> dict[MapId, list[ChangeBody]]:
-    """Two robots in one room."""
-    rng = np.random.default_rng(8)
-    return map_tours(room(0, 0, 5, 4, 700, rng), dict.fromkeys((R0, R1), looking_around(4)), rng)
-
-
-LOGS = logs()
+LOGS = looked_around((R0, R1), seed=8)
 
 
 def annotated_store(path: Path, maps: dict[MapId, list[ChangeBody]]) -> Path:

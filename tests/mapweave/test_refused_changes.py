@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from mapweave.cli import main
-from mapweave.hybridmap.change import ChangeBody, EdgePut
+from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.explanation import MARGINAL
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
@@ -26,23 +26,16 @@ from mapweave.opened_map import open_map
 from mapweave.storage.map_file import read_map_file, write_map_file
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from synthetic.maps import LOG_ID, entries_of, fill_store, looking_around, map_tours
-from synthetic.world import room
+from synthetic.maps import LOG_ID, entries_of, fill_store, looked_around
 
 R0, R1 = MapId("r0", 1), MapId("r1", 1)
 WORDS = "is refused (edge r1.1.98 is 99000 m long"
 
 
-def logs() -> dict[MapId, list[ChangeBody]]:
-    """Two robots in one room."""
-    rng = np.random.default_rng(8)
-    return map_tours(room(0, 0, 5, 4, 700, rng), dict.fromkeys((R0, R1), looking_around(4)), rng)
-
-
 @pytest.fixture(scope="module")
 def stores(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
     """A store that has taken all that two robots sent, and one that has refused an edge of the second."""
-    folder, changes = tmp_path_factory.mktemp("stores"), logs()
+    folder, changes = tmp_path_factory.mktemp("stores"), looked_around((R0, R1), seed=8)
     far = PoseGaussian(Pose2(99e3), np.eye(3))
     edge = Edge(NodeId(*R1, 98), NodeId(*R1, 1), NodeId(*R1, 3), far, EdgeKind.MAPPED)
     sound, unsound = folder / "sound", folder / "unsound"

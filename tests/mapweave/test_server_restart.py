@@ -12,15 +12,13 @@ from contextlib import contextmanager
 from pathlib import Path
 from urllib.request import urlopen
 
-import numpy as np
 import pytest
 from websockets.sync.client import connect
 
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.http.live import LOADING, NOT_THERE
 from mapweave.storage.map_file import MapFile, write_map_file
-from synthetic.maps import looking_around, map_tours
-from synthetic.world import room
+from synthetic.maps import looked_around
 from tests.waiting import eventually, free_port
 
 
@@ -58,10 +56,8 @@ def first_messages(http: int) -> dict[str, dict]:
 
 @pytest.mark.slow
 def test_the_page_shows_the_map_of_before_while_the_server_loads(tmp_path: Path) -> None:
-    rng, http = np.random.default_rng(4), free_port()
-    tours = {MapId(name, 1): looking_around(4) for name in ("r0", "r1")}
-    logs = map_tours(room(0, 0, 5, 4, 700, rng), tours, rng)
-    for map_id, log in logs.items():
+    http = free_port()
+    for map_id, log in looked_around((MapId("r0", 1), MapId("r1", 1)), seed=4).items():
         write_map_file(tmp_path / f"{map_id}.mapweave", MapFile("agent", str(map_id), tuple(log)))
     data = ["--data", str(tmp_path / "data"), "--map", str(tmp_path / "r0.1.mapweave")]
 

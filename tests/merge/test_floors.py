@@ -18,8 +18,7 @@ from mapweave.merge.floors import across_floors
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.offline_merge import merge_parts
-from synthetic.maps import looking_around, map_tours
-from synthetic.world import room
+from synthetic.maps import looked_around
 
 NAMES = [MapId(name, 1) for name in "abcdef"]
 HERE = PoseGaussian(Pose2(), np.eye(3))
@@ -80,10 +79,7 @@ def test_a_map_without_a_label_goes_with_those_it_has_most_in_common_with() -> N
 @pytest.fixture(scope="module")
 def twins() -> dict[MapId, HybridMap]:
     """Three robots in rooms that look the same: two on one floor, one above."""
-    rng = np.random.default_rng(6)
-    world = room(0, 0, 5, 4, 700, rng)
-    logs = map_tours(world, dict.fromkeys(NAMES[:3], looking_around(4)), rng)
-    return {map_id: HybridMap(log) for map_id, log in logs.items()}
+    return {map_id: HybridMap(log) for map_id, log in looked_around(NAMES[:3], seed=6).items()}
 
 
 def parts(merged: MergedMap) -> Counter[frozenset[MapId]]:

@@ -14,7 +14,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.explanation.map_explanation import explain_maps
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from synthetic.maps import changes_of, looking_around, map_tours, merger_of
+from synthetic.maps import changes_of, looked_around, merger_of
 from synthetic.world import room, take_map
 
 A, B = MapId("a", 1), MapId("b", 1)
@@ -25,9 +25,7 @@ NOON = 1_772_366_400_000_000_000
 @pytest.fixture
 def merger() -> Merger:
     """Two robots have looked around in one room."""
-    rng = np.random.default_rng(3)
-    tours = dict.fromkeys((A, B), looking_around(6))
-    return merger_of(map_tours(room(0, 0, 5, 4, 700, rng), tours, rng))
+    return merger_of(looked_around((A, B), seed=3, stops=6))
 
 
 def between(merged: MergedMap) -> set[tuple[NodeId, NodeId]]:
