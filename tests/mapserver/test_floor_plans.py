@@ -116,7 +116,7 @@ def test_a_plan_that_cannot_be_placed_is_refused(merged: MergedMap) -> None:
     pairs = pairs_of(merged)
     with pytest.raises(InvalidValue, match="component 0 has 2 pairs, and 3 are needed"):
         check_plan(plan_of(pairs[:2]), merged)
-    mirrored = [replace(pair, v=-pair.v) for pair in pairs]
+    mirrored = [replace(pair, v=500.0 - pair.v) for pair in pairs]
     with pytest.raises(InvalidValue, match="a mirror image of the plan fits better"):
         check_plan(plan_of(mirrored), merged)
     gone = [replace(pair, node=NodeId("c", 1, k)) for k, pair in enumerate(pairs)]
