@@ -184,7 +184,8 @@ def load() -> None:
     """Compile, or read from disk, all kernels imported so far: a robot that drives must not wait for it."""
     said = False
     for kernel in KERNELS:
-        if kernel.compiled_now and not said:
+        known = "machine" in kernel.__dict__  # compiled by an earlier call
+        if kernel.compiled_now and not (known or said):
             said = True
             log.warning("compiling what runs often, once for this computer: this takes up to a minute")
 

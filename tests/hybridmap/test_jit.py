@@ -46,6 +46,7 @@ import some_kernels
 from mapweave.hybridmap import jit
 assert "numba" not in sys.modules or sys.argv[1] == "without", "imported too early"
 jit.load()
+jit.load()  # of a second robot in the process
 kernel = some_kernels.lengths
 rows = np.array([[3.0, 4.0], [0.0, 2.0]])
 report = {"lengths": kernel(rows, some_kernels.Scale(2.0, np.array([1.0, 0.0])), 1).tolist()}
