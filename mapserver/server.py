@@ -177,6 +177,7 @@ class MapServer:
             self._quotas, self._gone, worker.unmerged, worker.note_refusal, worker.note_disbelief,
             self._metrics.acknowledged, self._roster.status_period_of,
         )  # fmt: skip
+        self._roster.remind = self._ingest.remind
         clock.give_way(lambda: self._ingest.busy or self._admission.busy)
         self._plans = PlanService(
             self._bus, self._keys, self._name, lambda: worker.current().merged,

@@ -19,6 +19,7 @@ import threading
 import time
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
+from typing import NamedTuple
 
 from mapweave.hybridmap.change import Change, ChangeBody
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, MapweaveError
@@ -51,6 +52,12 @@ QUOTA_PAUSE = 10.0
 """s after which a log is tried again that the robot's quota has no room for."""
 MOST_AHEAD = 10_000_000
 """Changes that a server may lack of a log: a robot makes about one a second, and a year has 3e7."""
+
+
+class Reminder(NamedTuple):
+    """A log that is acknowledged once more, though nothing new has come: for what else is said with it."""
+
+    map: MapId
 
 
 class Ingest:
@@ -120,7 +127,7 @@ class Ingest:
         self._puller = Puller(bus, keys, self._intakes, unmerged, s.ask_timeout, self._put_pulled)
         self._pulls = self._puller.schedule
         self._unaware: dict[MapId, AgentLog] = {}
-        self._work: Inbox[Sample | Pulled | Piece | News] = Inbox()
+        self._work: Inbox[Sample | Pulled | Piece | News | Reminder] = Inbox()
         self._follower = Follower(
             store, self._logs, self._intakes, self._pulls, s.pull, self._pass_on, note_refusal
         )
@@ -170,6 +177,13 @@ class Ingest:
         """Pass on what other servers have written to the store; from any thread, in the ingest's own."""
         self._work.put("", news, bounded=False)
 
+    def remind(self, map_id: MapId) -> bool:
+        """Have a log acknowledged once more, from any thread; returns at once whether there is one."""
+        if map_id not in self._logs:
+            return False
+        self._work.put(map_id.agent, Reminder(map_id), bounded=False)
+        return True
+
     def close(self) -> None:
         """Stop listening; received changes are applied, missing ones will be pulled next time."""
         for declared in self._declared:
@@ -185,7 +199,7 @@ class Ingest:
         """A message has come; in the bus's thread."""
         robot = robot_of(sample.key)
 
-        def replaces(last: Sample | Pulled | Piece | News) -> bool:
+        def replaces(last: Sample | Pulled | Piece | News | Reminder) -> bool:
             """A newer beacon of the same log says all that the one before it did."""
             return isinstance(last, Sample) and not last.attachment and last.key == sample.key
 
@@ -211,7 +225,7 @@ class Ingest:
             self._counters.add(pulls=self._puller.start())
             self.busy = False
 
-    def _take(self, robot: str, item: Sample | Pulled | Piece | News) -> AgentLog | None:
+    def _take(self, robot: str, item: Sample | Pulled | Piece | News | Reminder) -> AgentLog | None:
         """Process one item of the inbox. Returns the log that may go on now."""
         try:
             if isinstance(item, Pulled):
@@ -220,6 +234,10 @@ class Ingest:
                 return self._take_piece(item)
             if isinstance(item, News):
                 self._follower.take(item)
+                return None
+            if isinstance(item, Reminder):
+                if (reminded := self._logs.get(item.map)) is not None:
+                    self._unaware[item.map] = reminded
                 return None
             if item.attachment:
                 return self._take_change(item)

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from mapweave.agent.fleet_client import FleetClient
+from mapweave.agent.mission_control import MissionControl
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.agent_status import (
     LONGEST_STATUS_PERIOD,
     MAX_ROBOTS,
@@ -18,6 +22,7 @@ from mapweave.hybridmap.agent_status import (
     Status,
 )
 from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.change import NodeRetired
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MAX_VIA, MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
@@ -27,10 +32,12 @@ from mapweave.mapserver.places import Places
 from mapweave.mapserver.quotas import Quotas
 from mapweave.mapserver.roster import MOST_ALIVE, Roster
 from mapweave.mapserver.routes import Router
+from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode
+from tests.mapserver.played import MAP, HandAgent
 from tests.quick import first_quick
 from tests.waiting import eventually
 
@@ -69,6 +76,65 @@ def test_robots_that_begin_together_report_apart_after_two_periods() -> None:
     times = np.arange(50)[:, None] * periods
     for begin in np.arange(5.0, 30.0, 0.5):
         assert np.count_nonzero((times >= begin) & (times < begin + 0.5)) < 2 * 0.5 * rate
+
+
+def test_a_robot_that_has_its_period_from_when_the_fleet_was_small_is_reminded(tmp_path: Path) -> None:
+    hub = MemoryHub()
+    with ExitStack() as stack:
+        bus = MemoryBus(hub)
+        stack.callback(bus.close)
+        server = stack.enter_context(MapServer(bus, KEYS, tmp_path / "s0.sqlite", "s0"))
+        agent = HandAgent(hub)
+        stack.callback(agent.bus.close)
+        tokens = [bus.announce(KEYS.agent_alive(MAP))]
+        eventually(lambda: server._roster.alive(MAP.agent))
+        agent.publish(1)
+        eventually(lambda: [ack.status_period for ack in agent.acks] == [0.0])
+
+        def report() -> None:
+            said = AgentStatus(Status("standing", "", 1, 0, Pose2(), False), 1, MAP.agent, MAP.epoch)
+            bus.publish(KEYS.agent_status(MAP.agent), encode(said))
+
+        for fleet, heard in ((200, 0), (1000, 1), (1300, 0)):
+            tokens += [bus.announce(KEYS.agent_alive(MapId(f"f{k}", 1))) for k in range(len(tokens), fleet)]
+            eventually(lambda fleet=fleet: len(server._roster._alive) == fleet)
+            before = len(agent.acks)
+            for _ in range(3):
+                report()
+            eventually(lambda before=before, heard=heard: len(agent.acks) == before + heard)
+        agent.publish(2)
+        eventually(lambda: agent.acks[-1].watermark == 2)
+        reminded, last = (ack.status_period for ack in agent.acks[1:])
+    assert reminded > 1.0 and last == pytest.approx(min(1.3 * reminded, LONGEST_STATUS_PERIOD))
+
+
+def test_a_robot_that_makes_no_node_hears_how_rarely_to_report(tmp_path: Path) -> None:
+    """It is acknowledged nothing new: 1000 such robots sent 2000 statuses a second."""
+    hub = MemoryHub()
+    with ExitStack() as stack:
+        bus = MemoryBus(hub)
+        stack.callback(bus.close)
+        stack.enter_context(MapServer(bus, KEYS, tmp_path / "s0.sqlite", "s0"))
+        for k in range(1000):
+            bus.announce(KEYS.agent_alive(MapId(f"f{k}", 1)))
+        for again in (False, True):
+            with closing(Journal(tmp_path / "r0.sqlite", "r0")) as journal:
+                map_id = MapId("r0", 1) if again else journal.open_map(1)
+                replicator = Replicator(bus, KEYS, journal, map_id, ("s0",))
+                link = FleetClient(bus, KEYS, map_id, MissionControl("r0"))
+                if not again:
+                    replicator.submit([NodeRetired(NodeId("r0", 1, 1))], 1)
+                    eventually(lambda journal=journal: journal.acknowledged(MapId("r0", 1)) == {"s0": 1})
+                else:
+                    assert replicator.status_period == 0.0
+                    eventually(
+                        lambda link=link, replicator=replicator: (
+                            replicator.status_period > 1.0
+                            or link.report(Status("standing", "", 1, 0, Pose2(), False), 1)
+                        )
+                    )
+                link.close()
+                replicator.close()
 
 
 def test_a_robot_that_reports_as_rarely_as_it_may_is_not_called_silent() -> None:

@@ -37,6 +37,19 @@ def test_a_change_is_on_the_disk_before_it_is_acknowledged(server: Server, agent
     assert stored == [0]
 
 
+def test_a_robot_that_is_reminded_hears_again_what_is_settled_of_that_log(
+    server: Server, agent: HandAgent
+) -> None:
+    for sequence in (1, 2):
+        agent.publish(sequence)
+    eventually(lambda: agent.acks and agent.acks[-1].watermark == 2)
+    heard = len(agent.acks)
+    server.ingest.remind(MapId(MAP.agent, MAP.epoch + 1))
+    server.ingest.remind(MAP)
+    eventually(lambda: len(agent.acks) > heard)
+    assert agent.acks[heard:] == [Ack(MAP, LOG_ID, 2, (), server.store.id)]
+
+
 def test_a_reordered_change_waits_for_its_turn_without_being_pulled(
     hub: MemoryHub, agent: HandAgent, tmp_path: Path
 ) -> None:
