@@ -76,6 +76,7 @@ entries = st.one_of(
 )
 
 
+@pytest.mark.slow
 @given(st.lists(entries, max_size=6))
 def test_messages_and_files_bring_annotations_unchanged(made) -> None:
     record = Annotations(tuple(made))

@@ -148,6 +148,7 @@ def test_a_replay_is_read_back_as_it_was(
     assert "mission: carried" in rows["/walk/now:text"][-1][1][0]
 
 
+@pytest.mark.slow
 def test_ellipsoids_have_the_covariance_and_the_floor_lies_where_it_was_seen() -> None:
     from rerun.components import Colormap
 

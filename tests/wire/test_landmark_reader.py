@@ -80,6 +80,7 @@ def test_good_bytes_are_read_alike(some: SimpleNamespace, data: st.DataObject) -
     assert [row[2] for row in plain] == codes.tolist()
 
 
+@pytest.mark.slow
 @settings(max_examples=400)
 @given(st.data())
 def test_bad_bytes_are_refused_alike(some: SimpleNamespace, data: st.DataObject) -> None:

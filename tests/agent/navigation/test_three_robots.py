@@ -109,6 +109,7 @@ def test_one_drives_and_two_wait_and_say_so_then_the_next(home, router, ways) ->
     assert corridor.least_gap > 2 * BODY.radius, "they have not touched"
 
 
+@pytest.mark.slow
 def test_two_against_one_end_although_the_first_has_taken_the_niche(home, router) -> None:  # noqa: F811
     """The first makes way for the one that comes, and the second drives up: the niche is taken then, and
     these two waited head-on for ever. Here robots do not see those that have parked, so only the edge counts.

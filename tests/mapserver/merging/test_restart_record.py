@@ -183,7 +183,7 @@ def test_a_restarted_server_supersedes_what_it_had(before: Server, tmp_path: Pat
     assert decisions(Server(tmp_path / "store", drives())) != decisions(before)
 
 
-@pytest.mark.parametrize("seed", first_quick(range(1, 4), 1))
+@pytest.mark.parametrize("seed", first_quick(range(1, 4), 0))
 @settings(max_examples=4, deadline=None)
 @given(
     kills=st.lists(st.integers(1, 72), min_size=1, max_size=3, unique=True),
@@ -356,6 +356,7 @@ def test_a_damaged_record_is_thrown_away(
     assert merged == expected
 
 
+@pytest.mark.slow
 def test_a_table_of_other_nodes_does_no_harm(tmp_path: Path) -> None:
     """The store of another fleet was put in the place of this one."""
     by_drive(tmp_path / "store", drives(2))
