@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import threading
 from collections.abc import Callable, Mapping
 from typing import NamedTuple
@@ -64,7 +65,7 @@ class Roster:
     """Listens until closed. Thread-safe.
 
     Attributes:
-        remind: acknowledges the log of a map once more; returns whether the server has one of this name.
+        remind: acknowledges the log of a map once more.
     """
 
     def __init__(
@@ -93,9 +94,8 @@ class Roster:
         self._turn = threading.Lock()
         self._alive: dict[str, set[MapId]] = {}
         self._heard: dict[str, tuple[AgentStatus, float]] = {}
-        self._periods_sent: dict[str, float] = {}
         self._next_reminder = 0.0
-        self.remind: Callable[[MapId], bool] = lambda map_id: False
+        self.remind: Callable[[MapId], None] = lambda map_id: None
         self._closing = [
             bus.subscribe(keys.agent_statuses(), self._take),
             bus.watch(keys.agents_alive(), self._see),
@@ -126,34 +126,24 @@ class Roster:
         return min(period, LONGEST_STATUS_PERIOD) if period > OWN_PERIOD else 0.0
 
     def status_period_of(self, robot: str) -> float:
-        """The same for one robot, to which it is sent now."""
-        period = self._status_period_of(robot)
-        with self._turn:
-            if robot in self._alive:
-                self._periods_sent[robot] = period
-        return period
-
-    def _status_period_of(self, robot: str) -> float:
-        """How it differs from that of others depends on the name alone, so that servers agree."""
+        """The same for one robot: how it differs depends on its name alone, so that servers agree."""
         drawn = int.from_bytes(hashlib.blake2b(robot.encode(), digest_size=4).digest(), "big")
         share = 2.0 * drawn / 2**32 - 1.0
         return min(self.status_period() / (1.0 + STAGGER * share), LONGEST_STATUS_PERIOD)
 
-    def _remind(self, robot: str, map_id: MapId) -> None:
-        """Have its period sent to a robot that reports more than twice as often as it should.
+    def _reports_too_often(self, robot: str, since: float, now: float) -> bool:
+        """Whether a robot has to be reminded of its period, with the time since its last status, s.
 
         It hears it with acknowledgements alone, and is acknowledged nothing where it makes no node: of 1000
         robots that drive in a building that they know each sent two statuses a second.
         """
-        period, now = self._status_period_of(robot), self._clock()
+        if since > 0.5 * self.status_period_of(robot):
+            return False
         with self._turn:
-            known = max(self._periods_sent.get(robot, 0.0), OWN_PERIOD)
-            if robot not in self._alive or period <= 2.0 * known or now < self._next_reminder:
-                return
+            if now < self._next_reminder:
+                return False
             self._next_reminder = now + 1.0 / REMINDERS_PER_S
-        if self.remind(map_id):
-            with self._turn:
-                self._periods_sent[robot] = period
+        return True
 
     def presence(self) -> Mapping[str, Presence]:
         """All robots that are heard of, by name: `MAX_ROBOTS` at most."""
@@ -213,10 +203,13 @@ class Roster:
         named = {status.robot or robot, robot if status.mission is None else status.mission.order.robot}
         if named != {robot}:
             raise InvalidMessage(f"a status of {robot} is about {' and '.join(sorted(named - {robot}))}")
+        now = self._clock()
         with self._turn:
+            _, before = self._heard.get(robot, (status, -math.inf))
             if robot in self._heard or len(self._heard) < MAX_ROBOTS:
-                self._heard[robot] = status, self._clock()
-        self._remind(robot, status.map)
+                self._heard[robot] = status, now
+        if self._reports_too_often(robot, now - before, now):
+            self.remind(status.map)
         self._hear(status)
 
     def _see(self, key: str, alive: bool) -> None:
@@ -232,7 +225,6 @@ class Roster:
                 self._alive[map_id.agent] = maps
             else:
                 self._alive.pop(map_id.agent, None)
-                self._periods_sent.pop(map_id.agent, None)
         if alive and full:
             self._quotas.hold_back(map_id.agent, "liveliness tokens")
 

@@ -177,12 +177,9 @@ class Ingest:
         """Pass on what other servers have written to the store; from any thread, in the ingest's own."""
         self._work.put("", news, bounded=False)
 
-    def remind(self, map_id: MapId) -> bool:
-        """Have a log acknowledged once more, from any thread; returns at once whether there is one."""
-        if map_id not in self._logs:
-            return False
+    def remind(self, map_id: MapId) -> None:
+        """Have a log acknowledged once more, from any thread, if there is one. Returns at once."""
         self._work.put(map_id.agent, Reminder(map_id), bounded=False)
-        return True
 
     def close(self) -> None:
         """Stop listening; received changes are applied, missing ones will be pulled next time."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -37,7 +38,6 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode
-from tests.mapserver.played import MAP, HandAgent
 from tests.quick import first_quick
 from tests.waiting import eventually
 
@@ -78,34 +78,34 @@ def test_robots_that_begin_together_report_apart_after_two_periods() -> None:
         assert np.count_nonzero((times >= begin) & (times < begin + 0.5)) < 2 * 0.5 * rate
 
 
-def test_a_robot_that_has_its_period_from_when_the_fleet_was_small_is_reminded(tmp_path: Path) -> None:
-    hub = MemoryHub()
+def test_a_robot_that_reports_far_too_often_is_reminded() -> None:
+    now, reminded = [0.0], list[MapId]()
     with ExitStack() as stack:
-        bus = MemoryBus(hub)
+        bus = MemoryBus(MemoryHub())
         stack.callback(bus.close)
-        server = stack.enter_context(MapServer(bus, KEYS, tmp_path / "s0.sqlite", "s0"))
-        agent = HandAgent(hub)
-        stack.callback(agent.bus.close)
-        tokens = [bus.announce(KEYS.agent_alive(MAP))]
-        eventually(lambda: server._roster.alive(MAP.agent))
-        agent.publish(1)
-        eventually(lambda: [ack.status_period for ack in agent.acks] == [0.0])
+        roster = Roster(bus, KEYS, lambda: now[0], lambda status: None, Quotas())
+        stack.callback(roster.close)
+        roster.remind = reminded.append
 
-        def report() -> None:
-            said = AgentStatus(Status("standing", "", 1, 0, Pose2(), False), 1, MAP.agent, MAP.epoch)
-            bus.publish(KEYS.agent_status(MAP.agent), encode(said))
+        def report(robot: str, at: float) -> int:
+            now[0], before = at, reminded.count(MapId(robot, 3))
+            said = AgentStatus(Status("standing", "", 1, 0, Pose2(), False), round(1e9 * at), robot, 3)
+            # The second one is taken when all is done about the first.
+            for one in (said, replace(said, robot="another")):
+                bus.publish(KEYS.agent_status(one.robot), encode(one))
+                eventually(lambda one=one: roster.status(one.robot) == one)
+            return reminded.count(MapId(robot, 3)) - before
 
-        for fleet, heard in ((200, 0), (1000, 1), (1300, 0)):
-            tokens += [bus.announce(KEYS.agent_alive(MapId(f"f{k}", 1))) for k in range(len(tokens), fleet)]
-            eventually(lambda fleet=fleet: len(server._roster._alive) == fleet)
-            before = len(agent.acks)
-            for _ in range(3):
-                report()
-            eventually(lambda before=before, heard=heard: len(agent.acks) == before + heard)
-        agent.publish(2)
-        eventually(lambda: agent.acks[-1].watermark == 2)
-        reminded, last = (ack.status_period for ack in agent.acks[1:])
-    assert reminded > 1.0 and last == pytest.approx(min(1.3 * reminded, LONGEST_STATUS_PERIOD))
+        for k in range(4):
+            assert not report("r0", 100.0 + 0.5 * k), "a small fleet reports as it likes"
+        for k in range(1000):
+            bus.announce(KEYS.agent_alive(MapId(f"r{k}", 3)))
+        eventually(lambda: roster.status_period() == 2.5)
+        period = roster.status_period_of("r0")
+        for k in range(4):
+            assert not report("r0", 200.0 + period * k), "as it should"
+        assert not report("r1", 300.0), "the first"
+        assert report("r1", 300.5) == 1
 
 
 def test_a_robot_that_makes_no_node_hears_how_rarely_to_report(tmp_path: Path) -> None:
