@@ -94,7 +94,8 @@ class Roster:
         self._turn = threading.Lock()
         self._alive: dict[str, set[MapId]] = {}
         self._heard: dict[str, tuple[AgentStatus, float]] = {}
-        self._next_reminder = 0.0
+        self._reminded: dict[str, float] = {}
+        self._next_reminder = -math.inf
         self.remind: Callable[[MapId], None] = lambda map_id: None
         self._closing = [
             bus.subscribe(keys.agent_statuses(), self._take),
@@ -137,12 +138,14 @@ class Roster:
         It hears it with acknowledgements alone, and is acknowledged nothing where it makes no node: of 1000
         robots that drive in a building that they know each sent two statuses a second.
         """
-        if since > 0.5 * self.status_period_of(robot):
+        if since >= 0.5 * self.status_period_of(robot):
             return False
         with self._turn:
-            if now < self._next_reminder:
+            # So that one that does not listen keeps no other from it, and an answer has time to come.
+            again = self._reminded.get(robot, -math.inf) + LONGEST_STATUS_PERIOD
+            if robot not in self._heard or now < max(again, self._next_reminder):
                 return False
-            self._next_reminder = now + 1.0 / REMINDERS_PER_S
+            self._reminded[robot], self._next_reminder = now, now + 1.0 / REMINDERS_PER_S
         return True
 
     def presence(self) -> Mapping[str, Presence]:

@@ -178,7 +178,7 @@ class Ingest:
         self._work.put("", news, bounded=False)
 
     def remind(self, map_id: MapId) -> None:
-        """Have a log acknowledged once more, from any thread, if there is one. Returns at once."""
+        """Have a log acknowledged once more, from any thread, if all of it is settled. Returns at once."""
         self._work.put(map_id.agent, Reminder(map_id), bounded=False)
 
     def close(self) -> None:
@@ -233,7 +233,9 @@ class Ingest:
                 self._follower.take(item)
                 return None
             if isinstance(item, Reminder):
-                if (reminded := self._logs.get(item.map)) is not None:
+                reminded = self._logs.get(item.map)
+                # What is not settled is acknowledged, or refused, anyway.
+                if reminded is not None and reminded.newest <= reminded.watermark:
                     self._unaware[item.map] = reminded
                 return None
             if item.attachment:

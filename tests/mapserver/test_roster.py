@@ -97,7 +97,8 @@ def test_a_robot_that_reports_far_too_often_is_reminded() -> None:
             return reminded.count(MapId(robot, 3)) - before
 
         for k in range(4):
-            assert not report("r0", 100.0 + 0.5 * k), "a small fleet reports as it likes"
+            report("r0", 100.0 + 0.5 * (k // 2))
+        assert not reminded, "a small fleet reports as it likes"
         for k in range(1000):
             bus.announce(KEYS.agent_alive(MapId(f"r{k}", 3)))
         eventually(lambda: roster.status_period() == 2.5)
@@ -106,6 +107,11 @@ def test_a_robot_that_reports_far_too_often_is_reminded() -> None:
             assert not report("r0", 200.0 + period * k), "as it should"
         assert not report("r1", 300.0), "the first"
         assert report("r1", 300.5) == 1
+        # One that does not listen keeps no other from it.
+        assert sum(report("r1", 300.6 + 0.01 * k) for k in range(40)) == 0
+        assert not report("r2", 301.0) and report("r2", 301.5) == 1
+        assert not report("r1", 300.5 + LONGEST_STATUS_PERIOD), "as rarely as it may"
+        assert report("r1", 305.0) == 1
 
 
 def test_a_robot_that_makes_no_node_hears_how_rarely_to_report(tmp_path: Path) -> None:

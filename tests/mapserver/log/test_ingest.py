@@ -48,6 +48,13 @@ def test_a_robot_that_is_reminded_hears_again_what_is_settled_of_that_log(
     server.ingest.remind(MAP)
     eventually(lambda: len(agent.acks) > heard)
     assert agent.acks[heard:] == [Ack(MAP, LOG_ID, 2, (), server.store.id)]
+    # One that is not settled is acknowledged, or refused, anyway: a reminder would take a refusal back.
+    agent.publish(4)
+    eventually(lambda: server.ingest.lags()[MAP.agent].missing)
+    server.ingest.remind(MAP)
+    agent.publish(3)
+    eventually(lambda: agent.acks[-1].watermark == 4)
+    assert [ack.watermark for ack in agent.acks[heard:]] == [2, 4]
 
 
 def test_a_reordered_change_waits_for_its_turn_without_being_pulled(
