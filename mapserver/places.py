@@ -14,7 +14,6 @@ from mapweave.hybridmap.annotation import Annotation, Annotations, Place
 from mapweave.hybridmap.area import inside
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.manual_constraint import reason_of
 from mapweave.hybridmap.portal import MAX_FLOOR_WORDS
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import (
@@ -239,9 +238,6 @@ def position_of(word: str) -> tuple[float, float] | None:
 
 
 def why_left_out(merged: MergedMap, node: NodeId) -> str:
-    """Why a node is not in the merged map, in parentheses behind a blank; empty if nothing is known of it."""
-    retired = merged.constraints.retires(node)
-    apart = merged.set_apart.get(node.map)
-    if retired is not None:
-        return f" ({reason_of(retired)})"
-    return f" (map {node.map} is set apart: {apart})" if apart is not None else ""
+    """See `MergedMap.why_left_out`; in parentheses behind a blank."""
+    why = merged.why_left_out(node)
+    return f" ({why})" if why else ""

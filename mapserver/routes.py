@@ -14,7 +14,6 @@ import numpy as np
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import EdgeId, NodeId
-from mapweave.hybridmap.manual_constraint import reason_of
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.hybridmap.reachability import RECOGNISED
@@ -204,11 +203,8 @@ class Router:
         """
         for name, node in zip(names, (start, goal), strict=True):
             if node not in self.merged.poses:
-                retired = self.merged.constraints.retires(node)
-                apart = self.merged.set_apart.get(node.map)
-                why = f": {reason_of(retired)}" if retired is not None else ""
-                why = why or (f": map {node.map} is set apart, {apart}" if apart is not None else "")
-                return f"{name} {node} is not in the merged map{why or self._nearest(node)}"
+                why = self.merged.why_left_out(node)
+                return f"{name} {node} is not in the merged map{f': {why}' if why else self._nearest(node)}"
         parts = self.merged.component_of(start), self.merged.component_of(goal)
         if parts[0] != parts[1] and not (portals := self.portals).lead(start, goal):
             return portals.apart(start, goal)

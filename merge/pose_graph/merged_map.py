@@ -13,7 +13,7 @@ from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.manual_constraint import ManualConstraints, reason_of
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, nearest_covariance
 from mapweave.hybridmap.pruned_node import PrunedNodes
@@ -211,6 +211,13 @@ class MergedMap:
             some = f"of its {len(numbers)} nodes the nearest are {', '.join(map(str, nearest))}"
             span = some if numbers else "it has none"
             raise InvalidValue(f"map {which} has no node {end.number}; {span}")
+
+    def why_left_out(self, node: NodeId) -> str:
+        """Why a node has no merged pose: what retires it, or sets its map apart; empty if neither does."""
+        retired, apart = self.constraints.retires(node), self.set_apart.get(node.map)
+        if retired is not None:
+            return reason_of(retired)
+        return f"map {node.map} is set apart: {apart}" if apart is not None else ""
 
     def accusations(self) -> dict[MapId, str]:
         """What is held against maps, in a few words each."""
