@@ -96,6 +96,8 @@ def _robot(keys: Keys, name: str) -> list[_Rule]:
     questions = [sent_by(f"{keys.root}/server/*/{what}", name) for what in sorted(OF_ROBOTS)]
     addressed = [f"{keys.root}/server/*/{what}/{name}" for what in ("ack", "poses")]
     return [
+        # One declaration for all questions to it; which of them are let through says the next rule.
+        ("ingress", ("declare_queryable",), [f"{agent}/**"]),
         *_writes([f"{agent}/change/*", f"{agent}/head/*", f"{agent}/alive/*", f"{base}/driver/*",
                   f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/mission/*",
                   f"{agent}/portal", f"{agent}/portal/*", f"{agent}/drive", f"{agent}/view",

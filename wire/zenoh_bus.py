@@ -23,10 +23,20 @@ from mapweave.wire.bus import Closing, Reply, Request, Sample, never
 from mapweave.wire.bus_settings import QUEUE_LIMIT, RETRY_FIRST, RETRY_LONGEST, BusSettings
 from mapweave.wire.dispatch import Dispatcher
 from mapweave.wire.keyexpr import check_key, check_pattern
+from mapweave.wire.keys import questions_to_robot
 from mapweave.wire.open_files import allow_many_files
 from mapweave.wire.publishers import Publishers
 from mapweave.wire.zenoh_config import session_values
-from mapweave.wire.zenoh_entities import Declared, Owner, Service, Subscription, Token, Watcher, read_reply
+from mapweave.wire.zenoh_entities import (
+    Declared,
+    Owner,
+    Queryable,
+    Service,
+    Subscription,
+    Token,
+    Watcher,
+    read_reply,
+)
 
 log = logging.getLogger(__name__)
 
@@ -62,6 +72,7 @@ class ZenohBus:
         self._connecting = threading.Thread(target=self._keep_connected, name="zenoh-connect", daemon=True)
         self._links: list[object] = []
         self._publishers = Publishers()
+        self._queryables: dict[str, Queryable] = {}
         if self._settings.mode == "router":
             self._session = _open_router(self._settings)
             self._watch_links(self._session)
@@ -88,7 +99,18 @@ class ZenohBus:
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> Closing:
         """Answer questions."""
-        return self.declare(Service(self.owner, check_pattern(key), handler))
+        to_robot = questions_to_robot(check_pattern(key))
+        with self.owner.lock:
+            queryable = self._queryables.get(to_robot)
+            if new := queryable is None or not queryable.wanted():
+                queryable = Queryable(self.owner, to_robot or key)
+            service = Service(queryable, key, handler)
+            queryable.add(service)
+            if new:
+                self.declare(queryable)
+            if to_robot:
+                self._queryables[to_robot] = queryable
+        return service
 
     def ask(
         self, key: str, payload: bytes, timeout: float, enough: Callable[[Reply], bool] = never

@@ -16,7 +16,7 @@ from mapweave.hybridmap.errors import NotConnected
 from mapweave.wire.alive_keys import AliveKeys
 from mapweave.wire.bus import Reply, Request, Sample
 from mapweave.wire.dispatch import Dispatcher, guarded
-from mapweave.wire.keyexpr import answered
+from mapweave.wire.keyexpr import answered, intersects
 from mapweave.wire.refusal import decode_refusal, encode_refusal
 
 log = logging.getLogger(__name__)
@@ -134,21 +134,62 @@ class Subscription(Declared):
             guarded(lambda: self._handler(message), message.key)
 
 
-class Service(Declared):
-    """Questions to a handler."""
+class Queryable(Declared):
+    """Questions under a key, or under all that a pattern matches, to the services there."""
 
-    def __init__(self, owner: Owner, key: str, handler: Callable[[Request], None]) -> None:
+    def __init__(self, owner: Owner, key: str) -> None:
         super().__init__(owner, key)
-        self._handler = handler
+        # Replaced as a whole, so that Zenoh's thread reads it without the lock.
+        self._services: tuple[Service, ...] = ()
+
+    def add(self, service: Service) -> None:
+        """Take in a service; called with the owner's lock held."""
+        self._services += (service,)
+
+    def remove(self, service: Service) -> None:
+        """Leave a service out. Without any the key is taken back."""
+        with self._owner.lock:
+            self._services = tuple(one for one in self._services if one is not service)
+            # From now on nothing is added to it.
+            self._open = bool(self._services)
+        if not self._open:
+            self.close()
 
     def _declare_in(self, session: zenoh.Session) -> Any:
         return session.declare_queryable(self.key, self._receive)
 
     def _receive(self, query: zenoh.Query) -> None:
         self._owner.heard()
-        # A reply goes out on one key that the question's pattern matches.
-        key = answered(str(query.key_expr), self.key)
-        self._owner.dispatcher.question(self._handler, ZenohRequest(self._owner, key, query), self.wanted)
+        asked = str(query.key_expr)
+        asked_of = [one for one in self._services if intersects(asked, one.key)]
+        question = _Question(query, len(asked_of))
+        for service in asked_of:
+            # A reply goes out on one key that the question's pattern matches.
+            request = ZenohRequest(self._owner, answered(asked, service.key), question)
+            self._owner.dispatcher.question(service.handler, request, service.wanted)
+
+
+class Service:
+    """Questions to a handler.
+
+    Attributes:
+        key: or a pattern of keys; the queryable's matches it.
+        handler: what is called.
+    """
+
+    def __init__(self, queryable: Queryable, key: str, handler: Callable[[Request], None]) -> None:
+        self.key, self.handler = key, handler
+        self._queryable, self._open = queryable, True
+
+    def close(self) -> None:
+        """Serve no longer. Twice is no error."""
+        if self._open:
+            self._open = False
+            self._queryable.remove(self)
+
+    def wanted(self) -> bool:
+        """Whether the handler may still be called."""
+        return self._open and self._queryable.wanted()
 
 
 class Watcher(Declared):
@@ -172,14 +213,36 @@ class Watcher(Declared):
         self._alive.note(str(sample.key_expr), sample.kind == zenoh.SampleKind.PUT)
 
 
-class ZenohRequest:
-    """A question. Its query must be dropped after the answer, or the asker waits for the time-out."""
+class _Question:
+    """A question as it came. Zenoh waits until it is dropped, when the last service is done with it."""
 
-    def __init__(self, owner: Owner, key: str, query: zenoh.Query) -> None:
+    def __init__(self, query: zenoh.Query, services: int) -> None:
+        self.query = query
+        self._open, self._lock = services, threading.Lock()
+        if not services:
+            self._drop()
+
+    def done(self) -> None:
+        """One of the services has answered, or never will."""
+        with self._lock:
+            self._open -= 1
+            last = self._open == 0
+        if last:
+            self._drop()
+
+    def _drop(self) -> None:
+        self.query.drop()  # type: ignore[no-untyped-call]
+
+
+class ZenohRequest:
+    """A question to one service."""
+
+    def __init__(self, owner: Owner, key: str, question: _Question) -> None:
+        query = question.query
         self._owner = owner
         self._key = key
         self._payload = query.payload.to_bytes() if query.payload is not None else b""
-        self._query = query
+        self._question = question
         self._lock = threading.Lock()
         self._answered = False
         owner.open_requests.add(self)
@@ -196,11 +259,11 @@ class ZenohRequest:
 
     def reply(self, payload: bytes) -> None:
         """Answer; a second answer is ignored."""
-        self._finish(lambda: self._query.reply(self._key, payload))
+        self._finish(lambda: self._question.query.reply(self._key, payload))
 
     def refuse(self, reason: str, retry_after: float = 0.0) -> None:
         """Answer with an error; a second answer is ignored."""
-        self._finish(lambda: self._query.reply_err(encode_refusal(reason, retry_after)))
+        self._finish(lambda: self._question.query.reply_err(encode_refusal(reason, retry_after)))
 
     def abandon(self) -> None:
         """Mark as unanswered: the bus closes."""
@@ -216,7 +279,7 @@ class ZenohRequest:
         except zenoh.ZError as error:
             log.debug("an answer on %s found no way back: %s", self._key, error)
         finally:
-            self._query.drop()  # type: ignore[no-untyped-call]
+            self._question.done()
             self._owner.open_requests.discard(self)
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError
 from mapweave.wire.alive_keys import MOST_OF_ONE
-from mapweave.wire.bus import Reply, Request, Sample
+from mapweave.wire.bus import Closing, Reply, Request, Sample
 from tests.waiting import eventually
 from tests.wire.fleets import Fleet, settle, subscribe
 
@@ -269,3 +269,43 @@ def test_tokens_of_one_robot_are_bounded(fleet: Fleet, caplog: pytest.LogCapture
     again = flooding.announce(f"{root}/r3/alive/9999")
     eventually(lambda: news[-1] == (f"{root}/r3/alive/9999", True))
     again.close()
+
+
+def test_services_at_one_robot_answer_each_for_itself(fleet: Fleet) -> None:
+    robot, asker = fleet.join(), fleet.join()
+    root = "mapweave/1/fleet/agent/r1"
+
+    def serve(what: str) -> Closing:
+        return robot.serve(f"{root}/{what}", lambda request: request.reply(f"{what}: {request.key}".encode()))
+
+    def asked(what: str) -> set[str]:
+        begin = time.monotonic()
+        replies = asker.ask(f"{root}/{what}", b"", 60.0)
+        assert time.monotonic() - begin < 30.0, "an answer that nobody gives is waited for"
+        return {reply.payload.decode().replace(f"{root}/", "") for reply in replies}
+
+    mission, of_anyone, logs = (serve(what) for what in ("mission", "mission/*", "log/*"))
+    eventually(lambda: asked("log/3") == {"log/*: log/3"})
+    assert asked("mission") == {"mission: mission"}
+    assert asked("mission/anna") == {"mission/*: mission/anna"}
+    assert {answer.partition(":")[0] for answer in asked("**")} == {"mission", "mission/*", "log/*"}
+    assert asked("drive") == set()
+    mission.close()
+    mission.close()
+    eventually(lambda: asked("mission") == set())
+    assert asked("mission/anna") == {"mission/*: mission/anna"}
+    serve("mission")
+    eventually(lambda: asked("mission") == {"mission: mission"})
+    of_anyone.close()
+    logs.close()
+    eventually(lambda: asked("**") == {"mission: mission"})
+
+
+def test_a_robot_that_serves_nothing_for_a_while_serves_again(fleet: Fleet) -> None:
+    robot, asker = fleet.join(), fleet.join()
+    key = "mapweave/1/fleet/agent/r1/mission"
+    for answer in (b"first", b"second"):
+        served = robot.serve(key, lambda request, answer=answer: request.reply(answer))
+        eventually(lambda answer=answer: [r.payload for r in asker.ask(key, b"", 60.0)] == [answer])
+        served.close()
+        eventually(lambda: asker.ask(key, b"", 60.0) == [])

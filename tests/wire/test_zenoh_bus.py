@@ -5,6 +5,7 @@ from __future__ import annotations
 import socket
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -60,6 +61,25 @@ def test_a_client_whose_session_breaks_while_it_declares_connects_again(
     try:
         eventually(lambda: router.publish("a", b"found") or got)
         assert "the transport is closed; trying again" in caplog.text
+    finally:
+        client.close()
+        router.close()
+
+
+def test_all_questions_to_a_robot_are_one_declaration() -> None:
+    """A thousand robots that declare eight each fill two cores for a minute."""
+    endpoints = (f"tcp/127.0.0.1:{free_port()}",)
+    router, client = (
+        ZenohBus(BusSettings(mode="router", listen=endpoints)),
+        ZenohBus(BusSettings(endpoints=endpoints)),
+    )
+    try:
+        assert client.wait_connected(30)
+        before = threading.active_count()
+        for what in ("mission", "mission/*", "drive", "portal", "portal/*", "status", "log/*", "view"):
+            client.serve(f"mapweave/1/fleet/agent/r1/{what}", lambda request: request.reply(b""))
+        # Zenoh has a thread for each that takes calls.
+        assert threading.active_count() == before + 1
     finally:
         client.close()
         router.close()
