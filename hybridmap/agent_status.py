@@ -24,6 +24,8 @@ NOTHING_DRIVEN = DriveStatistics()
 NO_COMPONENT = -1
 LONGEST_STATUS_PERIOD = 4.0
 """Between two statuses of a robot, s. It sends two a second, unless a server with many robots wants fewer."""
+FIRST_STATUS_PERIOD = 2.0
+"""As long as no server has said how often, s: robots that are switched on together would send thousands."""
 SILENT = 5.0
 """A robot that has sent nothing for longer is named as silent, s."""
 

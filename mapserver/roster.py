@@ -230,6 +230,9 @@ class Roster:
                 self._alive.pop(map_id.agent, None)
         if alive and full:
             self._quotas.hold_back(map_id.agent, "liveliness tokens")
+        elif alive:
+            # Until then it reports rarely.
+            self.remind(map_id)
 
 
 def whereabouts(status: AgentStatus, merged: MergedMap) -> tuple[Pose2 | None, int]:

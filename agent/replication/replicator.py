@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from mapweave.agent.replication.ack_timer import AckTimer
 from mapweave.agent.replication.journal import Draft, Journal
 from mapweave.agent.replication.log_state import LogState
+from mapweave.hybridmap.agent_status import FIRST_STATUS_PERIOD
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
 from mapweave.hybridmap.ids import MapId, check_name
@@ -146,9 +147,11 @@ class Replicator:
 
     @property
     def status_period(self) -> float:
-        """The least time between two statuses that servers want now, s: they have many robots; else 0."""
-        with self._changed:
-            return max(self._current.status_periods.values(), default=0.0)
+        """The least time between two statuses that servers want now, s: they have many robots; else 0.
+
+        `FIRST_STATUS_PERIOD` until one has acknowledged something.
+        """
+        return self._wanted_period(FIRST_STATUS_PERIOD)
 
     def submit(self, bodies: Iterable[ChangeBody], stamp_ns: int) -> None:
         """Hand over changes. Encodes them, and waits for neither disk nor network.
@@ -226,6 +229,11 @@ class Replicator:
 
     def _unacknowledged(self) -> int:
         return sum(state.unsettled(self._servers) for state in self._logs.values())
+
+    def _wanted_period(self, unknown: float) -> float:
+        """The longest status period that a server wants; `unknown` as long as none has said it."""
+        with self._changed:
+            return max(self._current.status_periods.values(), default=unknown)
 
     def _run(self) -> None:
         stop = False
@@ -306,7 +314,7 @@ class Replicator:
         everyone = now >= self._everyone_at
         if everyone:
             self._everyone_at = now + SETTLED_BEACONS * max(
-                self._settings.beacon_interval, self.status_period
+                self._settings.beacon_interval, self._wanted_period(0.0)
             )
         unsettled = False
         for state in self._logs.values():

@@ -12,6 +12,7 @@ import heapq
 import json
 import os
 import sys
+import threading
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -156,26 +157,62 @@ class Agent:
         self.journal.close()
 
 
-def run_schedule(agents: Sequence[Agent], orders: Orders, begin: float) -> None:
-    """Nodes and reports of all agents, each at its own times; then the burst."""
+class Reporter:
+    """Publishes the statuses of agents from when each is connected, as `mapweave agent` does."""
+
+    def __init__(self) -> None:
+        """Begin, with no agent."""
+        self._changed = threading.Condition()
+        self._due: list[tuple[float, int, Agent]] = []
+        self._count, self._closing = 0, False
+        self._thread = threading.Thread(target=self._run, name="statuses", daemon=True)
+        self._thread.start()
+
+    def add(self, agent: Agent) -> None:
+        """An agent is connected: its first status is due."""
+        with self._changed:
+            heapq.heappush(self._due, (time.monotonic(), self._count, agent))
+            self._count += 1
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Publish no more. Idempotent."""
+        with self._changed:
+            self._closing = True
+            self._changed.notify()
+        self._thread.join()
+
+    def _run(self) -> None:
+        while True:
+            with self._changed:
+                left = self._due[0][0] - time.monotonic() if self._due else None
+                if not self._closing and (left is None or left > 0.0):
+                    self._changed.wait(left)
+                    continue
+                if self._closing:
+                    return
+                _, number, agent = heapq.heappop(self._due)
+            agent.report()
+            with self._changed:
+                heapq.heappush(self._due, (time.monotonic() + agent.report_period, number, agent))
+
+
+def run_schedule(agents: Sequence[Agent], orders: Orders, begin: float, reporter: Reporter) -> None:
+    """Nodes of all agents, each at its own times, and their reports; then the burst."""
     rng = np.random.default_rng([orders.seed, orders.first, 1])
     end = begin + orders.seconds
-    due: list[tuple[float, int, bool]] = []
-    for k in range(len(agents)):
-        due.append((begin + rng.uniform(0.0, INTERVAL), k, True))
-        due.append((begin + rng.uniform(0.0, 1.0 / REPORTS), k, False))
-    due += [(end + rng.uniform(0.0, 1.0), number - orders.first, True) for number in burst_numbers(orders)]
+    due = [(begin + rng.uniform(0.0, INTERVAL), k) for k in range(len(agents))]
+    due += [(end + rng.uniform(0.0, 1.0), number - orders.first) for number in burst_numbers(orders)]
     heapq.heapify(due)
     while due and due[0][0] < end + 1.0:
-        at, k, maps = heapq.heappop(due)
+        at, k = heapq.heappop(due)
+        if at >= end:
+            reporter.close()
         time.sleep(max(0.0, at - time.monotonic()))
-        if maps:
-            agents[k].map_on()
-        else:
-            agents[k].report()
-        after = at + (INTERVAL if maps else agents[k].report_period)
-        if after < end:
-            heapq.heappush(due, (after, k, maps))
+        agents[k].map_on()
+        if at + INTERVAL < end:
+            heapq.heappush(due, (at + INTERVAL, k))
+    reporter.close()
 
 
 def burst_numbers(orders: Orders) -> list[int]:
@@ -190,15 +227,17 @@ def main() -> None:
     orders = Orders(**json.loads(sys.argv[1]))
     stops = 2 + int(orders.seconds / INTERVAL) + -(-orders.burst // 2 // orders.agents)
     jit.load()  # as a robot does before it maps
-    agents = [Agent(orders, orders.first + k, stops) for k in range(orders.count)]
-    for agent in agents:
-        agent.map_on()
+    agents, reporter = list[Agent](), Reporter()
+    for k in range(orders.count):
+        agents.append(Agent(orders, orders.first + k, stops))
+        reporter.add(agents[-1])
+        agents[-1].map_on()
     wait_until_acknowledged(agents)
     print("ready", flush=True)
     begin = float(sys.stdin.readline())
     if orders.disturbance == "flooding":
         agents[0].flood(begin + orders.seconds)
-    run_schedule(agents, orders, begin)
+    run_schedule(agents, orders, begin, reporter)
     end = begin + orders.seconds
     wait_until_acknowledged(agents)
     print(

@@ -14,6 +14,7 @@ from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.agent_status import (
+    FIRST_STATUS_PERIOD,
     LONGEST_STATUS_PERIOD,
     MAX_ROBOTS,
     SILENT,
@@ -31,7 +32,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver import http
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.quotas import Quotas
-from mapweave.mapserver.roster import MOST_ALIVE, Roster
+from mapweave.mapserver.roster import MOST_ALIVE, STAGGER, STATUSES_PER_S, Roster
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -114,33 +115,45 @@ def test_a_robot_that_reports_far_too_often_is_reminded() -> None:
         assert report("r1", 305.0) == 1
 
 
-def test_a_robot_that_makes_no_node_hears_how_rarely_to_report(tmp_path: Path) -> None:
+@pytest.mark.parametrize("comes_first", [False, True])
+def test_a_robot_that_makes_no_node_hears_how_rarely_to_report(tmp_path: Path, comes_first: bool) -> None:
     """It is acknowledged nothing new: 1000 such robots sent 2000 statuses a second."""
     hub = MemoryHub()
     with ExitStack() as stack:
         bus = MemoryBus(hub)
         stack.callback(bus.close)
         stack.enter_context(MapServer(bus, KEYS, tmp_path / "s0.sqlite", "s0"))
-        for k in range(1000):
-            bus.announce(KEYS.agent_alive(MapId(f"f{k}", 1)))
-        for again in (False, True):
-            with closing(Journal(tmp_path / "r0.sqlite", "r0")) as journal:
-                map_id = MapId("r0", 1) if again else journal.open_map(1)
-                replicator = Replicator(bus, KEYS, journal, map_id, ("s0",))
-                link = FleetClient(bus, KEYS, map_id, MissionControl("r0"))
-                if not again:
-                    replicator.submit([NodeRetired(NodeId("r0", 1, 1))], 1)
-                    eventually(lambda journal=journal: journal.acknowledged(MapId("r0", 1)) == {"s0": 1})
-                else:
-                    assert replicator.status_period == 0.0
-                    eventually(
-                        lambda link=link, replicator=replicator: (
-                            replicator.status_period > 1.0
-                            or link.report(Status("standing", "", 1, 0, Pose2(), False), 1)
-                        )
+
+        def others_come() -> None:
+            for k in range(1000):
+                bus.announce(KEYS.agent_alive(MapId(f"f{k}", 1)))
+
+        with closing(Journal(tmp_path / "r0.sqlite", "r0")) as journal:
+            replicator = Replicator(bus, KEYS, journal, journal.open_map(1), ("s0",))
+            replicator.submit([NodeRetired(NodeId("r0", 1, 1))], 1)
+            eventually(lambda: journal.acknowledged(MapId("r0", 1)) == {"s0": 1})
+            replicator.close()
+        if not comes_first:
+            others_come()
+        with closing(Journal(tmp_path / "r0.sqlite", "r0")) as journal:
+            replicator = Replicator(bus, KEYS, journal, MapId("r0", 1), ("s0",))
+            assert replicator.status_period == FIRST_STATUS_PERIOD
+            link = FleetClient(bus, KEYS, MapId("r0", 1), MissionControl("r0"))
+            if comes_first:
+                eventually(lambda: replicator.status_period == 0.0)
+                others_come()
+            wanted = 1001 / STATUSES_PER_S
+            eventually(
+                lambda: (
+                    (
+                        wanted / (1.0 + STAGGER) < replicator.status_period < wanted / (1.0 - STAGGER)
+                        and replicator.status_period != FIRST_STATUS_PERIOD
                     )
-                link.close()
-                replicator.close()
+                    or (comes_first and link.report(Status("standing", "", 1, 0, Pose2(), False), 1))
+                )
+            )
+            link.close()
+            replicator.close()
 
 
 def test_a_robot_that_reports_as_rarely_as_it_may_is_not_called_silent() -> None:

@@ -12,6 +12,7 @@ import pytest
 
 from mapweave.agent.replication.journal import Draft, Journal
 from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
+from mapweave.hybridmap.agent_status import FIRST_STATUS_PERIOD
 from mapweave.hybridmap.change import ChangeBody, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId
@@ -103,7 +104,7 @@ def test_changes_are_published_in_order_with_their_mark(agent: Agent, server: Ha
 
 def test_the_longest_status_period_that_servers_want_counts(agent: Agent, hub: MemoryHub) -> None:
     first, second = HandServer(hub), HandServer(hub, "s1")
-    assert agent.replicator.status_period == 0.0
+    assert agent.replicator.status_period == FIRST_STATUS_PERIOD, "none has said anything"
     first.acknowledge(agent.log_id, 0, period=2.5)
     eventually(lambda: agent.replicator.status_period == 2.5)
     second.acknowledge(agent.log_id, 0, period=1.0)
@@ -111,6 +112,8 @@ def test_the_longest_status_period_that_servers_want_counts(agent: Agent, hub: M
     eventually(lambda: agent.replicator.status_period == 1.0)
     second.acknowledge(agent.log_id, 0)
     eventually(lambda: agent.replicator.status_period == 0.75)
+    first.acknowledge(agent.log_id, 0)
+    eventually(lambda: agent.replicator.status_period == 0.0)
     first.bus.close()
     second.bus.close()
 
