@@ -281,7 +281,7 @@ def test_services_at_one_robot_answer_each_for_itself(fleet: Fleet) -> None:
     def asked(what: str) -> set[str]:
         begin = time.monotonic()
         replies = asker.ask(f"{root}/{what}", b"", 60.0)
-        assert time.monotonic() - begin < 30.0, "an answer that nobody gives is waited for"
+        assert time.monotonic() - begin < 30.0, "it waits for an answer that no service gives"
         return {reply.payload.decode().replace(f"{root}/", "") for reply in replies}
 
     mission, of_anyone, logs = (serve(what) for what in ("mission", "mission/*", "log/*"))
