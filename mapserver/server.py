@@ -117,7 +117,8 @@ class MapServer:
             cache: folder for what is kept beside a store in PostgreSQL; made if it is not there.
 
         Raises:
-            InvalidFile: the store is damaged or is none, or has another map of a name that is in the base.
+            InvalidFile: the store is damaged or is none, is another server's, or has another map of a name
+                that is in the base.
         """
         self._bus = bus
         self._keys = keys
@@ -237,6 +238,11 @@ class MapServer:
     def settle(self, timeout: float) -> bool:
         """Wait until everything that came before this call is merged; False if the time is over first."""
         return self._worker.settle(timeout)
+
+    @property
+    def displaced(self) -> str:
+        """Why this server must end, in one line: another one of its name has the store. Else empty."""
+        return self._store.displaced
 
     @property
     def read_only(self) -> bool:

@@ -210,6 +210,15 @@ class PostgresSession:
             connection.execute(OWN, (self._mark,), prepare=False)
             yield connection
 
+    def renew(self) -> None:
+        """Connect again.
+
+        Raises:
+            InvalidFile: there is no connection to be had.
+        """
+        self._drop()
+        _ = self.connection
+
     def close(self) -> None:
         """End the connection for good. Idempotent."""
         self._closed = True

@@ -18,6 +18,7 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.log.postgres_follower import CHANNEL, LOG, RECORD, PostgresFollower, words_of
+from mapweave.mapserver.log.postgres_name import ServerName
 from mapweave.mapserver.log.sql_store import SqlStore
 from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, ID, News, Run, fresh_id
 from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
@@ -66,6 +67,9 @@ class PostgresStore(SqlStore):
 
     One session writes, another reads: a commit that waits for a standby holds up no answer. Where PostgreSQL
     is away, every method fails with InvalidFile; the next call connects again.
+
+    The session that reads holds the server's name: it waits for no standby, so PostgreSQL notices at once
+    when its server is killed.
     """
 
     shared = True
@@ -75,17 +79,20 @@ class PostgresStore(SqlStore):
 
         Args:
             address: see PostgresAddress.read.
-            name: of the server, as PostgreSQL's lists of sessions show it.
-            read_only: change nothing; the tables must be there.
+            name: of the server, as PostgreSQL's lists of sessions show it. One server has it at a time.
+            read_only: change nothing, and take no name; the tables must be there.
 
         Raises:
             InvalidValue: the address is none, or has a password.
-            InvalidFile: there is no connection, or the tables are of another version.
+            InvalidFile: there is no connection, the tables are of another version, or another server has
+                this name.
         """
         super().__init__()
         self.address = PostgresAddress.read(address)
         self._write_lock, self._read_lock = threading.RLock(), threading.RLock()
         self._name, self._session_id = name, 0
+        self._server_name = ServerName(name, self.address.words)
+        self._has_name = False
         self._follower: PostgresFollower | None = None
         self._writing: int | None = None
         """The thread in a transaction."""
@@ -94,11 +101,12 @@ class PostgresStore(SqlStore):
         self._warned = False
         options = {"default_transaction_read_only": "on"} if read_only else {}
         self._reader, self._writer = (
-            PostgresSession(self.address, f"mapweave {name}", options, not read_only, prepare)
-            for prepare in (self._check_version, self._prepare)
+            PostgresSession(self.address, self._server_name.session, options, not read_only, prepare)
+            for prepare in (self._check_version if read_only else self._prepare_reader, self._prepare)
         )
         try:
             if not read_only:
+                self._take_name()
                 self._make()
             self.id = int.from_bytes(self.result(ID) or b"", "big")
         except InvalidFile:
@@ -109,6 +117,11 @@ class PostgresStore(SqlStore):
     def leads(self) -> bool:
         """Whether this server writes the results of merging; see `Store`."""
         return self._follower is not None and self._follower.leads
+
+    @property
+    def displaced(self) -> str:
+        """Why this server must end; see `Store`."""
+        return self._server_name.displaced
 
     def follow(self, changed: Callable[[News], None]) -> None:
         """Have what other servers write reported; see `Store`."""
@@ -121,6 +134,13 @@ class PostgresStore(SqlStore):
         for lock, session in ((self._write_lock, self._writer), (self._read_lock, self._reader)):
             with lock:
                 session.close()
+
+    def _take_name(self) -> None:
+        # A pooler of transactions would keep the lock: it is found out by the second session.
+        reader, _ = self._reader.connection, self._writer.connection
+        self._has_name = True
+        with self._reader.guard():
+            self._server_name.take(reader)
 
     def _make(self) -> None:
         """Make the tables where there are none; servers that start together take turns."""
@@ -143,8 +163,18 @@ class PostgresStore(SqlStore):
             what = "no map store" if version is None else f"a map store of format {version}"
             raise InvalidFile(f"{self.address.words}: has {what}, this program uses format {VERSION}")
 
+    def _prepare_reader(self, connection: psycopg.Connection) -> None:
+        if self._has_name:
+            self._server_name.take(connection)
+            self._check_version(connection)
+
     def _prepare(self, connection: psycopg.Connection) -> None:
         """A writer's session: what is acknowledged must survive."""
+        if self._has_name:
+            # Both were lost, or the other one is with a primary of before.
+            with self._read_lock:
+                if not self._server_name.is_held(connection):
+                    self._reader.renew()
         connection.add_notice_handler(self._note)
         connection.prepare_threshold = PREPARED_AFTER
         # The number that libpq knows is that of a pooler, if there is one.
@@ -186,6 +216,8 @@ class PostgresStore(SqlStore):
     @contextmanager
     def _transaction(self) -> Iterator[None]:
         with self._write_lock, self._writer.guard():
+            if self.displaced:
+                raise InvalidFile(self.displaced)
             self._touched.clear()
             try:
                 with self._writer.connection.pipeline(), self._writer.transaction() as connection:

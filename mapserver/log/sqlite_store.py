@@ -36,6 +36,7 @@ class SqliteStore(SqlStore):
 
     shared = False
     leads = True
+    displaced = ""
 
     def __init__(self, path: Path) -> None:
         """Open the store, or make one. Rows that are damaged are taken out, see `damaged`.

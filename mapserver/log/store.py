@@ -88,6 +88,13 @@ class Store(Protocol):
     def leads(self) -> bool:
         """Whether this server writes the results of merging: one of those that share a store does."""
 
+    @property
+    def displaced(self) -> str:
+        """Why this server must end, in one line; empty if it need not.
+
+        Another server of its name has taken a store that servers share. Nothing more is written.
+        """
+
     def follow(self, changed: Callable[[News], None]) -> None:
         """Have what other servers write reported from now on, from a thread of the store's.
 

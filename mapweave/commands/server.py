@@ -101,6 +101,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     # Modules stay: looking among them for garbage took a sixth of the start.
     gc.disable()
+    from mapweave.hybridmap.errors import InvalidFile
     from mapweave.hybridmap.ids import check_name
     from mapweave.terminal import log_with_time, stamped
 
@@ -189,6 +190,8 @@ def run(arguments: argparse.Namespace) -> int:
         manager.ready()
         while not stop.wait(1.0):
             manager.alive()
+            if server.displaced:
+                raise InvalidFile(server.displaced)
             if renewal is not None:
                 renewal.check()
             now = server.summary()

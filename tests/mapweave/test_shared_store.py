@@ -6,6 +6,8 @@ import json
 import os
 import re
 import signal
+import subprocess
+import sys
 from collections.abc import Mapping
 from contextlib import closing
 from pathlib import Path
@@ -17,6 +19,7 @@ import pytest
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.cli import main
+from mapweave.exit_status import FAILED
 from mapweave.hybridmap.change import ChangeBody, NodeRetired
 from mapweave.hybridmap.ids import NodeId
 from mapweave.mapserver.content_hash import content_hash
@@ -124,6 +127,82 @@ def test_either_of_two_servers_may_be_killed(
     assert sorted(path.name for path in (tmp_path / "maps").iterdir()) == [
         "r0.1.mapweave", "r1.1.mapweave", "r2.1.mapweave",
     ]  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(600)
+def test_a_name_is_that_of_one_server(postgres: PostgresServer, tmp_path: Path) -> None:
+    """A second is refused, others run beside it, a killed one is followed, and a displaced one ends."""
+    address = postgres.database()
+    endpoints = {name: f"tcp/127.0.0.1:{free_port()}" for name in ("s0", "s1")}
+    running: dict[str, subprocess.Popen[bytes]] = {}
+
+    def command(name: str, data: str, *listen: str) -> list[str]:
+        return [sys.executable, "-m", "mapweave", "server", "--fleet", "fleet", "--name", name,
+                "--store", address, "--data", str(tmp_path / data), "--listen", *listen]  # fmt: skip
+
+    def start(name: str) -> None:
+        with (tmp_path / f"{name}.log").open("ab") as log:
+            others = [word for other in running for word in ("--connect", endpoints[other])]
+            running[name] = subprocess.Popen(
+                [*command(name, name, endpoints[name]), *others], stdout=log, stderr=log
+            )
+
+    def refused() -> str:
+        """Its only line on stderr, but for the one about the tests' PostgreSQL."""
+        words = command("s0", "second", f"tcp/127.0.0.1:{free_port()}")
+        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        assert done.returncode == FAILED
+        (line,) = (line for line in done.stderr.splitlines() if "fsync=off" not in line)
+        return line
+
+    try:
+        start("s0")
+        bus = ZenohBus(BusSettings(mode="client", endpoints=tuple(endpoints.values())))
+
+        def serves(name: str) -> bool:
+            """Whether exactly one answers by this name."""
+            assert all(process.poll() is None for process in running.values())
+            replies = bus.ask(KEYS.server_status(name), b"", 5.0)
+            return [bool(reply.error) for reply in replies] == [False]
+
+        eventually(lambda: serves("s0"), PATIENCE)
+        start("s1")
+        eventually(lambda: serves("s1"), PATIENCE)
+        journal, robot = robot_of(tmp_path, bus, next(iter(logs().values())), "r0")
+        assert robot.wait_acknowledged(PATIENCE)
+        line = refused()
+        assert f"a map server s0 runs on this store already (process {running['s0'].pid} on " in line
+        assert "--name" in line
+        assert serves("s0") and serves("s1")
+        running["s0"].kill()
+        running["s0"].wait()
+        start("s0")
+        eventually(lambda: serves("s0"), PATIENCE)
+        assert f"(process {running['s0'].pid} on " in refused()
+        # As a server whose machine stood still, so that PostgreSQL ended its sessions.
+        running["s0"].send_signal(signal.SIGSTOP)
+        with psycopg.connect(address, autocommit=True) as people:
+            people.execute(
+                "SELECT pg_terminate_backend(pid, 10000) FROM pg_stat_activity "
+                "WHERE application_name LIKE 'mapweave s0%'"
+            )
+        with closing(PostgresStore(address, "s0")) as store:
+            running["s0"].send_signal(signal.SIGCONT)
+            assert running["s0"].wait(PATIENCE) == FAILED
+            words = (tmp_path / "s0.log").read_text().splitlines()[-1]
+            assert f"another map server s0 (process {os.getpid()} on " in words and "--name" in words
+            stored = {m: [(c.sequence, encode_change(c)) for c in store.replay(m)] for m in store.maps()}
+        assert stored == logs_of([journal])
+        del running["s0"]
+        assert serves("s1")
+        robot.close()
+        journal.close()
+        bus.close()
+    finally:
+        for process in running.values():
+            process.kill()
+            process.wait()
 
 
 @pytest.mark.slow

@@ -9,6 +9,7 @@ from pathlib import Path
 import psycopg
 import pytest
 
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.mapserver.log.entry import Applied
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.store import Run
@@ -61,6 +62,9 @@ def test_nothing_acknowledged_is_lost_with_the_primary() -> None:
         assert [change.sequence for change in store.replay(MAP)] == list(range(1, acknowledged + 1))
         assert failures == {"InvalidFile"}
         eventually(lambda: store.leads)
+        with pytest.raises(InvalidFile, match="a map server store runs on this store already"):
+            PostgresStore(standby.address())
+        assert not store.displaced
         store.close()
         standby.stop()
         servers.close()
