@@ -55,9 +55,15 @@ TYPES = {
     **dict.fromkeys(("body", "message", "value"), "BYTEA NOT NULL"),
 }
 """Of columns that are no numbers."""
-TABLES_THERE = "SELECT tablename FROM pg_tables WHERE schemaname = 'mapweave'"
+TABLES_THERE = (
+    "SELECT relname, EXISTS (SELECT FROM pg_constraint WHERE conrelid = pg_class.oid AND contype = 'p') "
+    "FROM pg_class WHERE relkind = 'r' AND relnamespace = to_regnamespace('mapweave')"
+)
+"""Each with whether it has a primary key."""
 PREPARED_AFTER = 5
 """Uses of a statement, by a session that writes."""
+VERSIONS = "schema_version"
+"""The table that has the version of all others."""
 SCHEMA_LOCK = 0x4D575354
 """Advisory lock of who makes the tables: 'MWST'."""
 
@@ -146,19 +152,25 @@ class PostgresStore(SqlStore):
         """Make the tables where there are none; servers that start together take turns."""
         with self._transaction():
             self._writer.connection.execute("SELECT pg_advisory_xact_lock(%s)", (SCHEMA_LOCK,))
-            if _version(self._writer.connection) is None:
+            there = _tables(self._writer.connection)
+            if not there:
                 for statement in _statements():
                     self._writer.connection.execute(statement)
                 self._put("result", (ID, fresh_id().to_bytes(8, "big")))
             else:
                 self._check_version(self._writer.connection)
-                there = {row[0] for row in self._writer.connection.execute(TABLES_THERE)}
                 # A store of an earlier program lacks some.
-                for table in KEYS.keys() - there:
+                for table in KEYS.keys() - there.keys():
                     self._writer.connection.execute(_table(table))
 
     def _check_version(self, connection: psycopg.Connection) -> None:
-        version = _version(connection)
+        version, there = _version(connection), _tables(connection)
+        # A restore fills the tables first, and then adds the keys.
+        if (there and version is None) or (version == VERSION and not all(there.values())):
+            raise InvalidFile(
+                f"{self.address.words}: has only a part of a map store: a restore into it runs, or has failed; "
+                "if it failed, drop this database and restore into an empty one, or use the database of before"
+            )
         if version != VERSION:
             what = "no map store" if version is None else f"a map store of format {version}"
             raise InvalidFile(f"{self.address.words}: has {what}, this program uses format {VERSION}")
@@ -279,6 +291,12 @@ class PostgresStore(SqlStore):
         elif table == "result":
             # The names with spaces, of images, are not followed.
             self._touched[f"{RECORD}:{str(values[0]).replace(' ', '_')}"] = None
+
+
+def _tables(connection: psycopg.Connection) -> dict[str, bool]:
+    """Those of a store that are there, each with whether it has the key that it needs."""
+    rows = connection.execute(TABLES_THERE).fetchall()
+    return {name: has_key or name == VERSIONS for name, has_key in rows if name in (*KEYS, VERSIONS)}
 
 
 def _version(connection: psycopg.Connection) -> int | None:

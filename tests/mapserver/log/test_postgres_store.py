@@ -27,7 +27,7 @@ from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.store import Run, Store
 from mapweave.wire.codec import encode_body, encode_change
-from synthetic.postgres_server import PostgresServer
+from synthetic.postgres_server import PostgresServer, binaries
 from tests.mapserver.log.test_store import MAP, OTHER, broken, edge_put, entry, node_put
 from tests.postgres import started
 from tests.waiting import eventually
@@ -287,6 +287,45 @@ def test_a_store_of_another_format_is_refused(postgres: PostgresServer) -> None:
         connection.execute("UPDATE mapweave.schema_version SET version = 99")
     with pytest.raises(InvalidFile, match=r"format 99, this program uses format 1"):
         PostgresStore(address)
+
+
+@pytest.mark.parametrize("part", ["tables", "rows", "cut-off", "no-version"])
+def test_a_store_that_was_restored_in_part_is_refused(postgres: PostgresServer, part: str) -> None:
+    """Neither a server nor a reader takes it for a store, and it stays as it is."""
+    folder = binaries()
+    if folder is None or not all((folder / name).exists() for name in ("pg_dump", "pg_restore")):
+        pytest.skip("this PostgreSQL comes without pg_dump and pg_restore")
+    address, other = postgres.database(), postgres.database()
+    store = PostgresStore(address)
+    store.apply(MAP, 5, [entry(1), entry(2)])
+    store.close()
+    names = [str(psycopg.conninfo.conninfo_to_dict(one)["dbname"]) for one in (address, other)]
+    dump = postgres.folder / f"{names[0]}.dump"
+    postgres.run("pg_dump", "--format=custom", "--file", str(dump), names[0])
+    restore = ["pg_restore", "--exit-on-error", "--dbname", names[1], str(dump)]
+    if part == "cut-off":
+        dump.write_bytes(dump.read_bytes()[:-1])
+        with pytest.raises(AssertionError, match=r"unexpected end|end of file"):
+            postgres.run(*restore)
+    else:
+        sections = ["pre-data"] if part == "tables" else ["pre-data", "data"]
+        postgres.run(*restore, *(f"--section={section}" for section in sections))
+    if part == "no-version":
+        with psycopg.connect(other) as connection:
+            connection.execute("DROP TABLE mapweave.schema_version")
+    before = postgres.run("pg_dump", names[1])
+    for read_only in (True, False):
+        with pytest.raises(
+            InvalidFile, match=r"has only a part of a map store.*drop this database"
+        ) as refused:
+            PostgresStore(other, read_only=read_only)
+        assert "\n" not in str(refused.value)
+    assert main(["map", "show", other, "--no-picture"]) == 1
+    # Each dump has another word against injected commands.
+    after = postgres.run("pg_dump", names[1])
+    assert [line for line in after.splitlines() if "restrict" not in line] == [
+        line for line in before.splitlines() if "restrict" not in line
+    ]
 
 
 def test_texts_that_postgresql_does_not_take(postgres: PostgresServer) -> None:
