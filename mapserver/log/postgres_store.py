@@ -168,8 +168,8 @@ class PostgresStore(SqlStore):
         # A restore fills the tables first, and then adds the keys.
         if (there and version is None) or (version == VERSION and not all(there.values())):
             raise InvalidFile(
-                f"{self.address.words}: has only a part of a map store: a restore into it runs, or has failed; "
-                "if it failed, drop this database and restore into an empty one, or use the database of before"
+                f"{self.address.words}: has only a part of a map store: a restore into it runs or failed; "
+                "if it failed, drop this database and restore into an empty one, or use that of before"
             )
         if version != VERSION:
             what = "no map store" if version is None else f"a map store of format {version}"
