@@ -9,7 +9,7 @@ import subprocess
 import sys
 import tempfile
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -26,6 +26,7 @@ from tests.mapserver.log.test_store import MAP, entry
 from tests.pgbouncer import pooled
 from tests.waiting import eventually
 
+Start = Callable[..., subprocess.Popen[str]]
 HOLDER = """
 import sys, time
 from mapweave.mapserver.log.postgres_store import PostgresStore
@@ -52,13 +53,20 @@ def refusal(address: str, name: str = "s0") -> str:
     return str(refused.value)
 
 
-def another(address: str, *arguments: str) -> subprocess.Popen[str]:
-    """A process that has opened the store as s0."""
-    process = subprocess.Popen(
-        [sys.executable, "-c", HOLDER, address, *arguments], stdout=subprocess.PIPE, text=True
-    )
-    assert process.stdout is not None and process.stdout.readline() == "has it\n"
-    return process
+@pytest.fixture
+def another() -> Iterator[Start]:
+    """Starts a process that has opened the store as s0; such processes end with the test."""
+    processes: list[subprocess.Popen[str]] = []
+
+    def start(address: str, *arguments: str) -> subprocess.Popen[str]:
+        words = [sys.executable, "-c", HOLDER, address, *arguments]
+        processes.append(process := subprocess.Popen(words, stdout=subprocess.PIPE, text=True))
+        assert process.stdout is not None and process.stdout.readline() == "has it\n"
+        return process
+
+    yield start
+    for process in processes:
+        end(process)
 
 
 def end(process: subprocess.Popen[str]) -> None:
@@ -111,7 +119,7 @@ def test_a_refused_server_changes_nothing_for_the_first(address: str) -> None:
     first.close()
 
 
-def test_a_server_that_was_killed_is_followed_by_one_of_its_name(address: str) -> None:
+def test_a_server_that_was_killed_is_followed_by_one_of_its_name(address: str, another: Start) -> None:
     process = another(address)
     assert f"process {process.pid} on " in refusal(address)
     end(process)
@@ -119,7 +127,7 @@ def test_a_server_that_was_killed_is_followed_by_one_of_its_name(address: str) -
 
 
 def test_the_name_of_a_killed_server_is_free_while_its_commit_waits_for_a_standby(
-    postgres: PostgresServer, address: str
+    postgres: PostgresServer, address: str, another: Start
 ) -> None:
     """Lost robots get answers meanwhile."""
     PostgresStore(address, "s0").close()
@@ -172,12 +180,13 @@ def first_applied(store: PostgresStore, sequence: int) -> int:
     ("which", "writes"), [(ALL, True), (ALL, False), (WITH_NAME, False)], ids=["writes", "reads", "with-name"]
 )
 def test_a_server_whose_name_another_has_taken_meanwhile_acknowledges_nothing_more(
-    address: str, which: str, writes: bool
+    address: str, which: str, writes: bool, another: Start, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     displaced = PostgresStore(address, "s0")
     assert displaced.apply(MAP, 5, [entry(1)]).watermark == 1
     end_sessions(address, which)
     process = another(address)
+    monkeypatch.setattr(postgres_name, "PATIENCE", 0.1)
     if not writes:
         with pytest.raises(InvalidFile, match="took this name"):
             displaced.watermark(MAP)
@@ -187,6 +196,7 @@ def test_a_server_whose_name_another_has_taken_meanwhile_acknowledges_nothing_mo
     eventually(lambda: displaced.apply_all([Run(MAP, 5, [entry(2)])]) and displaced.displaced)
     assert f"(process {process.pid} on " in displaced.displaced and "\n" not in displaced.displaced
     end(process)
+    monkeypatch.undo()
     # For good: the name may be another's by then.
     for _ in range(3):
         (result,) = displaced.apply_all([Run(MAP, 5, [entry(2)])])
