@@ -10,8 +10,10 @@ Others are not asked, so no robot makes a map of another one seem torn.
 
 from __future__ import annotations
 
+import zlib
 from collections import Counter, defaultdict
 from collections.abc import Sequence
+from random import Random
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
@@ -27,7 +29,7 @@ from mapweave.merge.settings import ConsistencySettings
 MOST_OF_A_NODE = 2
 """Links of each node that are tested, those with most landmarks: so many confirm each other."""
 MOST_NODES = 100
-"""Nodes of a map that are tested, evenly chosen."""
+"""Nodes of a map that are tested, drawn."""
 Excluded = dict[tuple[int, int], dict[str, list[Link]]]
 """Refused links from one component to another, by the robot at their far end."""
 Behind = tuple[HybridMap | PoseGraph, ...]
@@ -106,9 +108,15 @@ def _excluded(merged: MergedMap) -> Excluded:
 
 
 def _thinned(links: Sequence[Link]) -> list[Link]:
-    """The links of some nodes with most landmarks, so many of each."""
+    """The links of some nodes with most landmarks, so many of each.
+
+    The nodes are drawn: of those of two robots in turns, every second one would be of one robot alone. The
+    draw depends on the links only, not on their order.
+    """
+    ordered = sorted(links, key=lambda link: (link.a, -link.weight, link.b))
     own: dict[NodeId, list[Link]] = {}
-    for link in sorted(links, key=lambda link: (link.a, -link.weight, link.b)):
+    for link in ordered:
         own.setdefault(link.a, []).append(link)
-    step = -(-len(own) // MOST_NODES)
-    return [link for node in sorted(own)[::step] for link in own[node][:MOST_OF_A_NODE]]
+    draw = Random(zlib.crc32(" ".join(f"{link.a} {link.b}" for link in ordered).encode()))
+    drawn = draw.sample(list(own), min(len(own), MOST_NODES))
+    return [link for node in sorted(drawn) for link in own[node][:MOST_OF_A_NODE]]

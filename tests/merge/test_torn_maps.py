@@ -15,6 +15,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.merge import torn_maps
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import Measurement
@@ -37,11 +38,15 @@ def fleet() -> Fleet:
     return draw_fleet(SEED, SCENES["house"], Fault.NONE, stops=2)
 
 
-def joined_with_copies(fleet: Fleet, shift: Pose2) -> MergedMap:
-    """Copies of r0's nodes, and of r1's shifted against where they are, merged with the true maps."""
+def joined_with_copies(fleet: Fleet, shift: Pose2, *, in_turns: bool = False) -> MergedMap:
+    """Copies of r0's nodes, and of r1's shifted against where they are, merged with the true maps.
+
+    The second robot's come after the first one's, or the two robots' in turns.
+    """
     rng = np.random.default_rng(SEED)
     sound = {map_id: content for map_id, content in fleet.maps.items() if map_id != ODD}
-    theirs = [node for k in ("r0", "r1") for node in sound[MapId(k, 1)][0]]
+    both = [sound[MapId(k, 1)][0] for k in ("r0", "r1")]
+    theirs = [node for some in (zip(*both, strict=True) if in_turns else both) for node in some]
     poses = [AWAY @ (shift if node.id.agent == "r1" else Pose2()) @ fleet.truth[node.id] for node in theirs]
     copied = chain(Setting(ODD, fleet.maps[ODD], sound, rng), [altered(node, rng) for node in theirs], poses)
     merger = Merger()
@@ -94,6 +99,17 @@ def test_two_robots_that_agree_exclude_a_torn_map(
     assert not torn or found[ODD].startswith(
         "it shows places of r0 and r1 in another arrangement than theirs"
     )
+
+
+@pytest.mark.parametrize(("shift", "torn"), [(TORN, True), (Pose2(), False)])
+def test_nodes_of_two_robots_in_turns_are_tested_beside_each_other(
+    fleet: Fleet, shift: Pose2, torn: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of more nodes than are tested, those of one robot alone were tested: every second one."""
+    merged = beside(joined_with_copies(fleet, shift, in_turns=True), ("r0", "r1"))
+    # As in a large map: three in four nodes fit, so that every second one was tested.
+    monkeypatch.setattr(torn_maps, "MOST_NODES", len(merged.maps[ODD].nodes) * 3 // 4)
+    assert TornMapSearch(ConsistencySettings()).torn(merged).keys() == ({ODD} if torn else set())
 
 
 @pytest.mark.slow
