@@ -163,6 +163,17 @@ class MapServer:
 
     def __enter__(self) -> MapServer:
         """Begin to serve."""
+        try:
+            self._begin()
+        except BaseException:
+            # Whatever still runs in a library written in C++ when the interpreter ends aborts the process.
+            self._schedule.close()
+            self._cluster.close()
+            self._store.close()
+            raise
+        return self
+
+    def _begin(self) -> None:
         worker, clock = self._worker, self._schedule
         self._cluster.start()
         worker.start()
@@ -211,7 +222,6 @@ class MapServer:
         # Behind the reading of the store: its map can be seen meanwhile.
         for job in library_jobs():
             clock.post(job)
-        return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.mapserver import libraries, server
 from mapweave.mapserver.libraries import SLOW, library_jobs
 from mapweave.mapserver.server import MapServer
@@ -48,3 +49,25 @@ def test_a_server_that_is_stopped_meanwhile_ends_without_the_rest(
         assert began.wait(30)
     bus.close()
     assert not ran
+
+
+def test_a_server_whose_start_fails_leaves_nothing_running(
+    hub: MemoryHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The process aborted behind its message when the interpreter ended within such a library."""
+
+    def fail(*parts: object) -> None:
+        raise InvalidFile("the database system is starting up")
+
+    before = set(threading.enumerate())
+    bus = MemoryBus(hub)
+    with monkeypatch.context() as patch:
+        patch.setattr(server, "Ingest", fail)
+        with pytest.raises(InvalidFile, match="starting up"), MapServer(bus, Keys(), tmp_path / "s", "s0"):
+            raise AssertionError
+    left = {thread.name for thread in set(threading.enumerate()) - before}
+    assert not left & {"background", "periodic"}
+    # Nor does it hold its store.
+    with MapServer(bus, Keys(), tmp_path / "s", "s0") as running:
+        assert running.settle(60)
+    bus.close()
