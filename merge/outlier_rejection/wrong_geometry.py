@@ -35,7 +35,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
-from mapweave.merge.outlier_rejection.bent_maps import AGREEING, is_bent
+from mapweave.merge.outlier_rejection.bent_maps import AGREEING, is_bent, nearly_there
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.lines_of_sight import (
     LEAST_NODES,
@@ -282,8 +282,10 @@ def is_torn(
     best = link_sets(links, placed, fixed, s)[0]
     if len(best) >= AGREEING * len(links):
         return False  # a place that looks the same, as a whole
-    first = {link.a for link in best}
-    second = {link.a for link in links} - first
+    first, agreeing = {link.a for link in best}, {link.key for link in best}
+    near = nearly_there(links, placed, fixed)[[k for k, link in enumerate(links) if link.key in agreeing]]
+    # Nodes that are a little off are of the same place: its others confirm them, which tells of no tear.
+    second = {link.a for link in links} - {links[k].a for k in np.flatnonzero(near.any(axis=0)).tolist()}
     return tears(sorted(first), sorted(second), placed.graph, nodes)
 
 

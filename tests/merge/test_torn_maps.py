@@ -29,7 +29,7 @@ from synthetic.wrong_geometry import ODD, SCENES, Fault, Fleet, draw_fleet
 from tests.quick import first_quick
 
 SEED = 5
-AWAY, TORN = Pose2(40.0, -10.0, 2.0), Pose2(2.0, -2.0, 1.0)
+AWAY, TORN, NOT_OFF = Pose2(40.0, -10.0, 2.0), Pose2(2.0, -2.0, 1.0), Pose2()
 EXCLUDED = "{} and r3 would have been at the same place at the same time: 0.01 m apart"
 
 
@@ -38,16 +38,20 @@ def fleet() -> Fleet:
     return draw_fleet(SEED, SCENES["house"], Fault.NONE, stops=2)
 
 
-def joined_with_copies(fleet: Fleet, shift: Pose2, *, in_turns: bool = False) -> MergedMap:
+def joined_with_copies(
+    fleet: Fleet, shift: Pose2, *, in_turns: bool = False, off: Pose2 = NOT_OFF
+) -> MergedMap:
     """Copies of r0's nodes, and of r1's shifted against where they are, merged with the true maps.
 
-    The second robot's come after the first one's, or the two robots' in turns.
+    The second robot's come after the first one's, or the two robots' in turns. Every fifth of the first one's
+    is off.
     """
     rng = np.random.default_rng(SEED)
     sound = {map_id: content for map_id, content in fleet.maps.items() if map_id != ODD}
     both = [sound[MapId(k, 1)][0] for k in ("r0", "r1")]
     theirs = [node for some in (zip(*both, strict=True) if in_turns else both) for node in some]
-    poses = [AWAY @ (shift if node.id.agent == "r1" else Pose2()) @ fleet.truth[node.id] for node in theirs]
+    wrong = {node.id: off for node in both[0][::5]} | {node.id: shift for node in both[1]}
+    poses = [AWAY @ wrong.get(node.id, NOT_OFF) @ fleet.truth[node.id] for node in theirs]
     copied = chain(Setting(ODD, fleet.maps[ODD], sound, rng), [altered(node, rng) for node in theirs], poses)
     merger = Merger()
     for map_id, content in {**sound, ODD: copied}.items():
@@ -109,6 +113,14 @@ def test_nodes_of_two_robots_in_turns_are_tested_beside_each_other(
     merged = beside(joined_with_copies(fleet, shift, in_turns=True), ("r0", "r1"))
     # As in a large map: three in four nodes fit, so that every second one was tested.
     monkeypatch.setattr(torn_maps, "MOST_NODES", len(merged.maps[ODD].nodes) * 3 // 4)
+    assert TornMapSearch(ConsistencySettings()).torn(merged).keys() == ({ODD} if torn else set())
+
+
+@pytest.mark.parametrize(("shift", "torn"), [(TORN, True), (Pose2(), False)])
+def test_nodes_that_are_a_little_off_are_of_no_other_place(fleet: Fleet, shift: Pose2, torn: bool) -> None:
+    """They counted as of another one: a map with everything nearly where it is seemed torn."""
+    off = Pose2(0.5, 0.4, 0.0)
+    merged = beside(joined_with_copies(fleet, shift, in_turns=True, off=off), ("r0", "r1"))
     assert TornMapSearch(ConsistencySettings()).torn(merged).keys() == ({ODD} if torn else set())
 
 
