@@ -4,7 +4,7 @@
 
 A real `mapweave server` process with its router, over Zenoh on loopback. Each agent has a session, journal,
 replicator and fleet client of its own, as on a robot; a process holds up to 125 of them. Each agent maps a
-room of its own: a node of 150 landmarks and its edge every 10 s. It makes its first node, and begins to report,
+room of its own: a node of 150 landmarks and its edge every 10 s. It makes its first node and begins to report
 when it is connected: every 2 s, and then twice a second or as rarely as the server asks. Behind that comes a
 burst: so many changes within one second. Meanwhile one more session asks five times a second where it
 is. Journals lie in memory, as they are other machines' disks; the server's store is on this machine's disk.
