@@ -178,8 +178,12 @@ class Ingest:
         self._work.put("", news, bounded=False)
 
     def remind(self, map_id: MapId) -> None:
-        """Have a log acknowledged once more, from any thread, if all of it is settled. Returns at once."""
-        self._work.put(map_id.agent, Reminder(map_id), bounded=False)
+        """Have a log acknowledged once more, from any thread, if all of it is settled and there is room.
+
+        Returns at once.
+        """
+        reminder = Reminder(map_id)
+        self._work.put(map_id.agent, reminder, replaces=lambda last: last == reminder)
 
     def close(self) -> None:
         """Stop listening; received changes are applied, missing ones will be pulled next time."""

@@ -13,6 +13,7 @@ from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.agent_log import AgentLog, PullSettings
 from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.inbox import MOST
 from mapweave.mapserver.log.ingest_settings import IngestSettings
 from mapweave.wire.bus import Sample
 from mapweave.wire.log_messages import Ack, LogRequest
@@ -136,6 +137,17 @@ def held_up(server: Server, agent: HandAgent) -> Iterator[None]:
     assert held.wait(30)
     yield
     go_on.set()
+
+
+def test_reminders_take_no_room_without_end(server: Server, agent: HandAgent) -> None:
+    """A robot that declares and takes back a liveliness token over and over has a reminder each time."""
+    with held_up(server, agent):
+        for _ in range(2 * MOST):
+            server.ingest.remind(MAP)
+        assert server.ingest.waiting == 1
+        for k in range(2 * MOST):
+            server.ingest.remind(MapId(MAP.agent, MAP.epoch + k))
+        assert server.ingest.waiting <= MOST
 
 
 def test_beacons_that_wait_become_one(server: Server, agent: HandAgent) -> None:
