@@ -308,8 +308,8 @@ def _agent_of(keys: Keys, what: str, key: str) -> str:
 def questions_to_robot(key: str) -> str:
     """Pattern: all questions to the robot to which this one goes; empty if it goes to no robot.
 
-    A robot declares it once, instead of each key at which it answers: beside a thousand robots a declaration
-    costs the router a millisecond.
+    A robot declares it once, instead of each key at which it answers: the more robots there are, the more a
+    declaration costs the router.
     """
     match key.split("/"):
         case ["mapweave", version, fleet, "agent", name, _, *_] if NAME.fullmatch(name):

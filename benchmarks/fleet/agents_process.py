@@ -198,7 +198,7 @@ class Reporter:
 
 
 def run_schedule(agents: Sequence[Agent], orders: Orders, begin: float, reporter: Reporter) -> None:
-    """Nodes of all agents, each at its own times, and their reports; then the burst."""
+    """Nodes of all agents, each at its own times; then the burst, in which none reports."""
     rng = np.random.default_rng([orders.seed, orders.first, 1])
     end = begin + orders.seconds
     due = [(begin + rng.uniform(0.0, INTERVAL), k) for k in range(len(agents))]
