@@ -238,7 +238,7 @@ class Navigator:
         crossing.looked(self.fix is not None)
 
     def _find(self) -> Behaviour:
-        self.stage, self._goal_hidden = Stage.LOST, False
+        self.stage = Stage.LOST
         self._patience.trouble = "it does not know where it is"
         expected, self._expected = self._expected, None
         self._start_from((yield from self._positioning.find(expected)))
@@ -311,6 +311,9 @@ class Navigator:
                 break
             yield command
         self._following = False
+        # By landmarks seen a moment ago; a look that showed nothing is no such sight.
+        blind, allowed = follower.fix.blind, self._settings.navigation.blind_distance
+        known = blind < allowed and not self._positioning.failed_views
         match follower.progress:
             case RouteProgress.ARRIVED:
                 self._reach()
@@ -320,15 +323,14 @@ class Navigator:
                 self._goal_hidden
                 and self._trial.node is None
                 and not (self._via and self._portal is None)
-                and follower.fix.blind < self._settings.navigation.blind_distance
+                and known
             ):
                 self.stage, self.detail = Stage.ARRIVED, HIDDEN
                 self._reach()
             case RouteProgress.UNSURE:
-                # By landmarks seen a moment ago it is at the goal, yet it sees none of the goal's landmarks.
-                blind, allowed = follower.fix.blind, self._settings.navigation.blind_distance
-                self._goal_hidden = blind < allowed
-                if self._trial.node is not None or not (self._trial.borne_out or self._goal_hidden):
+                # It is at the goal by what it knows, yet it sees none of the goal's landmarks.
+                self._goal_hidden |= known
+                if self._trial.node is not None or not (self._trial.borne_out or blind < allowed):
                     self._trial.refute(blind)
                 yield from self._relocalize()
 
@@ -342,7 +344,7 @@ class Navigator:
 
     def _reach_stop(self) -> None:
         """What was driven until here says nothing of the way on."""
-        self._trial = AnswerTrial(self._motion, self._positioning.refuted)
+        self._trial, self._goal_hidden = AnswerTrial(self._motion, self._positioning.refuted), False
         self._patience.reach(self._motion.now)
 
     def _let_pass(self, right_of_way: RightOfWay, follower: RouteFollower) -> Generator[Command, None, bool]:

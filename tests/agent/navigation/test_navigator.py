@@ -265,6 +265,19 @@ def test_without_landmarks_it_drives_on_a_little_before_it_is_lost(home):
     assert nav.tally.relocalizations == 1
 
 
+def test_a_look_that_shows_nothing_does_not_confirm_that_the_goal_is_reached(home, own_map):
+    """Its landmarks are seen once and then no more: a robot that was carried off is not parked at it."""
+    goal = min(own_map.nodes)
+    eyes = Eyes(home, TOUR[0] @ Pose2(0.1, 0.0, 0.05))
+    nav = navigator(eyes, own_map, goal)
+    trial = Trial(nav, eyes, lambda question: Answer(question.number, None, NO_ANSWER))
+    trial.run(10.0, lambda: nav.fix is not None)
+    assert nav.fix is not None and nav.fix.node == goal
+    eyes.world = World(home.points[:1], home.normals[:1], home.vectors[:1])
+    trial.run(60.0, lambda: nav.arrived)
+    assert not nav.arrived, nav.detail
+
+
 def test_a_tally_counts_nodes_that_were_left_before_they_were_reached():
     tally = DriveStatistics().passed([0.2]).passed([]).passed([0.9, 0.3]).passed([1.2])
     assert tally == DriveStatistics(edges=3, skipped=2)
