@@ -24,9 +24,9 @@ from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mapping.node_retirement import Released, alone
 from mapweave.agent.mission import Answer, Question
 from mapweave.agent.observation import Command, Observation, RobotDescription
-from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.ranger_monitor import not_exploring
 from mapweave.agent.settings import AgentSettings
+from mapweave.agent.submap_grid import SubmapGrid
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.ids import MapId
 from mapweave.vision.lens import Lens
@@ -240,13 +240,12 @@ class MapMaking:
         return move
 
     def _see_changes(self) -> None:
-        """Take what was changed in the map; nodes show a robot without rangers where the floor is free."""
+        """Take what was changed in the map; the floor that was seen is fixed to nodes, or seen by them."""
         new = self.mapper.take_changes()
         self._changes += new
-        if isinstance(self.floor, CameraOccupancyGrid):
-            for change in new:
-                if isinstance(change, NodePut):
-                    self.floor.see_node(change.node)
+        for change in new:
+            if isinstance(change, NodePut):
+                self.floor.see_node(change.node)
 
     def _use_calibrated(self) -> None:
         """Go on with the geometry to which the mapper has changed."""
@@ -282,10 +281,10 @@ class MapMaking:
         self._description, self._lens = description, lens
         self.sift = Sift(lens, self._settings.sift)
 
-    def _new_floor(self) -> OccupancyGrid:
+    def _new_floor(self) -> SubmapGrid | CameraOccupancyGrid:
         settings = self._settings.occupancy_grid
         if not self._by_camera:
-            return OccupancyGrid(self._description, settings)
+            return SubmapGrid(self._description, settings)
         floor = CameraOccupancyGrid(self._description, settings)
         for node in self.mapper.map.nodes.values():
             floor.see_node(node)

@@ -136,21 +136,11 @@ class OccupancyGrid:
     def _enough(self) -> float:
         return self._description.radius + self._settings.clearance
 
-    def unknown_around(self, radius: float, covered: Array) -> Array:
-        """For each cell the share of unknown cells around it: how much is to be seen from there.
-
-        Args:
-            radius: half the side of the square, m.
-            covered: (N, 2) m in map; others know the floor within the radius of these.
-        """
-        unknown = self._unknown(covered, radius)
-        side = 2 * round(radius / self._settings.cell) + 1
-        return np.asarray(cv2.boxFilter(unknown, -1, (side, side)), dtype=np.float64)
-
     def unknown_in_sight(self, points: Array, covered: Array, radius: float, reach: float) -> Array:
         """How much unknown floor would be seen from each of some points, by a full turn, (N,) m^2.
 
-        Occupied cells hide what is behind them; unknown cells hide nothing.
+        Occupied cells hide what is behind them, and so do gaps between them that are too narrow for the
+        robot: most of these are errors of its pose. Unknown cells hide nothing.
 
         Args:
             points: (N, 2) m in map.
@@ -158,17 +148,55 @@ class OccupancyGrid:
             radius: of that floor, m.
             reach: how far one can see, m.
         """
-        cell, unknown, hidden = self._settings.cell, self._unknown(covered, radius), self._odds > DECIDED
-        angles = np.arange(RAYS) * (math.tau / RAYS)
-        along = np.arange(0.5 * cell, reach, cell)
-        ray = along[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None, :]
-        pieces = along * cell * (math.tau / RAYS)
+        return self._in_sight(points, self._unknown(covered, radius), reach)
+
+    def distant_in_sight(self, points: Array, viewpoints: Array, reach: float) -> Array:
+        """How much known floor each of some points shows from near that no viewpoint shows so, (N,) m^2.
+
+        Args:
+            points: (N, 2) m in map.
+            viewpoints: (M, 2) m in map.
+            reach: what is within this, with nothing between, is near, m.
+        """
+        distant = (self._odds < -DECIDED).astype(np.float32)
+        # At most half a cell apart: every cell is met.
+        rays = self._rays(reach, math.ceil(2.0 * math.tau * reach / self._settings.cell))
+        hidden = self._closed()
+        for viewpoint in viewpoints:
+            at, visible = self._sight(viewpoint, rays, hidden)
+            distant[at[visible, 0], at[visible, 1]] = 0.0
+        return self._in_sight(points, distant, reach)
+
+    def _in_sight(self, points: Array, wanted: NDArray[np.float32], reach: float) -> Array:
+        """Area of the cells that are wanted, 1 or 0 each, in sight of each of (N, 2) m in map, (N,) m^2."""
+        rays, hidden = self._rays(reach, RAYS), self._closed()
+        pieces = np.linalg.norm(rays[0], axis=1) * self._settings.cell * (math.tau / RAYS)
         areas = np.zeros(len(points))
         for k, point in enumerate(points):
-            at = self.cells(point + ray)
-            visible = ~np.logical_or.accumulate(hidden[at[..., 0], at[..., 1]], axis=1)
-            areas[k] = (unknown[at[..., 0], at[..., 1]] * visible * pieces).sum()
+            at, visible = self._sight(point, rays, hidden)
+            areas[k] = (wanted[at[..., 0], at[..., 1]] * visible * pieces).sum()
         return areas
+
+    def _rays(self, reach: float, count: int) -> Array:
+        """(count, S, 2) m: points along rays in all directions, a cell apart, from where they begin."""
+        angles = np.arange(count) * (math.tau / count)
+        along = np.arange(0.5 * self._settings.cell, reach, self._settings.cell)
+        return np.asarray(along[None, :, None] * np.stack([np.cos(angles), np.sin(angles)], axis=1)[:, None])
+
+    def _sight(
+        self, point: Array, rays: Array, hidden: NDArray[np.bool_]
+    ) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+        """The cells along rays from a point, (2,) m in map, and which of them nothing hides."""
+        at = self.cells(point + rays)
+        return at, ~np.logical_or.accumulate(hidden[at[..., 0], at[..., 1]], axis=1)
+
+    def _closed(self) -> NDArray[np.bool_]:
+        """Occupied cells, and gaps between them through which the robot does not fit.
+
+        One cell thicker than they are, so that no ray gets through between two that meet at a corner.
+        """
+        occupied, cells = (self._odds > DECIDED).astype(np.uint8), round(self._enough / self._settings.cell)
+        return cv2.erode(cv2.dilate(occupied, _disc(cells + 1)), _disc(cells)) > 0
 
     def _unknown(self, covered: Array, radius: float) -> NDArray[np.float32]:
         """1 where a cell is unknown and none of (N, 2) points in map is within the radius (m), else 0."""
@@ -211,6 +239,12 @@ class OccupancyGrid:
                     before[neighbour] = cell
                     heapq.heappush(queue, (further, neighbour))
         return DistanceField(self, drivable, cost, before)
+
+
+def _disc(radius: int) -> NDArray[np.uint8]:
+    """Cells within a radius of a cell, which is in the middle."""
+    side = 2 * radius + 1
+    return np.asarray(cv2.getStructuringElement(cv2.MORPH_ELLIPSE, (side, side)), np.uint8)
 
 
 _FOOTPRINT: Array = np.array([[0.0, 0.0], [0.1, 0.0], [-0.1, 0.0], [0.0, 0.1], [0.0, -0.1]])

@@ -19,17 +19,21 @@ from mapweave.agent.exploration.viewpoint_selection import (
     views_of,
 )
 from mapweave.agent.mapping.episode import Episode, Move
+from mapweave.agent.mapping.relative_poses import relative_poses, way_lengths
 from mapweave.agent.mission import Answer, Question
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.settings import ExplorerSettings
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Array
+from mapweave.agent.submap_grid import SubmapGrid
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.pose import Array, Pose2
 
 COVERED_REACH = 0.7
 """Nodes within this of a place show it, m."""
 COVERED_SHARE = 0.75
 """A place around which nodes cover this share of all directions is not mapped again."""
+LOOP = 10.0
+"""A way over the map's edges that is this much longer than over the floor is a loop worth closing, m."""
 
 
 class Explorer:
@@ -39,8 +43,7 @@ class Explorer:
     `yield` is a command for one tick, or a request to the mapper.
 
     Attributes:
-        places: where it has made a full turn, (x, y) m in map.
-        spacing: least distance between two of them, m.
+        spacing: least distance between two places at which it makes a full turn, m.
     """
 
     spacing = SPACING
@@ -55,7 +58,10 @@ class Explorer:
         seed: int = 0,
     ) -> None:
         """Take the robot's description, and the mapper and grid that the pipeline keeps up to date."""
-        self.places: list[Array] = []
+        self._places: list[tuple[NodeId | None, Array]] = []
+        self._map_from_node: dict[NodeId, Pose2] = {}
+        self._loops_tried: list[Array] = []
+        self._closes_loop = False
         self._description = description
         self._mapper = mapper
         self._floor = floor
@@ -115,11 +121,12 @@ class Explorer:
         yield from self._moves.begin()
         self._ask()
         while True:
-            if seen_around(self._views, self._moves.position, COVERED_REACH) >= COVERED_SHARE:
+            covered = seen_around(self._views, self._moves.position, COVERED_REACH) >= COVERED_SHARE
+            if covered and not self._closes_loop:
                 yield from self._scan()
             else:
                 yield from self._look_around()
-            self.places.append(self._moves.position)
+            self._places.append((self._newest, self._moves.position))
             path = yield from self._await_way_on()
             if not path:
                 break
@@ -171,16 +178,75 @@ class Explorer:
 
     def _way_on(self) -> list[Array]:
         """Corners of the way to the next place; empty if there is none."""
+        self._close_loops()
         s = self._settings
-        been = np.array([*self.places, *self._avoided.places(self._now)])
-        fleet_places = self._fleet_coverage.places(self._views, COVERED_REACH, COVERED_SHARE)
-        return next_viewpoint(self._floor, self._moves.position, been, fleet_places, s, self.spacing)
+        been = np.array([*self._been(), *self._avoided.places(self._now)])
+        here, nodes = self._moves.position, self._own_views[:, :2]
+        others = self._fleet_coverage.places(self._views, COVERED_REACH, COVERED_SHARE)
+        path = next_viewpoint(self._floor, here, been, nodes, others, s, self.spacing)
+        self._closes_loop = not path
+        return path or self._way_to_close_a_loop()
+
+    def _way_to_close_a_loop(self) -> list[Array]:
+        """Corners of the way to a node that is near over the floor and far over edges; empty without one.
+
+        The robot has come back to where it was, and no node shows it (Stachniss, Haehnel, Burgard:
+        Exploration with active loop-closing for FastSLAM, IROS 2004). Each part of the floor is tried once.
+        """
+        newest = self._newest
+        if newest is None:
+            return []
+        lengths = way_lengths(self._mapper.map, newest)
+        ways = self._floor.ways(self._moves.position, math.inf)
+        near = {cell: k for k, cell in enumerate(map(tuple, ways.cells.tolist()))}
+        best, gained = None, LOOP
+        for node, (x, y) in zip(self._mapper.map.nodes, self._own_views[:, :2], strict=True):
+            k = near.get(tuple(self._floor.cells(np.array([x, y])).tolist()))
+            tried = any(math.dist((x, y), place) < REACH for place in self._loops_tried)
+            if k is not None and not tried and lengths.get(node, 0.0) - ways.lengths[k] > gained:
+                best, gained = k, lengths[node] - ways.lengths[k]
+        if best is None:
+            return []
+        self._loops_tried.append(ways.positions[best])
+        return ways.path(ways.cells[best])
+
+    def _close_loops(self) -> None:
+        """Let what was seen and where it has been lie as loop closures say, as seen from here."""
+        self._mapper.finish_pending()
+        newest = self._newest
+        if newest is None or not isinstance(self._floor, SubmapGrid):
+            return
+        own_map = self._mapper.map
+        here = own_map.nodes[newest].map_from_robot.mean
+        poses = {node: here @ pose for node, pose in relative_poses(own_map, newest).items()}
+        if self._floor.correct(poses):
+            self._map_from_node = poses
+
+    @property
+    def _newest(self) -> NodeId | None:
+        """The node that was made last."""
+        return next(reversed(self._mapper.map.nodes), None)
+
+    def _been(self) -> Iterator[Array]:
+        """(2,) m in map, where it has made a full turn."""
+        nodes = self._mapper.map.nodes
+        for node, position in self._places:
+            if node in nodes and node in self._map_from_node:
+                way = nodes[node].map_from_robot.mean
+                yield self._map_from_node[node].apply(way.inverse().apply(position))
+            else:
+                yield position
 
     @property
     def _views(self) -> Array:
         """(N, 4) of own and of others' nodes; see `views_of`."""
+        return np.concatenate([self._own_views, self._fleet_coverage.views])
+
+    @property
+    def _own_views(self) -> Array:
+        """The same of own nodes."""
         self._mapper.finish_pending()
-        return np.concatenate([views_of(self._mapper.map), self._fleet_coverage.views])
+        return views_of(self._mapper.map, self._map_from_node)
 
     def _ask(self) -> None:
         """Ask what others have mapped around here. Nothing waits for the answer."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,7 +11,8 @@ from numpy.typing import NDArray
 from mapweave.agent.occupancy_grid import DistanceField, OccupancyGrid
 from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.pose import Array
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.pose import Array, Pose2
 
 VIEW_RADIUS = 1.6
 """What lies around a place, and what others know around theirs, is judged within this radius, m."""
@@ -24,10 +26,17 @@ GRAIN = 0.4
 """One place is tried in each square of this side, m."""
 
 
-def views_of(hybrid_map: HybridMap) -> Array:
-    """(N, 4) [x m, y m, heading rad, horizontal semi-aperture rad], in map: the nodes' fields of view."""
+def views_of(hybrid_map: HybridMap, map_from_node: Mapping[NodeId, Pose2] | None = None) -> Array:
+    """(N, 4) [x m, y m, heading rad, horizontal semi-aperture rad], in map: the nodes' fields of view.
+
+    Args:
+        hybrid_map: the nodes.
+        map_from_node: where some of them lie, if not where the robot's own way says.
+    """
+    elsewhere = map_from_node or {}
     views = [
-        (*node.map_from_robot.mean.vector, node.camera.semi_aperture) for node in hybrid_map.nodes.values()
+        (*elsewhere.get(node.id, node.map_from_robot.mean).vector, node.camera.semi_aperture)
+        for node in hybrid_map.nodes.values()
     ]
     return np.array(views, dtype=np.float64).reshape(-1, 4)
 
@@ -46,91 +55,69 @@ def seen_around(views: Array, position: Array, reach: float) -> float:
     return float((off <= nearby[:, 3]).any(axis=1).mean())
 
 
-SPACING = 1.7
-"""Places are at least this far from each other, m."""
-REACH = 7.0
-"""The longest way to a next place, m."""
-
-
-def next_viewpoint(
-    floor: OccupancyGrid,
-    position: Array,
-    visited: Array,
-    covered_by_others: Array,
-    settings: ExplorerSettings,
-    spacing: float = SPACING,
-) -> list[Array]:
-    """Corners of the way to the place where the robot should make its next full turn; empty if there is none.
-
-    First where most new floor is seen for the time that it takes, then where floor was seen only from afar.
-    What others have covered is left to them, as long as there is anything else.
-
-    Args:
-        floor: what the rangers saw.
-        position: (2,) m, in map, of the robot.
-        visited: (N, 2) m, in map, N > 0: where there is nothing more to be seen.
-        covered_by_others: (M, 2) m, in map: places that others have covered.
-        settings: of the exploration.
-        spacing: least distance of the next place from these, m.
-    """
-    ways = floor.ways(position, REACH)
-    for choose in (_new_area, _closer_view):
-        for skipped in (
-            (covered_by_others, covered_by_others[:0]) if len(covered_by_others) else (covered_by_others,)
-        ):
-            taken = np.concatenate([visited, skipped])
-            away = np.linalg.norm(ways.positions[:, None] - taken[None], axis=2).min(axis=1)
-            free = np.flatnonzero(away >= spacing)
-            path = choose(floor, ways, free, skipped, settings) if len(free) else []
-            if path:
-                return path
-    return []
-
-
 VIEW = 3.0
 """A full turn shows floor up to this far, m."""
 SCAN_TIME = 60.0
 """How long a full turn takes, about, s."""
 LEAST_AREA = 1.0
 """New floor that is worth a full turn, m^2."""
+NEAR = 1.4
+"""Floor within this of a node, with nothing between, was seen from near, m."""
+LEAST_PATCH = 0.25
+"""Known floor that is worth a full turn if no node saw it from near, m^2."""
+SPACING = 1.7
+"""Places are at least this far from each other, m."""
+REACH = 7.0
+"""Farther places are looked for only if none within this way is worth a full turn, m."""
 
 
-def _new_area(
+def next_viewpoint(
     floor: OccupancyGrid,
-    ways: DistanceField,
-    free: NDArray[np.intp],
-    covered: Array,
+    position: Array,
+    visited: Array,
+    nodes: Array,
+    covered_by_others: Array,
     settings: ExplorerSettings,
+    spacing: float = SPACING,
 ) -> list[Array]:
-    """The way to where most unknown floor becomes visible per second of the way and of the full turn.
+    """Corners of the way to the place where the robot should make its next full turn; empty if there is none.
+
+    First where most new floor is seen for the time that it takes, then where most floor is seen that no node
+    saw from near. What others have covered is left to them, as long as there is anything else. Far places
+    come last, but no floor with any of these is explored.
 
     Args:
         floor: what the rangers saw.
-        ways: to everything within reach.
-        free: indices of the cells of `ways` that may be chosen.
-        covered: (M, 2) m, in map: places that others have covered.
+        position: (2,) m, in map, of the robot.
+        visited: (N, 2) m, in map, N > 0: where there is nothing more to be seen.
+        nodes: (K, 2) m, in map: where the robot's own nodes are.
+        covered_by_others: (M, 2) m, in map: places that others have covered.
         settings: of the exploration.
+        spacing: least distance of the next place from these, m.
     """
+    others = (covered_by_others, covered_by_others[:0]) if len(covered_by_others) else (covered_by_others,)
+    near = min(spacing, NEAR)
+    for reach in (REACH, math.inf):
+        ways = floor.ways(position, reach)
+        for new in (True, False):
+            for left_to_them in others:
+                tried = _one_in_each_square(ways, np.concatenate([visited, left_to_them]), spacing)
+                points = ways.positions[tried]
+                if new:
+                    areas = floor.unknown_in_sight(points, left_to_them, VIEW_RADIUS, VIEW)
+                else:
+                    areas = floor.distant_in_sight(points, np.concatenate([nodes, left_to_them]), near)
+                rates = areas / (SCAN_TIME + ways.lengths[tried] / settings.travel_speed)
+                rates[areas < (LEAST_AREA if new else LEAST_PATCH)] = 0.0
+                if rates.any():
+                    return ways.path(ways.cells[tried[rates.argmax()]])
+    return []
+
+
+def _one_in_each_square(ways: DistanceField, taken: Array, spacing: float) -> NDArray[np.intp]:
+    """Indices of cells of `ways`, one a square, that are at least the spacing (m) from (N, 2) m in map."""
+    away = np.linalg.norm(ways.positions[:, None] - taken[None], axis=2).min(axis=1)
+    free = np.flatnonzero(away >= spacing)
     squares = np.floor(ways.positions[free] / GRAIN).astype(np.int64)
     _, representatives = np.unique(squares, axis=0, return_index=True)
-    tried = free[representatives]
-    areas = floor.unknown_in_sight(ways.positions[tried], covered, VIEW_RADIUS, VIEW)
-    rates = areas / (SCAN_TIME + ways.lengths[tried] / settings.travel_speed)
-    rates[areas < LEAST_AREA] = -math.inf
-    best = int(rates.argmax())
-    return ways.path(ways.cells[tried[best]]) if np.isfinite(rates[best]) else []
-
-
-def _closer_view(
-    floor: OccupancyGrid,
-    ways: DistanceField,
-    free: NDArray[np.intp],
-    covered: Array,
-    settings: ExplorerSettings,
-) -> list[Array]:
-    """The way to where most around is unknown, visible or not; the arguments are those of `_new_area`."""
-    unknown = floor.unknown_around(VIEW_RADIUS, covered)[ways.cells[free, 0], ways.cells[free, 1]]
-    worth = unknown - 0.04 * ways.lengths[free]
-    worth[unknown < 0.02] = -math.inf
-    best = int(worth.argmax())
-    return ways.path(ways.cells[free[best]]) if np.isfinite(worth[best]) else []
+    return free[representatives]

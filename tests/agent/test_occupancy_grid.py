@@ -19,7 +19,6 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2
 from tests.quick import first_quick
 
-NO_VIEWS = np.zeros((0, 2))
 BEARINGS = tuple(np.linspace(-math.pi, math.pi, 36, endpoint=False).tolist())
 ROBOT = RobotDescription(
     Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3), ranger_bearings=BEARINGS, ranger_reach=3.0
@@ -66,6 +65,12 @@ def occupied(floor: OccupancyGrid) -> np.ndarray:
     return floor.room() == 0.0
 
 
+def unknown(floor: OccupancyGrid) -> np.ndarray:
+    """Cells of which nothing is known."""
+    taken = floor.taken()
+    return np.asarray(np.abs(taken.odds) <= taken.decided)
+
+
 def exact_room(floor: OccupancyGrid) -> np.ndarray:
     return distance_transform_edt(~occupied(floor)) * CELL
 
@@ -96,7 +101,7 @@ def test_rays_are_free_along_them_and_occupied_at_their_end(where, readings):
     pose, proximity = Pose2(*where), np.array(readings)
     floor = OccupancyGrid(ROBOT, SETTINGS)
     floor.see(pose, proximity)
-    full, known = occupied(floor), floor.unknown_around(0.0, NO_VIEWS) < 0.5
+    full, known = occupied(floor), ~unknown(floor)
     angles = pose.heading + np.array(BEARINGS)
     way = np.stack([np.cos(angles), np.sin(angles)], axis=1)
     here = np.array([pose.x, pose.y])
@@ -137,7 +142,7 @@ def test_readings_that_do_not_fit_the_robot_are_left_out():
     floor = OccupancyGrid(ROBOT, SETTINGS)
     floor.see(Pose2(), np.zeros(0))
     floor.see(Pose2(), np.full(5, 0.3))
-    assert (floor.unknown_around(0.0, NO_VIEWS) == 1.0).all()
+    assert unknown(floor).all()
 
 
 def test_the_room_is_seen_as_it_is():
@@ -168,17 +173,6 @@ def test_moved_obstacles_are_forgotten_and_new_ones_are_seen():
         floor.see(pose, measure(pose))
         gone += 1
     assert gone <= 12, "however long it stood there"
-
-
-def test_the_unknown_share_is_counted():
-    floor = known_room()
-    radius = 0.5
-    share = floor.unknown_around(radius, NO_VIEWS)
-    unknown = floor.unknown_around(0.0, NO_VIEWS) > 0.5
-    reach = round(radius / CELL)
-    for row, column in np.random.default_rng(0).integers(10, 110, (50, 2)):
-        patch = unknown[row - reach : row + reach + 1, column - reach : column + reach + 1]
-        assert share[row, column] == pytest.approx(patch.mean(), abs=1e-5)
 
 
 def test_cells_and_their_middles_belong_together():

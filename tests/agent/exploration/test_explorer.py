@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import math
+from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from mapweave.agent.exploration.explorer import Explorer
 from mapweave.agent.exploration.phase import Phase
 from mapweave.agent.exploration.viewpoint_selection import REACH
 from mapweave.agent.mission import Answer, Explore, WhatIsKnown
@@ -14,9 +16,14 @@ from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Pipeline, Step
 from mapweave.agent.settings import AgentSettings, ExplorerSettings
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.node import Edge, EdgeKind
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import KnownAnswer
+from synthetic.maps import changes_of
+from tests.agent.exploration.test_behaviours import View
+from tests.agent.test_submap_grid import ROBOT, drawn, drifting_node, drive
 from tests.quick import first_quick
 
 MAP = MapId("r0", 1)
@@ -117,3 +124,56 @@ def test_our_exploration_turns_all_the_way_around(walls):
     sides = turns(live(walls, ExplorerSettings(), 250, {}))
     assert len(sides) >= 3
     assert len(set(sides)) == 1
+
+
+class Mapped(View):
+    """A mapper that has driven around a block, and has a map whose nodes drift."""
+
+    def __init__(self, closed: bool) -> None:
+        super().__init__()
+        self.true, self.taken = drive()
+        kept = range(0, len(self.taken), 10)
+        nodes = [drifting_node(k, self.taken[k]) for k in kept]
+        ways = [(a, b, self.taken[a].inverse() @ self.taken[b]) for a, b in pairwise(kept)]
+        if closed:
+            ways.append((0, kept[-1], self.true[0].inverse() @ self.true[kept[-1]]))
+        edges = [
+            Edge(NodeId("r0", 1, 9000 + k), nodes[a // 10].id, nodes[b // 10].id,
+                 PoseGaussian.from_sigmas(pose, 0.01, 0.002), EdgeKind.LOOP)
+            for k, (a, b, pose) in enumerate(ways)
+        ]  # fmt: skip
+        self.pose, self.known = self.taken[-1], HybridMap(changes_of(nodes, edges))
+
+    @property
+    def map(self) -> HybridMap:
+        return self.known
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_where_it_was_moves_with_the_map_when_a_loop_closes(closed):
+    """Behind a loop its places and views lie where they are as seen from it, not where its way puts them."""
+    mapper, (floor, *_) = Mapped(closed), drawn()
+    explorer = Explorer(MAP, ROBOT, mapper, floor, ExplorerSettings(ask_fleet=False))  # type: ignore[arg-type]
+    first = NodeId("r0", 1, 0)
+    explorer._places = [(first, np.array([0.0, 0.0])), (None, np.array([1.0, 1.0]))]
+    explorer._close_loops()
+    been = list(explorer._been())
+    start = mapper.taken[-1] @ mapper.true[-1].inverse() @ mapper.true[0]
+    off = float(np.linalg.norm(been[0] - [start.x, start.y]))
+    assert off < 0.15 if closed else off > 0.5
+    assert (been[1] == [1.0, 1.0]).all(), "what was before the first node stays"
+    assert explorer._own_views[0, :2] == pytest.approx(been[0])
+
+
+def test_a_loop_that_no_node_closes_is_closed_before_it_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Before, a robot that had seen all around a ring was complete, and its map had two open ends."""
+    monkeypatch.setattr("mapweave.agent.exploration.explorer.next_viewpoint", lambda *_: [])
+    (floor, *_) = drawn()
+    closed, open_ = (
+        Explorer(MAP, ROBOT, Mapped(c), floor, ExplorerSettings(ask_fleet=False))  # type: ignore[arg-type]
+        for c in (True, False)
+    )
+    assert closed._way_on() == []
+    (*_, end) = open_._way_on()
+    assert np.linalg.norm(end) < 3.0, "to where it has begun"
+    assert open_._way_on() == [], "once"
