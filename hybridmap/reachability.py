@@ -42,6 +42,11 @@ class Reachability:
     in_view: int
     reason: str
 
+    @property
+    def in_sight(self) -> bool:
+        """Whether a robot that drives it sees all the way where it is: nothing solid is between."""
+        return self.drivable or self.in_view >= LEAST
+
 
 FARTHEST = 2.5
 """Largest distance of two nodes between which the servo drives, m."""

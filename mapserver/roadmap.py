@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.area import Floats
 from mapweave.hybridmap.change import EdgePut
-from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.hybrid_map import HybridMap, reached
 from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -26,15 +26,19 @@ Faded = Mapping[NodeId, NDArray[np.bool_]]
 class ClosedEdges(Collection[EdgeId]):
     """Edges of a map that the servo could not drive; each is evaluated on demand."""
 
-    def __init__(self, union: HybridMap, faded: Faded, cache: ReachabilityCache) -> None:
+    def __init__(
+        self, union: HybridMap, faded: Faded, cache: ReachabilityCache, out_of_sight: bool = False
+    ) -> None:
         """Take a map.
 
         Args:
             union: nodes and edges.
             faded: faded landmarks.
             cache: of reachability.
+            out_of_sight: only those on which the robot loses sight of the landmarks.
         """
         self._union, self._faded, self._cache = union, faded, cache
+        self._out_of_sight = out_of_sight
 
     def __contains__(self, edge_id: object) -> bool:
         """Whether the servo could not drive an edge of the map."""
@@ -45,7 +49,8 @@ class ClosedEdges(Collection[EdgeId]):
         if edge.a not in nodes or edge.b not in nodes:
             return False
         faded = self._faded.get(edge.a), self._faded.get(edge.b)
-        return not self._cache.reach(edge, nodes[edge.a], nodes[edge.b], faded).drivable
+        reach = self._cache.reach(edge, nodes[edge.a], nodes[edge.b], faded)
+        return not (reach.in_sight if self._out_of_sight else reach.drivable)
 
     def __iter__(self) -> Iterator[EdgeId]:
         """All of them: evaluates every edge."""
@@ -64,6 +69,7 @@ class Roadmap:
         union: its nodes and edges. In addition, nodes at one place are joined, whatever they show: a robot
             can turn there. And every superseded node is joined with its successor.
         closed: edges that only tie poses.
+        out_of_sight: those of them on which a robot does not see all the way where it is.
         poses: of all nodes.
         active_poses: of the active nodes.
     """
@@ -78,7 +84,9 @@ class Roadmap:
         """
         self.merged = merged
         self.union: HybridMap = merged.union()
-        self.closed = ClosedEdges(self.union, merged.faded, reaches)
+        self.closed, self.out_of_sight = (
+            ClosedEdges(self.union, merged.faded, reaches, out_of_sight) for out_of_sight in (False, True)
+        )
         reaches.forget(self.union.edges)
         self.poses = {node: merged.pose(node) for node in merged.poses}
         self.active_poses = {node: p for node, p in self.poses.items() if node not in merged.superseded}
@@ -87,6 +95,20 @@ class Roadmap:
         for k, (node, fate) in enumerate(sorted(merged.superseded.items())):
             if node in self.poses and fate.by in self.poses:
                 self._join(EdgeId(SUCCESSION, 0, k), node, fate.by)
+
+    def joined(self, start: NodeId, goal: NodeId, portals: Collection[tuple[NodeId, NodeId]]) -> bool:
+        """Whether edges that can be driven lead from a node to another, through portals too."""
+        beyond = {a: b for pair in portals for a, b in (pair, pair[::-1])}
+
+        def neighbours(node: NodeId) -> Iterator[NodeId]:
+            for edge in self.union.edges_at(node):
+                other = edge.b if edge.a == node else edge.a
+                if other in self.poses and edge.id not in self.closed:
+                    yield other
+            if node in beyond:
+                yield beyond[node]
+
+        return goal in reached(start, neighbours)
 
     def segments(self, component: int) -> tuple[list[tuple[NodeId, NodeId]], Floats, Floats]:
         """Joined pairs of nodes of a component, and (N, 2) where each begins and ends in the merged frame."""

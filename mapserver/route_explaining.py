@@ -97,24 +97,24 @@ def explain_route(
         frozenset(map(frozenset, blocked)), frozenset(map(frozenset, wary)), WARY_COST, rules, within
     )
     route, why_not = Route((), (), 0.0, ""), ""
-    poses: Mapping[NodeId, Pose2] = {}
-    for poses in router.choices(start, goal):
-        route = router.ways(poses, blocked, wary, within=within).find(start, goal)
+    for choice in router.choices(start, goal):
+        route = router.ways(choice, blocked, wary, within=within).find(start, goal)
         if route.nodes:
             break
         why_not = route.reason
+    poses = choice.poses
     if not route.nodes:
-        least = router.ways(poses, blocked, wary, TOLL, within).find(start, goal)
+        least = router.ways(choice, blocked, wary, TOLL, within).find(start, goal)
         gaps = _gaps(router, least, poses, hindrances)
         many = "1 gap is" if len(gaps) == 1 else f"{len(gaps)} gaps are"
         more = f"; {many} on the way that lacks least" if gaps else ""
         return RouteExplanation(start, goal, False, f"{why_not}{more}", gaps=gaps)
-    best = router.ways(poses, toll=0.0, within=within).find(start, goal)
+    best = router.ways(choice, toll=0.0, within=within).find(start, goal)
     gaps = _gaps(router, best, poses, hindrances) if best.cost < route.cost - CLEARLY else ()
     hops = tuple(_hops(router, route, poses, hindrances))
     reason = _why(router, route, best, hops, gaps) + _leaving(within)
     if rules:
-        free = router.ways(poses, blocked, wary, within=None).find(start, goal)
+        free = router.ways(choice, blocked, wary, within=None).find(start, goal)
         reason += _detour(router, route, free, poses)
     return RouteExplanation(start, goal, True, reason, hops, gaps)
 

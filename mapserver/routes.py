@@ -8,6 +8,7 @@ from collections.abc import Collection, Iterator, Mapping, Sequence
 from copy import copy
 from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 
@@ -42,6 +43,18 @@ WARY_COST = 4.0
 
 ENTRIES = 12
 """Nodes that are tried as the beginning of a route."""
+
+
+class Choice(NamedTuple):
+    """What a way is searched over.
+
+    Attributes:
+        poses: of the nodes.
+        closed: edges that it does not pass.
+    """
+
+    poses: Mapping[NodeId, Pose2]
+    closed: Collection[EdgeId]
 
 
 class _Shared:
@@ -162,9 +175,9 @@ class Router:
         within = self.rules.around(start, start_from_robot or Pose2())
         for rules in (True, False) if self.rules else (True,):
             reason = ""
-            for poses in self.choices(start, goal):
+            for choice in self.choices(start, goal):
                 best, why_not = self._cheapest(
-                    start, goal, poses, blocked, wary, start_from_robot, within if rules else None
+                    start, goal, choice, blocked, wary, start_from_robot, within if rules else None
                 )
                 if best is not None and rules:
                     return self._answer(start, best)
@@ -225,27 +238,33 @@ class Router:
             "" if closure is None else f"{name} {goal} is in {closure.name}, which is {rule_words(closure)}"
         )
 
-    def choices(self, start: NodeId, goal: NodeId) -> Iterator[Mapping[NodeId, Pose2]]:
-        """Sets of nodes over which a way is searched, one after the other.
+    def choices(self, start: NodeId, goal: NodeId) -> Iterator[Choice]:
+        """What a way is searched over, one after the other.
 
-        Superseded nodes are passed only where necessary, and at portals.
+        Superseded nodes are passed only where necessary, and at portals. Where nothing that can be driven
+        joins the two, an edge is tried that is longer, or turns more, than the servo manages, if landmarks
+        stay in view on it: a robot with proximity sensors gets near by these. Others refuse.
         """
-        sides = (node for pair in self.portals.edges.values() for node in pair)
-        yield self.roads.active_poses | {node: self.roads.poses[node] for node in (start, goal, *sides)}
-        yield self.roads.poses
+        roads, portals = self.roads, self.portals.edges.values()
+        sides = (node for pair in portals for node in pair)
+        active = roads.active_poses | {node: roads.poses[node] for node in (start, goal, *sides)}
+        yield Choice(active, roads.closed)
+        yield Choice(roads.poses, roads.closed)
+        if not roads.joined(start, goal, portals):
+            yield Choice(roads.poses, roads.out_of_sight)
 
     def ways(
         self,
-        poses: Mapping[NodeId, Pose2],
+        choice: Choice,
         blocked: Collection[tuple[NodeId, NodeId]] = (),
         wary: Collection[tuple[NodeId, NodeId]] = (),
         toll: float | None = None,
         within: Collection[Annotation] | None = (),
     ) -> Ways:
-        """The ways over nodes with these poses; see `route` and mapweave.hybridmap.route.Ways.
+        """The ways over some nodes and edges; see `route` and mapweave.hybridmap.route.Ways.
 
         Args:
-            poses: of the nodes.
+            choice: which.
             blocked: pairs of nodes between which the robot cannot drive.
             wary: pairs of nodes between which another robot did not get through.
             toll: what a pair that is blocked, closed, or cannot be driven costs, m; None: it is not passed.
@@ -255,8 +274,8 @@ class Router:
         closed = set() if within is None else rules.closed_for(within)
         barred = [*map(frozenset, blocked), *closed, *(self._discs.barred if self._discs else ())]
         return Ways(
-            self.roads.union, poses=poses, penalties=self._penalties(wary), blocked=barred,
-            closed=self.roads.closed, settings=self.costs, toll=toll,
+            self.roads.union, poses=choice.poses, penalties=self._penalties(wary), blocked=barred,
+            closed=choice.closed, settings=self.costs, toll=toll,
             factors={} if within is None else rules.factors_for(within), portals=self.portals.edges,
         )  # fmt: skip
 
@@ -275,14 +294,14 @@ class Router:
         self,
         start: NodeId,
         goal: NodeId,
-        poses: Mapping[NodeId, Pose2],
+        choice: Choice,
         blocked: Collection[tuple[NodeId, NodeId]],
         wary: Collection[tuple[NodeId, NodeId]],
         start_from_robot: Pose2 | None,
         within: Collection[Annotation] | None,
     ) -> tuple[Route | None, str]:
-        """The cheapest way over nodes with these poses, or why the nearest entry has none."""
-        ways = self.ways(poses, blocked, wary, within=within)
+        """The cheapest way over some nodes and edges, or why the nearest entry has none."""
+        ways, poses = self.ways(choice, blocked, wary, within=within), choice.poses
         best: Route | None = None
         reason, best_cost = "", math.inf
         for entry, cost in self._entries(start, poses, start_from_robot, blocked, within):
@@ -305,7 +324,12 @@ class Router:
             kind = union.edges[edge_id].kind
             legs.append(RouteLeg(nodes[node], self._relative(before, node), kind))
         through = "".join(f", through {stop.title} to {stop.beyond}" for _, stop in stops)
-        return RouteAnswer(tuple(legs), best.reason + through, portal)
+        tried = "".join(
+            f"; no robot has driven between {a} and {b}"
+            for (a, b), edge_id in zip(pairwise(way), best.edges, strict=False)
+            if edge_id in self.roads.closed
+        )
+        return RouteAnswer(tuple(legs), best.reason + through + tried, portal)
 
     def _entries(
         self,

@@ -27,6 +27,7 @@ from mapweave.wire.messages import decode, encode
 from mapweave.wire.packing import pack
 from synthetic.maps import changes_of, numbered
 from synthetic.world import Sensing, room, take_map
+from tests.mapserver.test_routes import OutOfSight
 
 ME, OTHER, FAR = MapId("a", 1), MapId("b", 1), MapId("c", 1)
 SHARP = Sensing(most=150, clutter=5, unknown_depth=0.0, reach=9.0)
@@ -47,6 +48,12 @@ def fleet() -> Merger:
 @pytest.fixture(scope="module")
 def router() -> Router:
     return Router(fleet().merged())
+
+
+@pytest.fixture(scope="module")
+def apart() -> Router:
+    """The same, with something between the two robots."""
+    return Router(fleet().merged(), reaches=OutOfSight())
 
 
 def nodes_of(map_id: MapId) -> list[NodeId]:
@@ -79,8 +86,18 @@ def least_gaps(router: Router, start: NodeId, goal: NodeId) -> int:
     )
 
 
-def test_edges_that_only_constrain_poses_are_named_with_what_they_lack(router: Router) -> None:
+def test_a_way_that_no_robot_has_driven_is_explained_as_it_is_given(router: Router) -> None:
     start, goal = nodes_of(ME)[0], nodes_of(OTHER)[2]
+    explanation, answer = explain_route(router, start, goal), router.route(start, goal)
+    assert explanation.found
+    ends = [start, *(hop.b for hop in explanation.hops)]
+    assert ends == [leg.node.id for leg in answer.legs]
+    (words,) = [hop.words for hop in explanation.hops if hop.a.map != hop.b.map]
+    assert words.startswith("ties poses, not driven: ")
+
+
+def test_edges_that_only_constrain_poses_are_named_with_what_they_lack(apart: Router) -> None:
+    router, start, goal = apart, nodes_of(ME)[0], nodes_of(OTHER)[2]
     explanation = explain_route(router, start, goal)
     assert not explanation.found and not explanation.hops and explanation.apart is None
     assert (

@@ -3,14 +3,20 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from mapweave.hybridmap.change import Change, EdgePut
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind
+from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.reachability import LEAST, Reachability
+from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.map_explanation import explain_maps
 from mapweave.merge.explanation.node_explanation import explain_nodes
@@ -61,6 +67,14 @@ def test_the_first_leg_leads_from_the_node_that_the_robot_knows(row: tuple[Route
     assert math.hypot(relative.x - STEP, relative.y) < 0.03
 
 
+class OutOfSight(ReachabilityCache):
+    """As if something stood between any two nodes that no robot has driven between."""
+
+    def reach(self, edge: Edge, a: Node, b: Node, faded: Sequence[NDArray[np.bool_] | None]) -> Reachability:
+        found = super().reach(edge, a, b, faded)
+        return replace(found, in_view=min(found.in_view, LEAST - 1))
+
+
 def test_a_link_that_the_servo_could_not_drive_ties_maps_and_leads_nowhere() -> None:
     """Two robots see one wall from three metres apart; then a robot drives from one to the other."""
     rng = np.random.default_rng(1)
@@ -73,8 +87,12 @@ def test_a_link_that_the_servo_could_not_drive_ties_maps_and_leads_nowhere() -> 
     merger = merger_of(logs)
     merged = merger.merged()
     assert len(merged.components) == 1 and merged.links, "the poses are tied"
-    answer = Router(merged).route(ends[0][0], ends[1][1])
+    answer = Router(merged, reaches=OutOfSight()).route(ends[0][0], ends[1][1])
     assert not answer.legs and "only ties poses" in answer.reason
+    tried = Router(merged).route(ends[0][0], ends[1][1])
+    assert [leg.node.id for leg in tried.legs][:: len(tried.legs) - 1] == [ends[0][0], ends[1][1]]
+    (pair,) = [pair for pair in pairwise(leg.node.id for leg in tried.legs) if pair[0].map != pair[1].map]
+    assert f"no robot has driven between {pair[0]} and {pair[1]}" in tried.reason, "without another way"
     explanation = explain_nodes(merged, *merged.links[0].pair)
     assert any("ties poses, not driven" in claim and "2.5 m" in claim for claim in explanation.claims)
     joined = explain_maps(merged, ME, other)
