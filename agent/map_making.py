@@ -271,6 +271,8 @@ class MapMaking:
         if recognized is None:
             return command
         self.mapper.resume(observation, recognized.features, recognized.node, recognized.recognition)
+        if isinstance(self.floor, SubmapGrid):
+            self.floor.go_on_from(recognized.node)
         map_from_odom = self.mapper.map_from_robot.mean @ odom_from_robot.inverse()
         for odom_from_then, proximity in self._resumption.seen:
             self.floor.see(map_from_odom @ odom_from_then, proximity)

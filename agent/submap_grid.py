@@ -53,9 +53,8 @@ class SubmapGrid(OccupancyGrid):
     def __init__(self, description: RobotDescription, settings: OccupancyGridSettings | None = None) -> None:
         """Start with everything unknown."""
         super().__init__(description, settings)
-        s = self._settings
         side = 2.0 * (STRETCH + description.ranger_reach + 1.0)
-        self._stretch_settings = replace(s, side=min(side, s.side))
+        self._stretch_settings = replace(self._settings, side=side)
         self._submaps: deque[Submap] = deque(maxlen=MOST_SUBMAPS)
         self._node: tuple[NodeId | None, Pose2] = None, Pose2()
         self._begun: Array | None = None
@@ -72,10 +71,19 @@ class SubmapGrid(OccupancyGrid):
         super().see(map_from_robot, proximity)
         here = np.array([map_from_robot.x, map_from_robot.y])
         if self._begun is None or np.linalg.norm(here - self._begun) > STRETCH:
-            self._submaps.extend(self._taken_submap())
-            self._begun, self._open = here, OccupancyGrid(self._description, self._stretch_settings)
+            self._end_submap()
+            self._begun = here
             self._open.roll(here)
         self._open.see(map_from_robot, proximity)
+
+    def go_on_from(self, node: Node) -> None:
+        """The robot was lost and has recognised a node: what it sees from now on is fixed to that."""
+        self._end_submap()
+        self._begun, self._node = None, (node.id, node.map_from_robot.mean)
+
+    def _end_submap(self) -> None:
+        self._submaps.extend(self._taken_submap())
+        self._open = OccupancyGrid(self._description, self._stretch_settings)
 
     def correct(self, map_from_node: Mapping[NodeId, Pose2]) -> bool:
         """Draw the grid again where nodes lie elsewhere than the robot's own way says, by more than a cell.

@@ -119,6 +119,8 @@ class Explorer:
 
     def _explore(self) -> Iterator[Move]:
         yield from self._moves.begin()
+        # Found again, the robot is where an earlier node says.
+        self._close_loops()
         self._ask()
         while True:
             covered = seen_around(self._views, self._moves.position, COVERED_REACH) >= COVERED_SHARE
@@ -126,7 +128,7 @@ class Explorer:
                 yield from self._scan()
             else:
                 yield from self._look_around()
-            self._places.append((self._newest, self._moves.position))
+            self._places.append((self._mapper.last, self._moves.position))
             path = yield from self._await_way_on()
             if not path:
                 break
@@ -193,10 +195,10 @@ class Explorer:
         The robot has come back to where it was, and no node shows it (Stachniss, Haehnel, Burgard:
         Exploration with active loop-closing for FastSLAM, IROS 2004). Each part of the floor is tried once.
         """
-        newest = self._newest
-        if newest is None:
+        here = self._mapper.last
+        if here is None:
             return []
-        lengths = way_lengths(self._mapper.map, newest)
+        lengths = way_lengths(self._mapper.map, here)
         ways = self._floor.ways(self._moves.position, math.inf)
         near = {cell: k for k, cell in enumerate(map(tuple, ways.cells.tolist()))}
         best, gained = None, LOOP
@@ -213,19 +215,13 @@ class Explorer:
     def _close_loops(self) -> None:
         """Let what was seen and where it has been lie as loop closures say, as seen from here."""
         self._mapper.finish_pending()
-        newest = self._newest
-        if newest is None or not isinstance(self._floor, SubmapGrid):
+        last, own_map = self._mapper.last, self._mapper.map
+        if last is None or not isinstance(self._floor, SubmapGrid):
             return
-        own_map = self._mapper.map
-        here = own_map.nodes[newest].map_from_robot.mean
-        poses = {node: here @ pose for node, pose in relative_poses(own_map, newest).items()}
+        here = own_map.nodes[last].map_from_robot.mean
+        poses = {node: here @ pose for node, pose in relative_poses(own_map, last).items()}
         if self._floor.correct(poses):
             self._map_from_node = poses
-
-    @property
-    def _newest(self) -> NodeId | None:
-        """The node that was made last."""
-        return next(reversed(self._mapper.map.nodes), None)
 
     def _been(self) -> Iterator[Array]:
         """(2,) m in map, where it has made a full turn."""

@@ -7,6 +7,7 @@ from typing import Protocol
 
 from mapweave.agent.observation import Command
 from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 
 
@@ -31,6 +32,10 @@ class Episode(Protocol):
     @property
     def map(self) -> HybridMap:
         """What was mapped so far."""
+
+    @property
+    def last(self) -> NodeId | None:
+        """The node from which the map goes on; None before there is one, or if the robot is lost."""
 
     def finish_pending(self) -> None:
         """Put into the map what is left of the last episode."""

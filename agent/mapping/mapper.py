@@ -85,6 +85,11 @@ class Mapper:
         return self._keyframes.map
 
     @property
+    def last(self) -> NodeId | None:
+        """The node from which the map goes on: the newest, or the one that was recognised; None if lost."""
+        return self._keyframes.last
+
+    @property
     def started(self) -> bool:
         """Whether there is an anchor view to map from."""
         return self._anchor is not None
@@ -204,7 +209,7 @@ class Mapper:
 
         Not while a drive to a goal may use it.
         """
-        last = self._keyframes.last
+        last = self.last
         node = self._retirement.next(now_ns, () if last is None else (last,))
         if node is not None:
             self._keyframes.retire(node)

@@ -100,6 +100,24 @@ def test_what_belongs_to_a_node_that_is_gone_stays():
     assert (floor.taken().odds == plain.taken().odds).all()
 
 
+def test_what_a_robot_sees_that_was_found_again_stays_where_it_was_found():
+    """It is carried back to its first node, whose own pose it takes up: seen from there, the rest moves."""
+    floor, *_ = drawn()
+    true, taken = drive()
+    floor.go_on_from(drifting_node(0, taken[0]))
+    exact = OccupancyGrid(ROBOT, WIDE)
+    start_from_world = taken[0] @ true[0].inverse()
+    for k in range(10):
+        seen = measure(true[k], AROUND)
+        floor.see(start_from_world @ true[k], seen)
+        exact.see(start_from_world @ true[k], seen)
+    by_first = {NodeId("r0", 1, k): start_from_world @ true[k] for k in range(0, len(true), 10)}
+    assert floor.correct(by_first)
+    known = np.abs(exact.taken().odds) > 1.0
+    same = np.sign(floor.taken().odds) == np.sign(exact.taken().odds)
+    assert same[known].mean() > 0.97
+
+
 @pytest.mark.slow
 def test_a_long_way_takes_a_bounded_number_of_submaps():
     floor = SubmapGrid(ROBOT, WIDE)

@@ -22,7 +22,7 @@ from mapweave.agent.mapping.episode import Move
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from tests.agent.ranged_body import BEARINGS, BODY
 
@@ -46,6 +46,10 @@ class View:
     @property
     def map_from_robot(self) -> PoseGaussian:
         return PoseGaussian(self.pose, np.zeros((3, 3)))
+
+    @property
+    def last(self) -> NodeId | None:
+        return None
 
     def finish_pending(self) -> None:
         """It makes no nodes."""

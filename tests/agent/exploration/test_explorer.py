@@ -148,6 +148,10 @@ class Mapped(View):
     def map(self) -> HybridMap:
         return self.known
 
+    @property
+    def last(self) -> NodeId | None:
+        return max(self.known.nodes)
+
 
 @pytest.mark.parametrize("closed", [False, True])
 def test_where_it_was_moves_with_the_map_when_a_loop_closes(closed):
