@@ -107,7 +107,7 @@ def test_what_a_robot_sees_that_was_found_again_stays_where_it_was_found():
     floor.go_on_from(drifting_node(0, taken[0]))
     exact = OccupancyGrid(ROBOT, WIDE)
     start_from_world = taken[0] @ true[0].inverse()
-    for k in range(10):
+    for k in range(90):
         seen = measure(true[k], AROUND)
         floor.see(start_from_world @ true[k], seen)
         exact.see(start_from_world @ true[k], seen)
@@ -116,6 +116,9 @@ def test_what_a_robot_sees_that_was_found_again_stays_where_it_was_found():
     known = np.abs(exact.taken().odds) > 1.0
     same = np.sign(floor.taken().odds) == np.sign(exact.taken().odds)
     assert same[known].mean() > 0.97
+    newest = floor._submaps[-1]
+    assert newest.node == NodeId("r0", 1, 0)
+    assert newest.moved.distance(Pose2()) < 1e-9
 
 
 @pytest.mark.slow
