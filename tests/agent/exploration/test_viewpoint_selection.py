@@ -15,7 +15,7 @@ from mapweave.agent.exploration.viewpoint_selection import next_viewpoint, seen_
 from mapweave.agent.mission import Answer, WhatIsKnown
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
-from mapweave.agent.settings import ExplorerSettings
+from mapweave.agent.settings import ExplorerSettings, OccupancyGridSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -207,12 +207,12 @@ def test_floor_that_was_seen_from_afar_only_agrees_with_a_test_of_each_cell():
 
 def wall_with_gap(angle: float, gap: float) -> OccupancyGrid:
     """A wall one cell thick, 1 m from the origin, with a gap in its middle; what is before it is known."""
-    floor = OccupancyGrid(BODY)
+    floor = OccupancyGrid(BODY, OccupancyGridSettings(side=12.0))
     cells = np.argwhere(np.isfinite(floor.taken().odds))
     points = floor.centres(cells)
     ahead = points @ (math.cos(angle), math.sin(angle))
     floor._odds[tuple(cells[ahead < 1.0].T)] = -1.0
-    for along in np.arange(-6.0, 6.0, 0.02):
+    for along in np.arange(-5.0, 5.0, 0.02):
         if abs(along) > gap / 2:
             cell = floor.cells(Pose2(0.0, 0.0, angle).apply(np.array([1.0, along])))
             floor._odds[tuple(cell)] = 1.0
