@@ -44,7 +44,7 @@ class Reachability:
 
     @property
     def in_sight(self) -> bool:
-        """Whether a robot that drives it sees all the way where it is: nothing solid is between."""
+        """Whether common landmarks stay in view on the way: a robot that drives it sees where it is."""
         return self.drivable or self.in_view >= LEAST
 
 

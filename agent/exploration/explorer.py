@@ -200,12 +200,13 @@ class Explorer:
             return []
         lengths = way_lengths(self._mapper.map, here)
         ways = self._floor.ways(self._moves.position, math.inf)
-        near = {cell: k for k, cell in enumerate(map(tuple, ways.cells.tolist()))}
+        numbers = np.full(self._floor.room().shape, -1)
+        numbers[ways.cells[:, 0], ways.cells[:, 1]] = np.arange(len(ways.cells))
         best, gained = None, LOOP
-        for node, (x, y) in zip(self._mapper.map.nodes, self._own_views[:, :2], strict=True):
-            k = near.get(tuple(self._floor.cells(np.array([x, y])).tolist()))
-            tried = any(math.dist((x, y), place) < REACH for place in self._loops_tried)
-            if k is not None and not tried and lengths.get(node, 0.0) - ways.lengths[k] > gained:
+        for node, place in zip(self._mapper.map.nodes, self._own_views[:, :2], strict=True):
+            k = int(numbers[tuple(self._floor.cells(place))])
+            tried = any(math.dist(place, before) < REACH for before in self._loops_tried)
+            if k >= 0 and not tried and lengths.get(node, 0.0) - ways.lengths[k] > gained:
                 best, gained = k, lengths[node] - ways.lengths[k]
         if best is None:
             return []

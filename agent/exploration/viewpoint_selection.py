@@ -116,8 +116,11 @@ def next_viewpoint(
 
 def _one_in_each_square(ways: DistanceField, taken: Array, spacing: float) -> NDArray[np.intp]:
     """Indices of cells of `ways`, one a square, that are at least the spacing (m) from (N, 2) m in map."""
-    away = np.linalg.norm(ways.positions[:, None] - taken[None], axis=2).min(axis=1)
-    free = np.flatnonzero(away >= spacing)
-    squares = np.floor(ways.positions[free] / GRAIN).astype(np.int64)
+    away, positions = np.ones(len(ways.cells), np.bool_), ways.positions
+    # One after the other: the whole floor has many cells.
+    for place in taken:
+        away &= np.linalg.norm(positions - place, axis=1) >= spacing
+    free = np.flatnonzero(away)
+    squares = np.floor(positions[free] / GRAIN).astype(np.int64)
     _, representatives = np.unique(squares, axis=0, return_index=True)
     return free[representatives]
