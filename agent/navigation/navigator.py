@@ -238,7 +238,7 @@ class Navigator:
         crossing.looked(self.fix is not None)
 
     def _find(self) -> Behaviour:
-        self.stage = Stage.LOST
+        self.stage, self._goal_hidden = Stage.LOST, False
         self._patience.trouble = "it does not know where it is"
         expected, self._expected = self._expected, None
         self._start_from((yield from self._positioning.find(expected)))

@@ -15,10 +15,13 @@ from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.navigation.stage import Stage
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.drive_statistics import DriveStatistics
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, Obstacle, RelocalizeAnswer, RouteAnswer, RouteLeg
+from mapweave.vision.sift import Features
+from synthetic.maps import changes_of
 from synthetic.world import World, take_map
 from tests.agent.scripted_fleet import (
     BODY,
@@ -276,6 +279,29 @@ def test_a_look_that_shows_nothing_does_not_confirm_that_the_goal_is_reached(hom
     eyes.world = World(home.points[:1], home.normals[:1], home.vectors[:1])
     trial.run(60.0, lambda: nav.arrived)
     assert not nav.arrived, nav.detail
+
+
+class BlankAtTheGoal(Eyes):
+    """Sees nothing where it looks along x near the second place of the tour."""
+
+    def extract(self, image: np.ndarray, left_out: object = None) -> Features:
+        seen = super().extract(image, left_out)
+        shown = len(seen) if self.pose.x < TOUR[1].x - 0.45 or abs(self.pose.heading) > 0.9 else 0
+        return Features(seen.pixels[:shown], seen.pixels[:shown], seen.codes[:shown], np.ones(shown))
+
+
+def test_a_goal_before_a_blank_wall_is_reached_by_two_looks_at_what_is_beside_it(home):
+    """A look at the goal fails; the robot goes on looking, and what it sees elsewhere is the second."""
+    poses = [TOUR[0], TOUR[1], TOUR[1] @ Pose2(0.0, 0.0, 2.6), TOUR[1] @ Pose2(0.0, 0.0, -2.6)]
+    nodes, edges = take_map(home, A.map, poses, np.random.default_rng(2), sigma_xy=0.002)
+    goal = nodes[1].id
+    nodes[1] = replace(nodes[1], landmarks=bare(goal).landmarks)
+    eyes = BlankAtTheGoal(home, TOUR[0] @ Pose2(0.1, 0.0, 0.05))
+    nav = navigator(eyes, HybridMap(changes_of(nodes, edges)), goal)
+    trial = Trial(nav, eyes, lambda question: Answer(question.number, None, NO_ANSWER))
+    trial.run(150.0, lambda: nav.arrived or nav.given_up)
+    assert nav.arrived and "its own landmarks" in nav.detail, trial.said
+    assert TOUR[1].distance(eyes.pose) < 0.08
 
 
 def test_a_tally_counts_nodes_that_were_left_before_they_were_reached():
