@@ -195,26 +195,42 @@ class Ways:
         return self._least * self._places[node].distance(self._places[target]) if self._comparable else 0.0
 
     def _why_not(self, start: NodeId, goal: NodeId) -> str:
-        there = self._map.nodes
-
-        def joined(node: NodeId, closed: Collection[EdgeId]) -> Iterator[NodeId]:
-            for edge in self._map.edges_at(node):
-                if edge.a in there and edge.b in there and edge.id not in closed:
-                    yield edge.b if edge.a == node else edge.a
-            for a, b in self._portals:
-                if node in (a, b):
-                    yield b if node == a else a
-
-        def is_joined(closed: Collection[EdgeId]) -> bool:
-            return goal in reached(start, lambda node: joined(node, closed))
-
-        if not is_joined(()):
+        if not joined(self._map, start, goal, (), self._portals):
             return f"{start} and {goal} are in parts of the map that nothing joins"
-        if not is_joined(self._closed):
+        if not joined(self._map, start, goal, self._closed, self._portals):
             return f"what joins {start} and {goal} only ties poses: nothing there could be driven"
         if self._barred:
             return f"every way from {start} to {goal} is blocked ({len(self._barred)} pairs)"
         return f"a node on every way from {start} to {goal} has no pose in the merged map"
+
+
+def joined(
+    hybrid_map: HybridMap,
+    start: NodeId,
+    goal: NodeId,
+    closed: Collection[EdgeId] = (),
+    portals: Collection[tuple[NodeId, NodeId]] = (),
+) -> bool:
+    """Whether edges, or portals, lead from a node to another, whatever is blocked.
+
+    Args:
+        hybrid_map: nodes and edges; edges to nodes that are not there lead nowhere.
+        start: one node.
+        goal: the other.
+        closed: edges that are not passed.
+        portals: pairs of nodes that are joined, too.
+    """
+    there = hybrid_map.nodes
+
+    def neighbours(node: NodeId) -> Iterator[NodeId]:
+        for edge in hybrid_map.edges_at(node):
+            if edge.a in there and edge.b in there and edge.id not in closed:
+                yield edge.b if edge.a == node else edge.a
+        for a, b in portals:
+            if node in (a, b):
+                yield b if node == a else a
+
+    return goal in reached(start, neighbours)
 
 
 def find_route(

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.area import Floats
 from mapweave.hybridmap.change import EdgePut
-from mapweave.hybridmap.hybrid_map import HybridMap, reached
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -95,20 +95,6 @@ class Roadmap:
         for k, (node, fate) in enumerate(sorted(merged.superseded.items())):
             if node in self.poses and fate.by in self.poses:
                 self._join(EdgeId(SUCCESSION, 0, k), node, fate.by)
-
-    def joined(self, start: NodeId, goal: NodeId, portals: Collection[tuple[NodeId, NodeId]]) -> bool:
-        """Whether edges that can be driven lead from a node to another, through portals too."""
-        beyond = {a: b for pair in portals for a, b in (pair, pair[::-1])}
-
-        def neighbours(node: NodeId) -> Iterator[NodeId]:
-            for edge in self.union.edges_at(node):
-                other = edge.b if edge.a == node else edge.a
-                if other in self.poses and edge.id not in self.closed:
-                    yield other
-            if node in beyond:
-                yield beyond[node]
-
-        return goal in reached(start, neighbours)
 
     def segments(self, component: int) -> tuple[list[tuple[NodeId, NodeId]], Floats, Floats]:
         """Joined pairs of nodes of a component, and (N, 2) where each begins and ends in the merged frame."""

@@ -19,7 +19,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.hybridmap.reachability import RECOGNISED
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
-from mapweave.hybridmap.route import Route, RouteSettings, Ways
+from mapweave.hybridmap.route import Route, RouteSettings, Ways, joined
 from mapweave.mapserver.active_nodes import without_faded
 from mapweave.mapserver.obstacles import Disc, Discs
 from mapweave.mapserver.portals import Portals
@@ -250,7 +250,7 @@ class Router:
         active = roads.active_poses | {node: roads.poses[node] for node in (start, goal, *sides)}
         yield Choice(active, roads.closed)
         yield Choice(roads.poses, roads.closed)
-        if not roads.joined(start, goal, portals):
+        if not joined(roads.union, start, goal, roads.closed, portals):
             yield Choice(roads.poses, roads.out_of_sight)
 
     def ways(

@@ -120,7 +120,7 @@ class Explorer:
     def _explore(self) -> Iterator[Move]:
         yield from self._moves.begin()
         # Found again, the robot is where an earlier node says.
-        self._close_loops()
+        self._correct_drift()
         self._ask()
         while True:
             covered = seen_around(self._views, self._moves.position, COVERED_REACH) >= COVERED_SHARE
@@ -180,7 +180,7 @@ class Explorer:
 
     def _way_on(self) -> list[Array]:
         """Corners of the way to the next place; empty if there is none."""
-        self._close_loops()
+        self._correct_drift()
         s = self._settings
         been = np.array([*self._been(), *self._avoided.places(self._now)])
         here, nodes = self._moves.position, self._own_views[:, :2]
@@ -213,7 +213,7 @@ class Explorer:
         self._loops_tried.append(ways.positions[best])
         return ways.path(ways.cells[best])
 
-    def _close_loops(self) -> None:
+    def _correct_drift(self) -> None:
         """Let what was seen and where it has been lie as loop closures say, as seen from here."""
         self._mapper.finish_pending()
         last, own_map = self._mapper.last, self._mapper.map

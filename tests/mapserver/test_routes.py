@@ -101,5 +101,8 @@ def test_a_link_that_the_servo_could_not_drive_ties_maps_and_leads_nowhere() -> 
     assert between is not None
     driven = Edge(NodeId(*ME, 99), ends[0][1], ends[1][0], between, EdgeKind.DRIVEN)
     merger.on_change(Change(ME, 99, 0, EdgePut(driven)))
-    legs = Router(merger.merged()).route(ends[0][0], ends[1][1]).legs
+    router = Router(merger.merged())
+    legs = router.route(ends[0][0], ends[1][1]).legs
     assert [leg.node.id for leg in legs] == [*ends[0], *ends[1]]
+    blocked = router.route(ends[0][0], ends[1][1], [(ends[0][1], ends[1][0])])
+    assert not blocked.legs and "blocked" in blocked.reason, "a block goes away, and opens no other link"

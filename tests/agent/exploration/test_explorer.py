@@ -160,7 +160,7 @@ def test_where_it_was_moves_with_the_map_when_a_loop_closes(closed):
     explorer = Explorer(MAP, ROBOT, mapper, floor, ExplorerSettings(ask_fleet=False))  # type: ignore[arg-type]
     first = NodeId("r0", 1, 0)
     explorer._places = [(first, np.array([0.0, 0.0])), (None, np.array([1.0, 1.0]))]
-    explorer._close_loops()
+    explorer._correct_drift()
     been = list(explorer._been())
     start = mapper.taken[-1] @ mapper.true[-1].inverse() @ mapper.true[0]
     off = float(np.linalg.norm(been[0] - [start.x, start.y]))
