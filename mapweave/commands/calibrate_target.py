@@ -97,7 +97,9 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.vision.calibration.target_pdf import target_pdf
 
     target = target_of(arguments)
-    write_whole(arguments.out, target_pdf(target, arguments.paper))
+    with arguments_read():
+        page = target_pdf(target, arguments.paper)
+    write_whole(arguments.out, page)
     print(f"{arguments.out}: {target}, on {arguments.paper}")
     print("Print it at 100 % (not fitted to the page), hold a ruler to both scales, glue it to a flat board.")
     return 0

@@ -239,7 +239,7 @@ def test_mistakes_are_one_line(frames, capfd, tmp_path: Path) -> None:
     )
     assert "no such folder or video" in complaint(capfd, "calibrate", "camera", tmp_path / "none")
     assert "give two numbers" in complaint(capfd, "calibrate", "target", "--squares", "7", status=USAGE)
-    assert "do not fit on a4" in complaint(capfd, "calibrate", "target", "--square-mm", "60")
+    assert "do not fit on a4" in complaint(capfd, "calibrate", "target", "--square-mm", "60", status=USAGE)
     robot.write_text("robot = { camera = { height_m = 0.3 } }\n")
     with pytest.raises(SettingsError, match=r"no table \[robot.camera\]"):
         write_camera(robot, {"fx": 1.5})

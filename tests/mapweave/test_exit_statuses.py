@@ -123,7 +123,7 @@ CASES: dict[str, list[tuple[int, str]]] = {
     "find-cameras": [(USAGE, "--width 0"), (NO, "{tmp}/none.avi -o {tmp}/cameras")],
     "calibrate target": [
         (USAGE, "--paper a9"), (USAGE, "--squares x -o {out}"), (USAGE, "--square-mm -1 -o {out}"),
-        (FAILED, "-o {tmp}/none/board.pdf"),
+        (USAGE, "--square-mm 60 -o {out}"), (FAILED, "-o {tmp}/none/board.pdf"),
     ],
     "calibrate camera": [
         (USAGE, "{tmp} --squares x"), (USAGE, "{tmp} --height -3"), (USAGE, "--http 99999"),
