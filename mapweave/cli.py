@@ -96,7 +96,8 @@ class PrintVersion(argparse.Action):
         """Print it."""
         from importlib.metadata import version
 
-        print(f"mapweave {version('mapweave')}")
+        # As argparse writes its help: mapweave.start sees whether all of it was written.
+        parser._print_message(f"mapweave {version('mapweave')}\n", sys.stdout)
         parser.exit()
 
 

@@ -1,19 +1,63 @@
-"""Where the command `mapweave` begins: Ctrl-C while the command line is read is one line, too."""
+"""Where the command `mapweave` begins and ends: what holds for every command, also while its line is read.
+
+Ctrl-C is one line, and so is an output that cannot be written.
+"""
 
 from __future__ import annotations
 
+import os
 import sys
 
+FAILED = 1
 INTERRUPTED = 130
-"""As in mapweave.exit_status; nothing else is imported here."""
+"""As in mapweave.exit_status; nothing of the project is imported here."""
 
 
 def main() -> int:
     """Run a command; returns its exit status."""
+    _open_output()
     try:
         from mapweave.cli import main as run
 
-        return run()
+        try:
+            status = run()
+        except SystemExit as end:
+            # Argparse's own, after --help and --version as well.
+            status = end.code if isinstance(end.code, int) else 0
+        return _flushed(status)
     except KeyboardInterrupt:
         print("mapweave: interrupted", file=sys.stderr)
-        return INTERRUPTED
+        return _flushed(INTERRUPTED)
+
+
+def _open_output() -> None:
+    """Let commands print any text, also where nothing reads it."""
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            # It was closed when the process began.
+            setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
+    if sys.stdout.errors == "strict":
+        # A name may have characters that the locale lacks, and the name of a file need not be UTF-8.
+        sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
+
+
+def _flushed(status: int) -> int:
+    """Write what is still in the buffer of stdout.
+
+    Args:
+        status: with which the command ends.
+
+    Returns:
+        The exit status: that a full disk or a closed pipe takes no more is a failure.
+    """
+    try:
+        sys.stdout.flush()
+        return status
+    except OSError as error:
+        from mapweave.storage.os_errors import reason_of
+
+        # Python tries again at its end, and then says so in its own words, with status 120.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        if not isinstance(error, BrokenPipeError) and status != FAILED:
+            print(f"mapweave: standard output cannot be written ({reason_of(error)})", file=sys.stderr)
+        return FAILED

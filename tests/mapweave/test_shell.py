@@ -13,6 +13,7 @@ import sys
 import threading
 import time
 from pathlib import Path
+from typing import Any
 
 import pytest
 from argcomplete.finders import CompletionFinder
@@ -23,7 +24,9 @@ from mapweave.cheat_sheet import as_markdown
 from mapweave.cli import main, parser
 from mapweave.commands.completion import SHELLS
 from mapweave.commands.examples import EXAMPLES
-from mapweave.exit_status import USAGE
+from mapweave.exit_status import FAILED, USAGE
+from mapweave.storage.map_file import MapFile, write_map_file
+from mapweave.storage.os_errors import NO_ROOM
 from mapweave.terminal import EVERY, PLAIN_WIDTH, Bar, EventLog, tracked
 from tests.mapweave.command_line import parsers
 from tests.waiting import eventually
@@ -236,3 +239,62 @@ sys.exit(main())
         [sys.executable, "-c", program, module], capture_output=True, text=True, timeout=60, check=False
     )
     assert (done.stderr, done.returncode) == ("mapweave: interrupted\n", 130)
+
+
+BUFFERED = {"PYTHONUNBUFFERED": "", "PYTHONIOENCODING": "utf-8"}
+"""As most people run commands."""
+
+
+def started(*arguments: object, **options: Any) -> subprocess.CompletedProcess[Any]:
+    """`mapweave` in a process of its own, with options of `subprocess.run`."""
+    environment = os.environ | BUFFERED | options.pop("env", {})
+    return subprocess.run(
+        [sys.executable, "-m", "mapweave", *map(str, arguments)],
+        env=environment, timeout=60, check=False, **{"stderr": subprocess.PIPE} | options,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("arguments", ["--version", "--help", "completion zsh", "sim list --json"])
+def test_a_reader_that_ends_first_is_no_error_of_pythons_own(arguments: str) -> None:
+    """As in `mapweave ... | head -1`."""
+    reading, writing = os.pipe()
+    os.close(reading)
+    try:
+        done = started(*arguments.split(), stdout=writing)
+    finally:
+        os.close(writing)
+    assert (done.stderr, done.returncode) == (b"", FAILED)
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
+@pytest.mark.parametrize("arguments", ["--version", "completion zsh", "sim list --json"])
+def test_a_full_disk_behind_stdout_is_one_line(arguments: str) -> None:
+    with Path("/dev/full").open("wb") as full:
+        done = started(*arguments.split(), stdout=full)
+    words = f"mapweave: standard output cannot be written ({NO_ROOM})\n"
+    assert (done.stderr.decode(), done.returncode) == (words, FAILED)
+
+
+def test_a_command_whose_stdout_is_closed_does_its_work() -> None:
+    """As the shell's `>&-` does."""
+    done = started("sim", "list", preexec_fn=lambda: os.close(1))
+    assert (done.stderr, done.returncode) == (b"", 0)
+
+
+@pytest.mark.parametrize(
+    ("name", "encoding", "printed"),
+    [
+        (b"B\xfcro.mapweave", "utf-8", r"B\udcfcro.mapweave"),
+        ("Büro.mapweave".encode(), "ascii", r"B\xfcro.mapweave"),
+        ("Büro.mapweave".encode(), "utf-8", "Büro.mapweave"),
+    ],
+)
+def test_a_name_that_the_locale_cannot_show_is_shown_by_its_codes(
+    name: bytes, encoding: str, printed: str, tmp_path: Path
+) -> None:
+    path = tmp_path / os.fsdecode(name)
+    write_map_file(path, MapFile("merged", "nothing", ()))
+    codec = {"PYTHONIOENCODING": f"{encoding}:strict", "PYTHONUTF8": "1"}
+    done = started("map", "show", path, "--no-picture", env=codec, stdout=subprocess.PIPE)
+    assert (done.stderr, done.returncode) == (b"", 0)
+    assert printed in done.stdout.decode(encoding)
