@@ -34,6 +34,7 @@ class Runner:
     Attributes:
         skipped: images that were skipped so far.
         busy: how long the tick before took, s; 0 before the second.
+        why_no_node: why the last tick gave no node, in words, as far as it is known.
     """
 
     def __init__(
@@ -78,6 +79,7 @@ class Runner:
         self._questions: tuple[Question, ...] = ()
         self._answers: tuple[Answer, ...] = ()
         self._ticks, self._reported = 0, -math.inf
+        self.why_no_node = ""
 
     def tick(self, observation: Observation) -> Step:
         """Take one observation; changes and status go their way, questions wait for `exchange`."""
@@ -104,6 +106,7 @@ class Runner:
             self._synchronization.changes_submitted(self._replicator, self._fleet)
         self._report_fault(step)
         line = self._monitor.see(observation, step.status, step.command)
+        self.why_no_node = self._monitor.reason(step.status)
         if line:
             self._print(line)
         changed = self._missions.follow(step.status)

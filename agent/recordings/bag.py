@@ -239,7 +239,8 @@ def bag(path: Path, options: RecordingOptions) -> Recording:
     kidnapped = _kidnapped(opened, whole.stamps_ns)
     begins = int(np.diff(kidnapped, prepend=False)[kidnapped].sum())
     lifted = (f"the robot was lifted {begins} times",) if begins else ()
-    return replace(whole, kidnapped=kidnapped, notes=(*whole.notes, *lifted), damage=tuple(opened.damage))
+    damage = (*opened.damage, *whole.damage[len(lost) :])
+    return replace(whole, kidnapped=kidnapped, notes=(*whole.notes, *lifted), damage=damage)
 
 
 def _of(opened: Bag, kinds: Sequence[str]) -> list[Topic]:

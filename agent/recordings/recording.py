@@ -22,6 +22,10 @@ Stamps = NDArray[np.int64]
 
 SILENCE_S, SILENCE_GAPS = 2.0, 10.0
 """A camera that gives no image for so long, s and median gaps, has stopped."""
+FASTEST = 100.0
+"""m/s, half of the time or more: no robot or car drives so fast, so the odometry is in another unit."""
+LARGEST = 1e4
+"""m or rad between two images; a larger motion is no measurement, and covariances overflow."""
 MOST_WIDTH = 800
 """px; wider images are reduced. SIFT takes time in proportion to the area."""
 
@@ -204,7 +208,7 @@ def assembled(
     stamps, read = images.stamps_ns, images.read
     damage = (images.damage, *damage) if images.damage else damage
     if len(stamps) < 2:
-        raise DeviceError(f"{path}: {len(stamps)} images are no drive")
+        raise DeviceError(f"{path}: {len(stamps)} images are no drive; there must be two or more")
     if (np.diff(stamps) <= 0).any():
         first = int((np.diff(stamps) <= 0).argmax()) + 1
         raise DeviceError(f"{path}: the images' stamps do not ascend: see image {first}, counted from 0")
@@ -228,6 +232,12 @@ def assembled(
         increments = odometry
     if len(increments) != len(stamps) or not np.isfinite(increments).all():
         raise DeviceError(f"{path}: {len(increments)} rows of odometry for {len(stamps)} images")
+    whole_count, wrong = _plausible_rows(increments, stamps)
+    if wrong and whole_count < 2:
+        raise DeviceError(f"{path}: {wrong}")
+    if wrong:
+        damage = (*damage, f"{path}: {wrong}; what comes before is used")
+        stamps, increments = stamps[:whole_count], increments[:whole_count]
     factor = math.ceil(camera.width / MOST_WIDTH)
     if factor > 1:
         notes = (*notes, f"images are reduced {factor} times")
@@ -247,6 +257,31 @@ def assembled(
         increments,
         notes,
         damage,
+    )
+
+
+def _plausible_rows(increments: Array, stamps_ns: Stamps) -> tuple[int, str]:
+    """How many rows of odometry come before one that no robot drives, and what is wrong; empty if nothing is.
+
+    Args:
+        increments: (N, 2) m and rad since the image before.
+        stamps_ns: (N,) of the images.
+    """
+    moves = increments[1:, 0] != 0.0
+    speeds = np.abs(increments[1:, 0])[moves] / (np.diff(stamps_ns)[moves] * 1e-9)
+    if len(speeds) and float(np.median(speeds)) > FASTEST:
+        return 0, (
+            f"by its odometry the robot drives {float(np.median(speeds)):.3g} m/s: distances are in metres, "
+            "and times in seconds"
+        )
+    far = np.flatnonzero((np.abs(increments) > LARGEST).any(axis=1))
+    if not len(far):
+        return len(increments), ""
+    first = int(far[0])
+    forward, turn = increments[first]
+    return first, (
+        f"odometry of image {first}, counted from 0, is no motion since the one before: {forward:.3g} m and "
+        f"{turn:.3g} rad"
     )
 
 

@@ -5,10 +5,17 @@ from __future__ import annotations
 import csv
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.storage.atomic_file import read_whole
 from mapweave.storage.os_errors import reason_of
+
+if TYPE_CHECKING:
+    _Rows = csv.DictReader[str]
+else:
+    # Python 3.11 knows the values' type to checkers alone.
+    _Rows = csv.DictReader
 
 SEPARATORS = ";\t|"
 """What programs write in the place of commas."""
@@ -57,7 +64,22 @@ def named_columns(lines: Iterable[str]) -> list[str]:
     return next(csv.reader([first]), [])
 
 
-def rows_of(path: Path, lines: Sequence[str], columns: Sequence[str]) -> csv.DictReader[str]:
+class TableRows(_Rows):
+    """The rows of a table, by the names of their columns."""
+
+    def __next__(self) -> dict[str | Any, str | Any]:
+        """The next row.
+
+        Raises:
+            ValueError: it has more values than the table has columns: a decimal comma separates, too.
+        """
+        row = super().__next__()
+        if any(row.get(self.restkey) or ()):
+            raise ValueError("more values than columns; write numbers with a point, not a comma")
+        return row
+
+
+def rows_of(path: Path, lines: Sequence[str], columns: Sequence[str]) -> TableRows:
     """The rows of a table.
 
     Args:
@@ -68,7 +90,7 @@ def rows_of(path: Path, lines: Sequence[str], columns: Sequence[str]) -> csv.Dic
     Raises:
         DeviceError: it lacks a column, or something else separates the columns.
     """
-    reader = csv.DictReader(lines)
+    reader = TableRows(lines)
     try:
         lacking = [name for name in columns if name not in (reader.fieldnames or ())]
     except csv.Error as error:

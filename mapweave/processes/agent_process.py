@@ -90,7 +90,8 @@ def run_agent(
                 agent.finish()
                 path = agent.write_map()
                 nodes, edges = len(agent.pipeline.map.nodes), len(agent.pipeline.map.edges)
-                say(f"{options.name}: {nodes} nodes and {edges} edges in {path}")
+                why = agent.runner.why_no_node if options.recorded and not nodes else ""
+                say(f"{options.name}: {nodes} nodes and {edges} edges in {path}{'; ' * bool(why)}{why}")
             finally:
                 # The journal is complete also where a full disk takes no map file.
                 _hand_over(say, agent, bus, options)

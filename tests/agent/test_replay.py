@@ -263,8 +263,16 @@ WRONG = {
     "odometry is an image": (written("odometry.csv", b"\x89PNG\r\n\x1a\n\0\0"), "odometry.csv: is no text"),
     "odometry of a sheet": (written("odometry.csv", ODOMETRY.replace(",", ";")), "separated by ';'; separ"),
     "poses of a sheet": (written("odometry.csv", POSES.replace(",", "\t")), "separated by '\\t'; separ"),
+    "odometry with decimal commas": (
+        written("odometry.csv", "forward_m,turn_rad\n" + "0,02,0,01\n" * COUNT),
+        "line 2: more values than columns; write numbers with a point",
+    ),
+    "odometry in millimetres": (
+        written("odometry.csv", "forward_m,turn_rad\n" + "1e5,0\n" * COUNT),
+        "m/s: distances are in metres, and times in seconds",
+    ),
     "odometry with a huge field": (written("odometry.csv", ODOMETRY + "1" * 200_000), "odometry.csv"),
-    "a single time": (written("times.txt", "1\n"), "1 images are no drive"),
+    "a single time": (written("times.txt", "1\n"), "1 images are no drive; there must be two or more"),
     "no times": (written("times.txt", ""), "0 times for 14 images; there must be a line for each image"),
     "times too many": (written("times.txt", "\n".join(map(str, range(15)))), "15 times for 14 images; there"),
     "times go back": (written("times.txt", "\n".join(map(str, [*range(13), 3]))), "line 14: 3.0: times must"),
@@ -435,3 +443,25 @@ def test_any_camera_file_is_read_or_refused(tmp_path, name, value):
     else:
         assert np.isfinite(distortion).all()
         assert np.isfinite([camera.fx, camera.cx, camera.mount_height]).all()
+
+
+@pytest.mark.parametrize("row", ["0,1e9", "1e300,0", "0,-1e300"])
+def test_a_row_of_odometry_that_is_no_motion_ends_the_drive(folder, row):
+    """It is no reason for a traceback: encoders that overflow are recorded as they count."""
+    rows = ["0.02,0.01"] * COUNT
+    rows[8] = row
+    (folder / "odometry.csv").write_text("\n".join(["forward_m,turn_rad", *rows, ""]))
+    replay = Replay(folder)
+    assert len(replay) == 8
+    assert [o.odometry.forward for o in iter(replay.sense, None)][1:] == [0.02] * 7
+    (line,) = replay.damage
+    assert line.startswith(
+        f"{folder}: odometry of image 8, counted from 0, is no motion since the one before"
+    )
+    assert line.endswith("what comes before is used")
+
+
+def test_values_without_a_column_are_left_out_where_they_are_empty(folder):
+    """As a comma at the end of each line leaves them."""
+    (folder / "odometry.csv").write_text("forward_m,turn_rad\n" + "0.02,0.01,\n" * COUNT)
+    assert open_recording(folder).increments[1:] == pytest.approx(np.array([[0.02, 0.01]] * (COUNT - 1)))

@@ -277,6 +277,17 @@ def test_a_pose_that_is_no_number_ends_the_odometry(drive: Drive, tmp_path: Path
     assert "of /odom is not finite; what comes before is used" in line
 
 
+def test_what_is_damaged_of_odometry_beside_a_bag_is_said(
+    drive: Drive, poses_file: Path, tmp_path: Path
+) -> None:
+    write_bag(tmp_path / "drive", drive)
+    lines = poses_file.read_text().splitlines()
+    poses_file.write_text("\n".join([*lines[:20], "no pose", ""]))
+    recording = open_recording(tmp_path / "drive", replace(OPTIONS, odometry=poses_file))
+    (line,) = recording.damage
+    assert line.startswith(f"{poses_file}: line 21: a pose is") and line.endswith("before it are used")
+
+
 def test_all_of_a_killed_recorder_but_the_last_seconds_is_there(drive: Drive, tmp_path: Path) -> None:
     """A process records ten observations a second of its own clock; it is killed within a minute."""
     program = (
