@@ -27,6 +27,7 @@ from mapweave.commands.network import (
     stop_on_signals,
     warn_without_router,
 )
+from mapweave.connection import SOON
 from mapweave.extras import need
 
 DATA = Path("out/server")
@@ -108,7 +109,7 @@ def run(arguments: argparse.Namespace) -> int:
     # Lines have dates, so that a log shows when two maps came apart.
     log_with_time(arguments.log_format)
     sys.setswitchinterval(TURN)
-    for part in ("mapweave.mapserver", "mapweave.wire"):
+    for part in ("mapweave.mapserver", "mapweave.wire", "mapweave.processes"):
         logging.getLogger(part).setLevel(logging.INFO)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
@@ -143,6 +144,7 @@ def run(arguments: argparse.Namespace) -> int:
         from mapweave.mapserver.base_map import BaseMap
         from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
         from mapweave.mapserver.server import MapServer, ServerSettings
+        from mapweave.processes.server_name import NameWatch, refuse_second
         from mapweave.processes.service_manager import ServiceManager
         from mapweave.wire.keys import Keys
         from mapweave.wire.zenoh_bus import ZenohBus
@@ -154,6 +156,9 @@ def run(arguments: argparse.Namespace) -> int:
             show_refusals(arguments.log_format)
         keys, bus = Keys(router.fleet), ZenohBus(router)
         stack.callback(bus.close)
+        if router.mode == "client" or router.routers:
+            bus.wait_connected(SOON)
+            refuse_second(bus, keys, name)
         how = ServerSettings(settings.admission_control, settings.merge, settings.quotas, cluster)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
         if arguments.demo:
@@ -172,6 +177,8 @@ def run(arguments: argparse.Namespace) -> int:
         started = end_if_stopped_before(stop, data if arguments.demo else None)
         stack.enter_context(server)
         started.set()
+        if not arguments.lockstep:
+            stack.callback(NameWatch(bus, keys, name).close)
         if web is not None:
             loading.take(server)
             stack.callback(lambda: write_shown(shown, web.shown()))
