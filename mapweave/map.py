@@ -25,7 +25,7 @@ from mapweave.extras import need
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.constraint_subject import read_end, read_ends
-from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.errors import InvalidValue, Refused
 from mapweave.hybridmap.explanation import (
     Explanation,
     FleetExplanation,
@@ -42,7 +42,7 @@ from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAn
 from mapweave.map_reading import MapReading
 from mapweave.merge.settings import MergeSettings
 from mapweave.node_table import NodeTable
-from mapweave.refusals import check_component
+from mapweave.refusals import check_component, refusals
 from mapweave.storage.map_file import MapFile, write_map_file
 
 if TYPE_CHECKING:
@@ -82,7 +82,7 @@ class Map(ABC):
         """Nodes for words: names of places, and positions in the merged map.
 
         Raises:
-            InvalidValue: a word is none, with the reason.
+            Refused: a word is none, with the reason.
         """
 
     def __repr__(self) -> str:
@@ -108,19 +108,20 @@ class Map(ABC):
         """A node with its camera and landmarks.
 
         Raises:
-            InvalidValue: it is not there.
+            Refused: it is not there.
         """
-        return self._reading.node(self._named(node)[0])
+        with refusals():
+            return self._reading.node(self._named(node)[0])
 
     def pose(self, node: NodeName) -> PoseGaussian:
         """Pose of a node in the frame of its component.
 
         Raises:
-            InvalidValue: it is not there.
+            Refused: it is not there.
         """
         found = self._reading.placed.get(self._named(node)[0])
         if found is None:
-            raise InvalidValue(f"the map has no pose of node {node}")
+            raise Refused(f"the map has no pose of node {node}")
         return found[1]
 
     def graph(self) -> nx.MultiGraph[str]:
@@ -224,7 +225,7 @@ class Map(ABC):
             via: what to pass before, in order.
 
         Raises:
-            InvalidValue: a node is not there.
+            Refused: a node is not there.
         """
         stops = [start, *via, goal]
         nodes = self._named(*stops, *(end for pair in blocked for end in pair))
@@ -241,7 +242,8 @@ class Map(ABC):
         """Why two nodes are linked, or are not, with every number behind it.
 
         Raises:
-            InvalidValue: a node is not there.
+            InvalidValue: the two are one node, or maps.
+            Refused: a node is not there.
         """
         for name in map(str, (a, b)):
             if _is_map(name):
@@ -255,7 +257,8 @@ class Map(ABC):
         """Why two robots' maps are one, or are not; of each two of them if none are given.
 
         Raises:
-            InvalidValue: a map is not there, or there is one alone.
+            InvalidValue: there is one alone, or one is a node.
+            Refused: a map is not there.
         """
         if len(ends) not in (0, 2):
             raise InvalidValue(f"give two maps, or none for each two of them; not {len(ends)}")
@@ -270,7 +273,7 @@ class Map(ABC):
         """The nodes for names.
 
         Raises:
-            InvalidValue: one is none.
+            Refused: one is none.
         """
         return [NodeId.parse(word) for word in ids_of(map(str, names), self.resolve)]
 
@@ -333,7 +336,8 @@ class FileMap(Map):
         router = self._router()
         from mapweave.mapserver.explanations import explained
 
-        return explained(request, router, self._read.settings.consistency)
+        with refusals():
+            return explained(request, router, self._read.settings.consistency)
 
     def annotations(self) -> Annotations:
         """What people say about the map, as the file has it."""
@@ -344,7 +348,8 @@ class FileMap(Map):
         router = self._router()
         from mapweave.mapserver.places import Places
 
-        return Places(router, router.annotations).answer(request)
+        with refusals():
+            return Places(router, router.annotations).answer(request)
 
     def _router(self) -> Router:
         """Of the ways that are open now."""

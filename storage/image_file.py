@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 import struct
+from os import PathLike
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.atomic_file import read_whole
+from mapweave.storage.os_errors import reason_of
 
 MAX_PIXELS = 50_000_000
 """Larger images are refused before they are decoded; phones take up to 50 megapixels."""
@@ -26,7 +28,9 @@ PNM = re.compile(rb"P[1-6](?:\s|#[^\r\n]*[\r\n])+(\d{1,9})\s(?:\s|#[^\r\n]*[\r\n
 """As the decoder reads it. What stands between the numbers must match in one way, or this takes for ever."""
 
 
-def read_grey(path: Path, camera: Camera | None = None, source: str = "the camera") -> NDArray[np.uint8]:
+def read_grey(
+    path: str | PathLike[str], camera: Camera | None = None, source: str = "the camera"
+) -> NDArray[np.uint8]:
     """Read an image.
 
     Args:
@@ -41,11 +45,11 @@ def read_grey(path: Path, camera: Camera | None = None, source: str = "the camer
         DeviceError: it is not there, no image, too large, or none of the size that the camera takes.
     """
     try:
-        data = read_whole(path)
+        data = read_whole(Path(path))
     except FileNotFoundError:
         raise DeviceError(f"{path}: no such file") from None
-    except OSError:
-        data = b""
+    except OSError as error:
+        raise DeviceError(f"{path}: not an image that can be read ({reason_of(error)})") from None
     try:
         image = decode_grey(data)
     except InvalidValue as error:

@@ -19,6 +19,7 @@ import hashlib
 import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from os import PathLike
 from pathlib import Path
 from typing import Annotated, Literal
 
@@ -116,17 +117,17 @@ class MapFile:
                 raise InvalidValue(f"faded landmarks of shape {flags.shape} do not fit node {node}")
 
 
-def write_map_file(path: Path, content: MapFile) -> None:
+def write_map_file(path: str | PathLike[str], content: MapFile) -> None:
     """Write a map file, all or nothing.
 
     Raises:
         InvalidValue: the content cannot be encoded.
         InvalidFile: the disk does not take it.
     """
-    write_whole(path, pack_map_file(content))
+    write_whole(Path(path), pack_map_file(content))
 
 
-def read_map_file(path: Path, kind: Kind | Literal["any"] = "any") -> MapFile:
+def read_map_file(path: str | PathLike[str], kind: Kind | Literal["any"] = "any") -> MapFile:
     """Read and check a map file.
 
     Args:
@@ -137,7 +138,7 @@ def read_map_file(path: Path, kind: Kind | Literal["any"] = "any") -> MapFile:
         InvalidFile: it cannot be read, is truncated, altered or of another kind; one line gives the reason.
     """
     try:
-        data = read_whole(path)
+        data = read_whole(Path(path))
     except OSError as error:
         raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
     try:

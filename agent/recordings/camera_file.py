@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from os import PathLike
 from pathlib import Path
 
 from mapweave.agent.drive_geometry import check_mount
@@ -12,7 +13,7 @@ from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.vision.lens import Distortion, LensModel, lens_of
 
 
-def read_camera(path: Path) -> tuple[Camera, Distortion]:
+def read_camera(path: str | PathLike[str]) -> tuple[Camera, Distortion]:
     """Read a `camera.toml`: px, and metres above the floor.
 
     Returns:
@@ -21,7 +22,7 @@ def read_camera(path: Path) -> tuple[Camera, Distortion]:
     Raises:
         DeviceError: the file is missing or wrong.
     """
-    values = read_table(path, "it must give the camera's intrinsics")
+    values = read_table(Path(path), "it must give the camera's intrinsics")
     try:
         check_keys(values, FILE_KEYS)
         camera = Camera(

@@ -10,12 +10,14 @@ from importlib import import_module
 from importlib.metadata import version
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 import mapweave
 from synthetic.maps import changes_of
 from synthetic.world import room, take_map, take_view
+from tests.mapweave.command_line import CAMERA
 from tests.waiting import free_port
 
 SOURCE = Path(mapweave.__file__)
@@ -144,3 +146,22 @@ def test_maps_are_written_read_merged_and_say_where_a_view_was_taken(tmp_path: P
     elsewhere = room(0, 0, 5, 4, 600, np.random.default_rng(9))
     view, _ = take_view(elsewhere, TOUR[2], np.random.default_rng(5))
     assert mapweave.relocalizer_of(read).answer(view).certainty is mapweave.Certainty.UNKNOWN
+
+
+def test_a_path_may_be_text(tmp_path: Path) -> None:
+    """As of `mapweave.open`; what is wrong with one is an error of one line."""
+    at = str(tmp_path / "empty.mapweave")
+    mapweave.write_map_file(at, mapweave.MapFile("merged", "nothing", ()))
+    assert mapweave.read_map_file(at).title == "nothing"
+    (tmp_path / "camera.toml").write_text(CAMERA)
+    camera, _ = mapweave.read_camera(str(tmp_path / "camera.toml"))
+    assert (camera.width, camera.height) == (64, 48)
+    cv2.imwrite(str(tmp_path / "0.png"), np.full((48, 64), 90, np.uint8))
+    assert mapweave.read_grey(str(tmp_path / "0.png"), camera).shape == (48, 64)
+    for read in (mapweave.read_map_file, mapweave.read_camera, mapweave.read_grey):
+        for missing in (str(tmp_path / "none"), str(tmp_path)):
+            with pytest.raises(mapweave.MapweaveError) as refused:
+                read(missing)
+            assert str(refused.value).startswith(missing) and "\n" not in str(refused.value)
+    with pytest.raises(mapweave.MapweaveError, match="Is a directory"):
+        mapweave.read_grey(tmp_path)

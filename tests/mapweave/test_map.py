@@ -152,8 +152,14 @@ def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path: Path) -> No
         (maps,) = asked.explain_maps()
         assert maps.joined and asked.explain_maps("r0.1", "r1.1") == (maps,)
         for wrong in (["r0.1.1", "r9.1.1"], ["r0.1.1", "nothing"]):
-            with pytest.raises(InvalidValue, match=r"r9\.1|nothing"):
-                asked.explain(*wrong)
+            for question in (asked.explain, asked.route):
+                with pytest.raises(mapweave.Refused, match=r"r9\.1|nothing"):
+                    question(*wrong)
+            for look in (asked.node, asked.pose):
+                with pytest.raises(mapweave.Refused, match=r"r9\.1|nothing"):
+                    look(wrong[1])
+        with pytest.raises(mapweave.Refused, match=r"r9\.1"):
+            asked.explain_maps("r0.1", "r9.1")
         with pytest.raises(InvalidValue, match="is a node"):
             asked.explain_maps("r0.1.1", "r1.1.1")
         with pytest.raises(InvalidValue, match=r"r0\.1 is a map: `explain_maps` is for two"):
