@@ -60,6 +60,11 @@ class Replay:
         """How many observations there are."""
         return len(self._frames)
 
+    @property
+    def played(self) -> int:
+        """How many observations were given, or left out since they cannot be read."""
+        return self._position
+
     def describe(self) -> RobotDescription:
         """The camera; no rangers and no wheels to command."""
         recording = self.recording

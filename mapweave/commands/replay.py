@@ -19,6 +19,7 @@ from mapweave.commands.network import (
     stop_on_signals,
     warn_without_router,
 )
+from mapweave.exit_status import INTERRUPTED
 from mapweave.hybridmap.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -128,10 +129,16 @@ def run(arguments: argparse.Namespace) -> int:
             calibration=calibration,
             rerun=arguments.rerun,
         )
-        run_agent(robot, bus, keys, settings.agent, options, stop_on_signals())
+        stop = stop_on_signals()
+        run_agent(robot, bus, keys, settings.agent, options, stop)
     finally:
         bus.close()
-    return _report(robot.damage)
+    status = _report(robot.damage)
+    if stop.is_set() and robot.played < len(robot):
+        words = f"interrupted after {robot.played} of {len(robot)} images; what is mapped of them is kept"
+        print(f"mapweave: {words}", file=sys.stderr)
+        return INTERRUPTED
+    return status
 
 
 def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:

@@ -6,13 +6,16 @@ import json
 import os
 import subprocess
 import sys
+import threading
 from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
 
+from mapweave.agent.drivers.replay import Replay
 from mapweave.cli import main
+from mapweave.exit_status import INTERRUPTED
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.ids import NodeId
@@ -193,6 +196,23 @@ def test_a_recording_offline_is_mapped_without_a_session(recording, tmp_path, ca
     stamps = [line.split()[0] for line in (data / "walk.1.tum").read_text().splitlines() if line[0] != "#"]
     assert stamps == ["0.000000000", "0.100000000", "0.200000000"], "every frame, localized or not"
     capfd.readouterr()
+
+
+def test_a_replay_that_is_interrupted_says_how_far_it_came(recording, tmp_path, capfd, monkeypatch):
+    """A script must not take a part of a map for the whole."""
+    stop, sense = threading.Event(), Replay.sense
+
+    def sense_and_stop(self):
+        stop.set()
+        return sense(self)
+
+    monkeypatch.setattr("mapweave.commands.replay.stop_on_signals", lambda: stop)
+    monkeypatch.setattr(Replay, "sense", sense_and_stop)
+    data = tmp_path / "data"
+    assert main(["replay", str(recording), "--data", str(data), "--offline"]) == INTERRUPTED
+    *_, line = capfd.readouterr().err.splitlines()
+    assert line == "mapweave: interrupted after 1 of 3 images; what is mapped of them is kept"
+    assert (data / "walk.1.mapweave").exists()
 
 
 def test_a_recording_without_a_server_is_mapped_all_the_same(recording, tmp_path, capfd, closed):
