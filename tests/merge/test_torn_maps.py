@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import replace
 from functools import cache, partial
@@ -26,11 +26,19 @@ from mapweave.merge.torn_maps import TornMapSearch
 from mapweave.scenarios.liar.lies import Setting, altered, altered_places, bodies, chain
 from mapweave.wire.codec import decode_change
 from synthetic.wrong_geometry import ODD, SCENES, Fault, Fleet, draw_fleet
+from tests.examined import examined_once
 from tests.quick import first_quick
 
 SEED = 5
 AWAY, TORN, NOT_OFF = Pose2(40.0, -10.0, 2.0), Pose2(2.0, -2.0, 1.0), Pose2()
 EXCLUDED = "{} and r3 would have been at the same place at the same time: 0.01 m apart"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def examined() -> Iterator[None]:
+    """The nodes of every fleet here see the same; what differs is where its map has them."""
+    with examined_once():
+        yield
 
 
 @pytest.fixture(scope="module")
