@@ -22,6 +22,8 @@ more, those of a robot with wrong geometry up to 0.75."""
 BENT_XY, BENT_HEADING = 1.5, math.radians(30.0)
 """Placements that differ by less are of one place, m and rad: rooms that look alike are at least as far apart
 as one is wide, and doors are 0.9 m wide alone."""
+AT_ONCE = 1 << 14
+"""Pairs of links, about, that are compared together: more take memory, and no less time."""
 
 
 def is_bent(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> bool:
@@ -49,8 +51,12 @@ def nearly_there(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> ND
     )
     inside = placed.graph.means[placed.graph.index([link.a for link in links])]
     placements = compose_poses(own, inverse_poses(inside))
-    near = np.zeros((len(links), len(links)), np.bool_)
-    for k, placement in enumerate(placements):
-        off = compose_poses(inverse_poses(own), compose_poses(placement[None], inside))
-        near[k] = (np.hypot(off[:, 0], off[:, 1]) < BENT_XY) & (np.abs(off[:, 2]) < BENT_HEADING)
+    count, from_own = len(links), inverse_poses(own)
+    near = np.empty((count, count), np.bool_)
+    for first in range(0, count, rows := max(1, AT_ONCE // count)):
+        some = placements[first : first + rows]
+        laid = compose_poses(np.repeat(some, count, axis=0), np.tile(inside, (len(some), 1)))
+        off = compose_poses(np.tile(from_own, (len(some), 1)), laid)
+        fits = (np.hypot(off[:, 0], off[:, 1]) < BENT_XY) & (np.abs(off[:, 2]) < BENT_HEADING)
+        near[first : first + rows] = fits.reshape(len(some), count)
     return near
