@@ -222,7 +222,9 @@ class _Builder:
 
     def _facing(self, corner: Array, along: Array, down: Array) -> int:
         """The room that a panel faces, or -1."""
-        normal = -np.cross(along, down)
+        # Not by `np.cross`, which takes a tenth of the time that it takes to build an office.
+        (ax, ay, az), (dx, dy, dz) = along.tolist(), down.tolist()
+        normal = np.array([az * dy - ay * dz, ax * dz - az * dx, ay * dx - ax * dy])
         point = corner + along / 2 + down / 2 + BEFORE * normal / np.linalg.norm(normal)
         return int(room_before(point[None, :2], self._low, self._high)[0])
 
