@@ -115,7 +115,7 @@ class OfflineAnnotations:
     def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
         if self._out is None:
             raise InvalidValue(
-                f"{self._opened.path} is a {self._opened.source}, which is not written: give -o"
+                f"{self._opened.path} is {self._opened.source.words}, which is not written: give -o"
             )
         check_place(self._out)
         with refusals():

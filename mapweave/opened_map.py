@@ -49,6 +49,11 @@ class MapSource(StrEnum):
     STORE = "server's store"
     JOURNAL = "agent's journal"
 
+    @property
+    def words(self) -> str:
+        """With its article."""
+        return f"{'an' if self is MapSource.JOURNAL else 'a'} {self.value}"
+
 
 @dataclass(frozen=True, eq=False)
 class OpenedMap:

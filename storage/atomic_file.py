@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.storage.first_bytes import MAP_FILE, SQLITE
 from mapweave.storage.os_errors import no_permission, reason_of
 
 
@@ -19,9 +20,12 @@ def write_whole(path: Path, data: bytes | memoryview) -> None:
     """Write a temporary file in the same folder, then rename it.
 
     Raises:
-        InvalidFile: the disk does not take it; what was there is as before.
+        InvalidFile: the disk does not take it, or a database is there, or a map file and this is none; what
+            was there is as before.
     """
     check_place(path)
+    if _begins(path, MAP_FILE) and data[: len(MAP_FILE)] != MAP_FILE:
+        raise unwritable(path, "a map file is there; give another name")
     if path.exists() and not path.is_file():
         # A pipe, a terminal, /dev/null: nothing to keep, and nothing to put in its place.
         path.write_bytes(data)
@@ -69,7 +73,7 @@ def check_place(path: Path) -> None:
     """Refuse a place where no file can be, before hours of work are written there.
 
     Raises:
-        InvalidFile: it is a folder, or its folder is missing or takes no files.
+        InvalidFile: it is a folder or a database, or its folder is missing or takes no files.
     """
     if path.is_dir() or not path.name:
         raise unwritable(path, os.strerror(errno.EISDIR))
@@ -77,6 +81,20 @@ def check_place(path: Path) -> None:
         raise unwritable(path, f"there is no folder {path.parent}")
     if not os.access(path.parent, os.W_OK) and not path.exists():
         raise unwritable(path, no_permission())
+    if _begins(path, SQLITE):
+        raise unwritable(path, "a server's store or an agent's journal is there; give another name")
+
+
+def _begins(path: Path, first: bytes) -> bool:
+    """Whether a regular file that can be read begins with these bytes."""
+    try:
+        # To open a pipe would wait for who writes into it.
+        if not path.is_file():
+            return False
+        with path.open("rb") as file:
+            return file.read(len(first)) == first
+    except OSError:
+        return False
 
 
 def unwritable(path: Path, why: str) -> InvalidFile:

@@ -51,8 +51,10 @@ def check_new(path: Path) -> None:
     Raises:
         InvalidFile: see `check_place`.
     """
-    check_place(path)
-    if path.exists() or path.is_symlink():
+    there = path.exists() or path.is_symlink()
+    if not there or path.is_dir():
+        check_place(path)
+    if there:
         raise InvalidFile(f"{path}: is there already, and is not written over; give another name")
 
 

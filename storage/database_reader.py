@@ -11,9 +11,9 @@ from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.file_owner import is_owned
+from mapweave.storage.first_bytes import SQLITE
 
-MAGIC = b"SQLite format 3\0"
-"""First bytes of every SQLite file (https://sqlite.org/fileformat2.html, 1.3.1)."""
+MAGIC = SQLITE
 
 
 @contextmanager

@@ -38,10 +38,11 @@ from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.storage.atomic_file import read_whole, write_whole
+from mapweave.storage.first_bytes import MAP_FILE
 from mapweave.wire.packing import Limit
 from mapweave.wire.typed import decode, encode
 
-MAGIC = b"MAPWEAVE"
+MAGIC = MAP_FILE
 VERSION = 1
 HEADER = struct.Struct("<8sIQ")
 DIGEST_BYTES = 32

@@ -135,9 +135,9 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     if content.kind == "merged":
         out = out or Path(arguments.map)
     elif out is None and not arguments.check:
-        kind = "map file of kind agent, not merged," if of_file else one.source
+        kind = "a map file of kind agent, not merged," if of_file else one.source.words
         raise InvalidFile(
-            f"{one.path}: is a {kind} and is not changed: give -o FILE for a merged map with the constraint"
+            f"{one.path}: is {kind} and is not changed: give -o FILE for a merged map with the constraint"
             f"{'' if of_file else ', or ask the running server without --map'}"
         )
     if out is not None:

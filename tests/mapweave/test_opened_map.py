@@ -157,6 +157,30 @@ def test_commands_that_change_a_map_refuse_stores_and_journals(
         copy.unlink()
 
 
+def test_no_command_writes_over_a_store_a_journal_or_a_map(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """With `-o` the file that is read, or another one, was replaced without a word."""
+    for name in ("store", "journal", "merged"):
+        shutil.copyfile(folder / name, tmp_path / name)
+    before = state(tmp_path)
+    commands = [
+        ("merge", "merged", "-o"), ("unmerge", "r0.1", "r1.1", "--map", "store", "-o"),
+        ("pin", "r0.1.1", "--map", "merged", "-o"), ("export", "merged", "--format", "g2o", "-o"),
+    ]  # fmt: skip
+    for command in commands:
+        given = [tmp_path / word if (tmp_path / word).exists() else word for word in command]
+        for name in ("store", "journal"):
+            words = complaint(capfd, "map", *given, tmp_path / name)
+            assert words.endswith("(a server's store or an agent's journal is there; give another name)")
+    words = complaint(capfd, "map", *given, tmp_path / "merged")
+    assert words.endswith("(a map file is there; give another name)")
+    assert state(tmp_path) == before
+    journal = tmp_path / "journal"
+    words = complaint(capfd, "place", "add", "hall", "r0.1.1", "--map", journal)
+    assert words == f"mapweave: {journal} is an agent's journal, which is not written: give -o"
+
+
 @pytest.mark.parametrize("name", ["store", "merged"])
 def test_a_constraint_on_a_store_goes_into_a_file(
     folder: Path, tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]

@@ -14,6 +14,7 @@ import pytest
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.atomic_file import check_place, write_whole
+from mapweave.storage.first_bytes import MAP_FILE, SQLITE
 
 
 @contextmanager
@@ -87,3 +88,45 @@ def test_places_where_no_file_can_be(tmp_path: Path, place: str, words: str) -> 
             check_place(path)
         with pytest.raises(InvalidFile, match=words):
             write_whole(path, b"new")
+
+
+@pytest.mark.parametrize(
+    ("there", "words"),
+    [
+        (SQLITE + b"\x10\x00", "a server's store or an agent's journal is there; give another name"),
+        (MAP_FILE + b"\x01", "a map file is there; give another name"),
+    ],
+)
+def test_what_robots_have_made_is_not_written_over_with_something_else(
+    there: bytes, words: str, tmp_path: Path
+) -> None:
+    path = tmp_path / "x"
+    path.write_bytes(there)
+    for data in (b"a picture", b"", memoryview(b"a picture")):
+        with pytest.raises(InvalidFile) as refused:
+            write_whole(path, data)
+        assert str(refused.value) == f"{path}: cannot be written ({words})"
+    assert path.read_bytes() == there and list(tmp_path.iterdir()) == [path]
+
+
+def test_a_newer_map_takes_the_place_of_a_map_and_of_no_database(tmp_path: Path) -> None:
+    path, newer = tmp_path / "x", MAP_FILE + b"\x02"
+    path.write_bytes(MAP_FILE + b"\x01")
+    write_whole(path, newer)
+    write_whole(path, memoryview(newer))
+    assert path.read_bytes() == newer
+    path.write_bytes(SQLITE)
+    with pytest.raises(InvalidFile, match="store"):
+        write_whole(path, newer)
+    assert path.read_bytes() == SQLITE
+
+
+def test_a_pipe_is_written_and_not_read(tmp_path: Path) -> None:
+    path = tmp_path / "pipe"
+    os.mkfifo(path)
+    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
+    try:
+        write_whole(path, b"data")
+        assert os.read(reader, 9) == b"data"
+    finally:
+        os.close(reader)
