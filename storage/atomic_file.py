@@ -8,12 +8,12 @@ from __future__ import annotations
 import errno
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.first_bytes import MAP_FILE, SQLITE
-from mapweave.storage.os_errors import no_permission, reason_of
+from mapweave.storage.os_errors import READ_ONLY, no_permission, reason_of
 
 
 def write_whole(path: Path, data: bytes | memoryview) -> None:
@@ -50,11 +50,11 @@ def replacing(path: Path) -> Iterator[Path]:
         beside.replace(path)
         _sync_folder(path.parent)
     except OSError as error:
-        beside.unlink(missing_ok=True)
+        _remove(beside)
         raise unwritable(path, reason_of(error)) from None
     except BaseException:
         # Interrupted: remove the temporary file.
-        beside.unlink(missing_ok=True)
+        _remove(beside)
         raise
 
 
@@ -80,9 +80,16 @@ def check_place(path: Path) -> None:
     if not path.parent.is_dir():
         raise unwritable(path, f"there is no folder {path.parent}")
     if not os.access(path.parent, os.W_OK) and not path.exists():
-        raise unwritable(path, no_permission())
+        read_only = os.statvfs(path.parent).f_flag & os.ST_RDONLY
+        raise unwritable(path, READ_ONLY if read_only else no_permission())
     if _begins(path, SQLITE):
         raise unwritable(path, "a server's store or an agent's journal is there; give another name")
+
+
+def _remove(path: Path) -> None:
+    """Remove a file, where that is possible: a disk that is read-only keeps what it has."""
+    with suppress(OSError):
+        path.unlink(missing_ok=True)
 
 
 def _begins(path: Path, first: bytes) -> bool:

@@ -48,6 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from mapweave.drawing.map_picture import MapPicture, draw_map
     from mapweave.extras import MissingExtra, need
+    from mapweave.hybridmap.errors import InvalidFile
     from mapweave.hybridmap.hybrid_map import HybridMap
     from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.hybridmap.node import EdgeKind
@@ -119,8 +120,15 @@ def run(arguments: argparse.Namespace) -> int:
             title += f"\ndrawn: {which}, {len(poses)} of {len(hybrid.nodes)} nodes"
             summary["drawn"] = f"{which}, {len(poses)} nodes"
         edges, places = list(hybrid.edges.values()), _places(content, poses)
-        draw_map(MapPicture(title, poses, edges, landmarks=points, places=places), out)
-        summary["picture"] = str(out)
+        try:
+            draw_map(MapPicture(title, poses, edges, landmarks=points, places=places), out)
+            summary["picture"] = str(out)
+        except InvalidFile as error:
+            if arguments.out is not None:
+                raise
+            # A map may lie where nothing can be written; its summary is what most want to know.
+            summary.pop("drawn", None)
+            print(f"mapweave: {error}; give -o PNG, or --no-picture", file=sys.stderr)
     if arguments.json:
         print(json.dumps(summary))
     else:

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import cv2
 import numpy as np
@@ -108,6 +110,20 @@ def test_the_summary_of_a_merged_map(merged_file, capfd, tmp_path):
 def test_without_a_picture_none_is_drawn(agent_file, capfd):
     assert "picture" not in summary(capfd, agent_file, "--no-picture")
     assert not agent_file.with_suffix(".png").exists()
+
+
+def test_a_summary_comes_also_where_no_picture_can_be_written(agent_file, merged_file, capfd, monkeypatch):
+    """As from a disk that is read-only, beside the map; a picture that is asked for must be written."""
+    monkeypatch.setattr(os, "access", lambda *_: False)
+    monkeypatch.setattr(os, "statvfs", lambda _: SimpleNamespace(f_flag=os.ST_RDONLY))
+    for file in (agent_file, merged_file):
+        assert main(["map", "show", str(file), "--json"]) == 0
+        out, err = capfd.readouterr()
+        assert not {"picture", "drawn"} & json.loads(out).keys() and json.loads(out)["nodes"]
+        (line,) = err.splitlines()
+        assert "the disk is read-only" in line and line.endswith("; give -o PNG, or --no-picture")
+    assert main(["map", "show", str(agent_file), "-o", str(agent_file.with_suffix(".png"))]) == 1
+    assert capfd.readouterr().out == ""
 
 
 def test_people_read_lines(agent_file, capfd):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import resource
 import signal
@@ -130,3 +131,19 @@ def test_a_pipe_is_written_and_not_read(tmp_path: Path) -> None:
         assert os.read(reader, 9) == b"data"
     finally:
         os.close(reader)
+
+
+def test_a_disk_that_is_read_only_is_named_with_the_file_itself(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not with the temporary file, which cannot be removed there either."""
+    path = tmp_path / "x"
+    write_whole(path, b"old")
+
+    def refused(*_: object, **__: object) -> None:
+        raise OSError(errno.EROFS, os.strerror(errno.EROFS))
+
+    monkeypatch.setattr(Path, "write_bytes", refused)
+    monkeypatch.setattr(Path, "unlink", refused)
+    with pytest.raises(InvalidFile, match=r"/x: cannot be written \(the disk is read-only; "):
+        write_whole(path, b"new")
