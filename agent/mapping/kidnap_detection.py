@@ -41,6 +41,8 @@ class FrameOverlap(Enum):
 
 LEAST = 8
 """Points that should be in the image; with fewer there is no verdict."""
+FEWEST = 5
+"""Corners that should be in the image to say that it shows the same although a few tracks were lost."""
 SHARE = 0.45
 """If a smaller share of the expected points is found, the image shows something else."""
 BORDER_PX = 12.0
@@ -48,7 +50,7 @@ BORDER_PX = 12.0
 ASTRAY_PX = 20.0
 """A point found further than this from where it is expected is another one."""
 FEW_POINTS = 30
-"""With fewer points than this, the whole image is compared as well."""
+"""With fewer points than this, corners and the whole image are compared as well."""
 COARSE = 8
 """Side of the squares over which images are averaged before they are compared as a whole, px."""
 ALIKE = 0.95
@@ -94,19 +96,23 @@ class KidnapDetector:
             same = self._corners_agree(now, before, -turn)
         if same is not False:
             return FrameOverlap.SAME
-        # A dozen tracks on smooth shapes can all be lost at once; then the whole image is compared.
+        clipped = float(((now <= BLACK) | (now >= WHITE)).mean()) > MOST_CLIPPED
         inside = int(self._camera.contains(expected, BORDER_PX).sum())
-        few = LEAST <= inside < FEW_POINTS
-        if few and self._alike(before, now, turn):
-            return FrameOverlap.SAME
-        clipped = float(((now <= BLACK) | (now >= WHITE)).mean())
-        blank = clipped > MOST_CLIPPED or len(strongest_corners(now)) < LEAST_CORNERS
+        if LEAST <= inside < FEW_POINTS:
+            # A dozen tracks on smooth shapes can all be lost at once; the strongest corners stay. Where
+            # neither image has enough of them there is no verdict.
+            corners = self._corners_agree(before, now, turn, FEWEST)
+            if corners is None and not clipped:
+                corners = self._corners_agree(now, before, -turn) is not False
+            if corners or self._alike(before, now, turn):
+                return FrameOverlap.SAME
+        blank = clipped or len(strongest_corners(now)) < LEAST_CORNERS
         return FrameOverlap.BLANK if blank else FrameOverlap.STRANGE
 
-    def _same(self, expected: Array, followed: Array) -> bool | None:
+    def _same(self, expected: Array, followed: Array, least: int = LEAST) -> bool | None:
         """Whether enough points are near where they should be; None if too few should be in the image."""
         inside = self._camera.contains(expected, BORDER_PX)
-        if inside.sum() < LEAST:
+        if inside.sum() < least:
             return None
         near = lengths(followed[inside] - expected[inside]) <= ASTRAY_PX
         return bool(near.mean() >= SHARE)
@@ -129,9 +135,11 @@ class KidnapDetector:
         spread = float(a.std() * b.std())
         return spread > LEAST_SPREAD**2 and float((a * b).mean()) > ALIKE * spread
 
-    def _corners_agree(self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float) -> bool | None:
+    def _corners_agree(
+        self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float, least: int = LEAST
+    ) -> bool | None:
         corners = strongest_corners(before)
-        if len(corners) < LEAST:
+        if len(corners) < least:
             return None
         tracker = Tracker(self._lens, self._tracker)
         tracker.track(before)
@@ -140,7 +148,7 @@ class KidnapDetector:
         tracker.track(now, expected)
         followed = np.full(expected.shape, np.nan)
         followed[tracker.ids] = tracker.pixels
-        return self._same(expected, followed)
+        return self._same(expected, followed, least)
 
 
 def relit(image: NDArray[np.uint8], like: NDArray[np.uint8]) -> NDArray[np.uint8]:

@@ -86,6 +86,33 @@ def test_the_same_wall_from_further_back_is_not_the_same(walls, continuity):
     )
 
 
+def test_weak_points_of_a_smooth_wall_may_fade_at_once(walls, continuity, elsewhere):
+    """Less than half of them are found, and the strongest corners all are."""
+    expected = np.random.default_rng(0).uniform([20, 20], [300, 220], (23, 2))
+    followed = expected.copy()
+    followed[9:] = np.nan
+    seen, on = walls.render(HERE), walls.render(HERE @ Pose2(0.02, 0.0, 0.0))
+    # Brighter, so that it is not the image as a whole that is alike.
+    on = cv2.convertScaleAbs(on, alpha=1.0, beta=15.0)
+    assert continuity.compare(seen, on, 0.0, expected, followed) is FrameOverlap.SAME
+    assert continuity.compare(seen, elsewhere, 0.0, expected, followed) is FrameOverlap.STRANGE
+    assert continuity.compare(elsewhere, on, 0.0, expected, followed) is FrameOverlap.STRANGE
+
+
+def test_where_hardly_anything_is_in_view_lost_tracks_tell_of_nothing(walls, continuity):
+    """Tracks on a wall with four corners fade. What shows much more, or is clipped, is something else."""
+    rng = np.random.default_rng(0)
+    bare = np.clip(rng.normal(128, 1.5, (240, 320)), 0, 255).astype(np.uint8)
+    bare[100:140, 200:240] = 60
+    faded = cv2.GaussianBlur(bare, (0, 0), 2.0)
+    expected = rng.uniform([20, 20], [300, 220], (15, 2))
+    followed = np.full_like(expected, np.nan)
+    assert continuity.compare(bare, faded, 0.0, expected, followed) is FrameOverlap.SAME
+    assert continuity.compare(bare, walls.render(HERE), 0.0, expected, followed) is FrameOverlap.STRANGE
+    black = np.zeros_like(bare)
+    assert continuity.compare(bare, black, 0.0, expected, followed) is FrameOverlap.BLANK
+
+
 def test_two_blank_walls_look_the_same(continuity):
     rng = np.random.default_rng(0)
     first, second = (np.clip(rng.normal(128, 2, (240, 320)), 0, 255).astype(np.uint8) for _ in range(2))
