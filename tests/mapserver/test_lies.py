@@ -22,12 +22,13 @@ from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty
 from mapweave.mapserver.answers import Answers
-from mapweave.mapserver.merging.copies import Copies, copied_landmarks
+from mapweave.mapserver.merging.copies import LEAST_SAME, Copies, copied_landmarks, one_for_one
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.plausibility import MOST_FRAGMENTS, implausible, unreliable_robots
 from mapweave.merge.constraint_checks import check_manual_constraint
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.scenarios.liar.lies import altered
 from mapweave.wire.codec import decode_change
 from mapweave.wire.log_messages import Head
 from mapweave.wire.messages import encode
@@ -405,6 +406,40 @@ def test_a_robot_that_parks_where_another_one_has_mapped_has_copied_nothing() ->
     assert copied_landmarks(node, node) > 50
     found = Copies()
     found.compare(node, again)
+    assert not found.maps(frozenset())
+
+
+@pytest.mark.parametrize("many", [LEAST_SAME - 1, LEAST_SAME])
+def test_nodes_with_the_landmarks_of_others_one_for_one_are_copies(many: int) -> None:
+    """Noise of the pixels, the descriptors and the depths makes no other view: it has other landmarks."""
+    true = take_map(WORLD, FIRST, TOUR, np.random.default_rng(4))[0][:many]
+    assert len(true) == many
+    rng = np.random.default_rng(5)
+    found = Copies()
+    for node in true:
+        again = replace(altered(node, rng), id=NodeId(*LAST, node.id.number))
+        assert copied_landmarks(node, again) == 0
+        found.compare(node, again)
+    copied = found.maps(frozenset())
+    assert copied.keys() == ({LAST} if many == LEAST_SAME else set())
+    assert not copied or copied[LAST].startswith(
+        f"its node {LAST}.1 has the landmarks of {FIRST}.1 one for one"
+    )
+    assert not found.maps(frozenset(), [frozenset((FIRST, LAST))]), "a person has linked them"
+    found.forget((true[0].id, NodeId(*LAST, true[0].id.number)))
+    assert not found.maps(frozenset())
+
+
+def test_views_from_the_very_same_places_are_no_copies() -> None:
+    """As of robots that start at one mark, one after the other: each finds other features and keeps others."""
+    first, second = (
+        take_map(WORLD, who, TOUR, np.random.default_rng(n))[0] for n, who in enumerate((FIRST, LAST))
+    )
+    assert len(first) >= LEAST_SAME
+    found = Copies()
+    for pair in zip(first, second, strict=True):
+        assert not one_for_one(*pair)
+        found.compare(*pair)
     assert not found.maps(frozenset())
 
 

@@ -14,6 +14,7 @@ from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.mapserver.merging import copies as copied_nodes
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge import torn_maps
 from mapweave.merge.merging import merge_maps
@@ -38,6 +39,14 @@ EXCLUDED = "{} and r3 would have been at the same place at the same time: 0.01 m
 def examined() -> Iterator[None]:
     """The nodes of every fleet here see the same; what differs is where its map has them."""
     with examined_once():
+        yield
+
+
+@pytest.fixture(scope="module", autouse=True)
+def other_views() -> Iterator[None]:
+    """The nodes here are views of places that look alike: the merge does not know them as copies."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(copied_nodes, "one_for_one", lambda *_: False)
         yield
 
 

@@ -374,14 +374,13 @@ WAYS: dict[str, Callable[[Setting], Lie]] = {
     "copies that tear": copied_to_tear,
     "altered copies that tear": altered_to_tear,
     "copied places": copied_places,
+    "altered copied places": altered_places,
     "half copied landmarks": mixed_landmarks,
 }
 UNDECIDABLE: dict[str, Callable[[Setting], Lie]] = {
     "another's times": same_times,
-    "altered copied places": altered_places,
     "places seen from aside": places_from_aside,
 }
 """Maps that are right in themselves and could be of a second building that looks the same: nothing that a
-server knows tells which of the two robots lies. Answers may become ambiguous. Copies of two robots' places in
-an arrangement that is not theirs are found out if both robots contradict the map."""
+server knows tells which of the two robots lies. Answers may become ambiguous."""
 EVERY: Mapping[str, Callable[[Setting], Lie]] = {**WAYS, **UNDECIDABLE}
