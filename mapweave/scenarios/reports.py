@@ -65,6 +65,7 @@ class Reports:
         self._lock = threading.Lock()
         self._poses: dict[MapId, dict[int, tuple[float, float, float]]] = {}
         self._traffic: dict[str, list[int]] = {}
+        self._newest_ns: dict[str, int] = {}
         self._closing = bus.subscribe(keys.agent_statuses(), self._hear)
 
     def agent(self, robot: str) -> AgentStatus | None:
@@ -120,10 +121,13 @@ class Reports:
         status = report.status
         with self._lock:
             lives = self._traffic.setdefault(robot, [0])
-            # A counter that has fallen belongs to an agent that was started again.
-            if report.traffic < lives[-1]:
-                lives.append(0)
-            lives[-1] = report.traffic
+            # Reports that were published and asked for may overtake each other.
+            if report.stamp_ns > self._newest_ns.get(robot, -1):
+                self._newest_ns[robot] = report.stamp_ns
+                # A counter that has fallen belongs to an agent that was started again.
+                if report.traffic < lives[-1]:
+                    lives.append(0)
+                lives[-1] = report.traffic
             # A robot that reports that it is lost has no estimate.
             if status.mission in ("explore", "carried") and status.nodes and not status.astray:
                 pose = status.map_from_robot
