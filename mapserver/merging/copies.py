@@ -13,10 +13,10 @@ from mapweave.registration.matching import match
 LEAST_COPIED = 10
 """Landmarks that are the same bit by bit: as many as a recognition needs."""
 SAME_SHARE, SAME_PX = 0.9, 3.0
-"""Nodes have their landmarks one for one if so many match, as a share of those of the richer node, each at the
-same pixel within this. Robots that begin at the very same place, with noise of their own, have 0.65 to 0.79
-(four rendered offices), and 0.65 at most from 6 mm on; copies with the noise of another view 0.94 and more (95
-in 100)."""
+"""Nodes have their landmarks one for one if so many match, as a share of those of the richer node, each at
+the same pixel within this. Robots that begin at the very same place, with noise of their own, have 0.65 to
+0.79 (four rendered offices), and 0.65 at most from 6 mm on; copies with the noise of another view 0.94 and
+more (95 in 100)."""
 LEAST_SAME = 4
 """Nodes of one map that have their landmarks one for one with those of another map: so many are copies."""
 LEAST_LANDMARKS = 20

@@ -431,7 +431,7 @@ def test_nodes_with_the_landmarks_of_others_one_for_one_are_copies(many: int) ->
 
 
 def test_views_from_the_very_same_places_are_no_copies() -> None:
-    """As of robots that start at one mark, one after the other: each finds other features and keeps others."""
+    """As of robots that start at one mark, one after the other: each finds and keeps other features."""
     first, second = (
         take_map(WORLD, who, TOUR, np.random.default_rng(n))[0] for n, who in enumerate((FIRST, LAST))
     )
