@@ -128,7 +128,7 @@ def test_an_agents_log_in_a_file_has_one_line_an_event_with_the_time(
     arguments = ["replay", recording, "--offline", "--data", long, "--epoch", 1]
     assert main([str(a) for a in arguments]) == 0
     lines = capfd.readouterr().err.splitlines()
-    (written,) = [line for line in lines if line.endswith(f" in {long / 'walk.1.mapweave'}")]
+    (written,) = [line for line in lines if f" in {long / 'walk.1.mapweave'}; " in line]
     assert re.match(STAMP + "walk: ", written)
     assert all(re.match(STAMP + "walk: ", line) for line in lines), lines
 
