@@ -19,6 +19,7 @@ from mapweave.merge.islands import Islands
 from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover
 from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder, Superseding
 from mapweave.merge.pose_graph.candidates import Pair
+from mapweave.merge.pose_graph.implausible_last import ImplausibleLast
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.pinned_frames import PinnedFrames
@@ -27,7 +28,7 @@ from mapweave.merge.settings import MergeSettings
 
 
 class MergePipeline:
-    """The merge, pinned frames, superseding of nodes and removal of landmarks."""
+    """The merge, implausible maps last, pinned frames, superseding of nodes and removal of landmarks."""
 
     def __init__(
         self, settings: MergeSettings, reaches: ReachabilityCache, pause: Callable[[], None] = lambda: None
@@ -40,6 +41,7 @@ class MergePipeline:
             pause: see `Islands`.
         """
         self._islands = Islands(settings, pause=pause)
+        self._implausible_last = ImplausibleLast()
         self._frames = PinnedFrames()
         self._superseder = NodeSuperseder(reaches)
         self._remover = LandmarkRemover()
@@ -81,11 +83,19 @@ class MergePipeline:
         Raises:
             InvalidValue: a node's pose is out of the range of messages.
         """
-        merged = self._frames.moved(self._islands.merge(maps, verdicts, touched, constraints), pins)
-        for graph in merged.graphs:
-            # Written so that NaN fails.
-            if not (np.abs(graph.means[:, :2]) <= MAX_POSITION).all():
-                raise InvalidValue(f"nodes joined with {graph.anchor} lie beyond {MAX_POSITION:g} m")
-        merged = replace(merged, implausible=implausible(merged))
+        merged = self._islands.merge(maps, verdicts, touched, constraints)
+        _check_range(merged)
+        odd = implausible(merged)
+        merged = self._frames.moved(self._implausible_last.solved(merged, odd.keys()), pins)
+        _check_range(merged)
+        merged = replace(merged, implausible=odd)
         unsure = {*merged.implausible, *fragments(maps, pruned)}
         return self._remover.fade(self._superseder.renewed(merged, unsure))
+
+
+def _check_range(merged: MergedMap) -> None:
+    """Raises InvalidValue: a node's pose is out of the range of messages."""
+    for graph in merged.graphs:
+        # Written so that NaN fails.
+        if not (np.abs(graph.means[:, :2]) <= MAX_POSITION).all():
+            raise InvalidValue(f"nodes joined with {graph.anchor} lie beyond {MAX_POSITION:g} m")

@@ -197,6 +197,35 @@ def test_a_person_links_two_maps_of_one_recording() -> None:
     assert merger.merged().set_apart.keys() == {LAST}
 
 
+@pytest.mark.parametrize("clock", ["", "utc"])
+def test_a_map_with_a_clock_that_runs_backwards_is_joined_and_moves_no_other(clock: str) -> None:
+    """Its times contradict each other; its views are true, and those of an honest robot move the others."""
+    alone, beside = Merger(), Merger()
+    for log in sound_logs().values():
+        for message in log:
+            alone.on_change(decode_change(message))
+            beside.on_change(decode_change(message))
+    steps = [a.inverse() @ b @ Pose2(0.01, -0.01, 0.005) for a, b in pairwise(TOUR)]
+    nodes = take_map(WORLD, LAST, TOUR, np.random.default_rng(8))[0]
+    for number, body in enumerate(driven(LAST, nodes, steps), start=1):
+        if isinstance(body, NodePut) and clock:
+            body = NodePut(replace(body.node, stamp_ns=10**12 - body.node.stamp_ns, clock=clock))
+        beside.on_change(Change(LAST, number, 0, body))
+    before, after = alone.merged(), beside.merged()
+    first, second = before.maps
+    assert after.joined(first, LAST) and after.joined(first, second)
+    assert (LAST in after.implausible) is bool(clock)
+    moved = max(
+        (before.pose(first_node).inverse() @ before.pose(node)).distance(
+            after.pose(first_node).inverse() @ after.pose(node)
+        )
+        for component in before.components
+        for first_node in [min(component)]
+        for node in component
+    )
+    assert moved < 1e-6 if clock else moved > 1e-3
+
+
 def test_a_map_of_which_a_change_was_refused_is_joined_by_a_person_alone() -> None:
     """No robot sends such a change. What else it sends may be true, and must not move the maps of others."""
     merger = Merger()

@@ -1,0 +1,108 @@
+"""What an implausible map measured moves no node of another map."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.pose_graph.component import Component, solve_graph
+from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.implausible_last import ImplausibleLast
+from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+
+ODD = MapId("m", 1)
+SIGMAS = 0.05, 0.02
+
+
+def nodes_of(agent: str, count: int) -> list[NodeId]:
+    return [NodeId(agent, 1, k + 1) for k in range(count)]
+
+
+def measured(a: NodeId, b: NodeId, truth: dict[NodeId, Pose2], rng: np.random.Generator) -> Measurement:
+    way = truth[a].inverse() @ truth[b]
+    noise = rng.normal(0.0, [SIGMAS[0], SIGMAS[0], SIGMAS[1]])
+    return Measurement(a, b, PoseGaussian.from_sigmas(way @ Pose2.from_vector(noise), *SIGMAS))
+
+
+def drawn(seed: int, names: tuple[str, str, str], links: tuple[tuple[int, int], ...]) -> list[Measurement]:
+    """Drives of three robots, each from node to node, and links between those of the robots of each pair."""
+    rng = np.random.default_rng(seed)
+    drives = [nodes_of(name, 6) for name in names]
+    truth = {
+        node: Pose2.from_vector(rng.uniform([0, 0, -3], [6, 6, 3])) for nodes in drives for node in nodes
+    }
+    out = [measured(a, b, truth, rng) for nodes in drives for a, b in pairwise(nodes)]
+    for first, second in links:
+        out += [measured(drives[first][k], drives[second][k], truth, rng) for k in (0, 2, 5)]
+    return out
+
+
+def solved(measurements: list[Measurement]) -> Component:
+    anchor = min(node for m in measurements for node in (m.a, m.b))
+    return solve_graph(anchor, Pose2(), measurements)
+
+
+def merged_map(graph: Component) -> MergedMap:
+    return MergedMap({}, (), (), (frozenset(graph.nodes),), Poses((graph,)), (graph,))
+
+
+@pytest.mark.parametrize(
+    "names", [("a", "b", "m"), ("n", "o", "m")], ids=["behind the others", "first of all"]
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_the_others_are_where_they_are_without_it(seed: int, names: tuple[str, str, str]) -> None:
+    measurements = drawn(seed, names, ((0, 1), (0, 2), (1, 2)))
+    graph = solved(measurements)
+    alone = solved([m for m in measurements if ODD not in {m.a.map, m.b.map}])
+    placed = ImplausibleLast().solved(merged_map(graph), {ODD})
+    assert placed.graphs[0].nodes == graph.nodes
+    first = alone.nodes[0]
+
+    def apart(one: MergedMap) -> float:
+        return max(
+            (alone.pose(first).inverse() @ alone.pose(node)).distance(
+                one.pose(first).inverse() @ one.pose(node)
+            )
+            for node in alone.nodes
+        )
+
+    assert apart(merged_map(graph)) > 1e-3, "its measurements moved them"
+    assert apart(placed) < 1e-6
+    # Its own nodes lie where its links and its drive say, best of all places.
+    cost = placed.graphs[0].factors  # type: ignore[attr-defined]
+    means = placed.graphs[0].means
+
+    def error(at: np.ndarray) -> float:
+        total = 0.0
+        for a, b, mean, weight in zip(cost.a, cost.b, cost.means, cost.weights, strict=True):
+            way = Pose2.from_vector(at[a]).inverse() @ Pose2.from_vector(at[b])
+            off = (Pose2.from_vector(mean).inverse() @ way).vector
+            total += float(off @ weight @ off)
+        return total
+
+    own = [k for k, node in enumerate(graph.nodes) if node.map == ODD]
+    rng = np.random.default_rng(seed)
+    for _ in range(20):
+        moved = means.copy()
+        moved[own] += rng.normal(0.0, 1e-3, (len(own), 3))
+        assert error(moved) > error(means)
+
+
+def test_where_it_alone_joins_the_others_it_does() -> None:
+    merged = merged_map(solved(drawn(1, ("a", "b", "m"), ((0, 2), (1, 2)))))
+    assert ImplausibleLast().solved(merged, {ODD}).graphs[0] is merged.graphs[0]
+
+
+def test_what_did_not_change_is_the_same_object() -> None:
+    merged, last = merged_map(solved(drawn(1, ("a", "b", "m"), ((0, 1), (0, 2), (1, 2))))), ImplausibleLast()
+    assert last.solved(merged, set()) is merged and last.solved(merged, {MapId("x", 1)}) is merged
+    once = last.solved(merged, {ODD}).graphs[0]
+    assert once is not merged.graphs[0] and last.solved(merged, {ODD}).graphs[0] is once
+    assert last.solved(merged, {ODD, MapId("a", 1), MapId("b", 1)}).graphs[0] is merged.graphs[0], (
+        "no other is left"
+    )
+    assert last.solved(merged, {ODD}).graphs[0] is not once
