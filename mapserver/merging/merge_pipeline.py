@@ -19,10 +19,10 @@ from mapweave.merge.islands import Islands
 from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover
 from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder, Superseding
 from mapweave.merge.pose_graph.candidates import Pair
-from mapweave.merge.pose_graph.implausible_last import ImplausibleLast
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.pinned_frames import PinnedFrames
+from mapweave.merge.pose_graph.staged_optimization import StagedOptimization
 from mapweave.merge.pose_graph.verdicts import Verdicts
 from mapweave.merge.settings import MergeSettings
 
@@ -41,7 +41,7 @@ class MergePipeline:
             pause: see `Islands`.
         """
         self._islands = Islands(settings, pause=pause)
-        self._implausible_last = ImplausibleLast()
+        self._staged = StagedOptimization()
         self._frames = PinnedFrames()
         self._superseder = NodeSuperseder(reaches)
         self._remover = LandmarkRemover()
@@ -86,7 +86,7 @@ class MergePipeline:
         merged = self._islands.merge(maps, verdicts, touched, constraints)
         _check_range(merged)
         odd = implausible(merged)
-        merged = self._frames.moved(self._implausible_last.solved(merged, odd.keys()), pins)
+        merged = self._frames.moved(self._staged.solved(merged, odd.keys()), pins)
         _check_range(merged)
         merged = replace(merged, implausible=odd)
         unsure = {*merged.implausible, *fragments(maps, pruned)}

@@ -124,7 +124,7 @@ class Component(PoseGraph):
         order = np.full(len(self.nodes), len(rows))
         order[rows] = np.arange(len(rows))
         part = self._within(rows, order)
-        piece = _pieces(part, len(rows))
+        piece = pieces(part, len(rows))
         # Only differences count: one node of each piece is held.
         held = np.zeros((len(rows), 3))
         held[np.unique(piece, return_index=True)[1]] = ANCHOR_SIGMA**-2
@@ -165,8 +165,8 @@ def _shares(pairs: Rows, i: Rows, j: Rows) -> list[Rows]:
     return [np.array(some, np.int64) for some in out]
 
 
-def _pieces(part: Factors, count: int) -> Rows:
-    """(count,) which connected piece each row is in."""
+def pieces(part: Factors, count: int) -> Rows:
+    """(count,) which connected piece each of so many rows is in, by measurements between them."""
     from scipy import sparse
     from scipy.sparse.csgraph import connected_components
 
