@@ -286,7 +286,8 @@ def _building(costs: Costs, plan: Plan) -> list[Row]:
     )
     return [
         (f"robots on one front server, acknowledged within {GOOD_ACK_MS:g} ms (99 %)",
-         "the largest fleet in time in one run; runs differ by half", carried, MEASURED),
+         "the largest fleet in time in one run; on slower machines of two cores it was 200: measure yours",
+         carried, MEASURED),
         ("front servers", "robots over that", fronts, EXTRAPOLATED),
         ("cores for links", "robots × link, as if all map", f"{ROBOTS * costs.link_s:.0f}",
          "extrapolated, at most"),

@@ -35,7 +35,8 @@ def copied_landmarks(a: Node, b: Node) -> int:
 def one_for_one(a: Node, b: Node) -> bool:
     """Whether nearly each landmark of two nodes is one of the other, at the same pixel.
 
-    Two views never are: which features are found, have a depth, and are kept differs from view to view.
+    Two views are not, as far as was measured: which features are found, have a depth, and are kept differs
+    from view to view.
     """
     fewer, more = sorted((len(a.landmarks), len(b.landmarks)))
     if fewer < max(SAME_SHARE * more, LEAST_LANDMARKS):
