@@ -122,17 +122,6 @@ def test_a_newer_map_takes_the_place_of_a_map_and_of_no_database(tmp_path: Path)
     assert path.read_bytes() == SQLITE
 
 
-def test_a_pipe_is_written_and_not_read(tmp_path: Path) -> None:
-    path = tmp_path / "pipe"
-    os.mkfifo(path)
-    reader = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-    try:
-        write_whole(path, b"data")
-        assert os.read(reader, 9) == b"data"
-    finally:
-        os.close(reader)
-
-
 def test_a_disk_that_is_read_only_is_named_with_the_file_itself(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
