@@ -6,11 +6,11 @@ import argparse
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source
-from mapweave.commands.network import add_network
+from mapweave.commands.network import add_network, add_reason
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
@@ -25,16 +25,7 @@ def add_record_options(parser: argparse.ArgumentParser, changes: bool) -> None:
         changes: whether the command adds to the record.
     """
     if changes:
-        parser.add_argument(
-            "--because",
-            type=values.remark,
-            default="",
-            metavar="TEXT",
-            help="why; for those who wonder later",
-        )
-        parser.add_argument(
-            "--by", type=values.remark, default="", metavar="NAME", help="your name (default: the login name)"
-        )
+        add_reason(parser)
         parser.add_argument(
             "-o", "--out", type=Path, metavar="OUT", help="with --map: write a map file there instead"
         )
@@ -50,10 +41,29 @@ def add_area_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--corners", nargs="+", metavar="X,Y", help="the floor within these corners in the merged map, m"
     )
+    add_near(parser)
+
+
+def add_near(parser: argparse.ArgumentParser) -> None:
+    """Declare in which part of the map positions are."""
     parser.add_argument(
         "--near", type=values.node, metavar="NODE|PLACE",
         help="positions are in the part of the map where this is (default: the largest part)",
     )  # fmt: skip
+
+
+def add_remove(actions: Any, kind: str, words: str, of: str, description: str) -> None:
+    """Declare the action that withdraws an annotation of a kind by its name."""
+
+    def run(arguments: argparse.Namespace) -> int:
+        with record_of(arguments) as record:
+            print(record.withdraw(kind, arguments.name, arguments.because))
+        return 0
+
+    remove: argparse.ArgumentParser = actions.add_parser("remove", help=words, description=description)
+    remove.add_argument("name", metavar="NAME", help=of)
+    add_record_options(remove, changes=True)
+    remove.set_defaults(run=run)
 
 
 def area_fields(arguments: argparse.Namespace) -> dict[str, object]:

@@ -8,9 +8,15 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, opened
-from mapweave.commands.network import add_network, key_holder, network_of, settings_of
+from mapweave.commands.network import (
+    add_network,
+    add_reason,
+    add_timeout,
+    key_holder,
+    network_of,
+    settings_of,
+)
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.constraint_subject import Subject
@@ -19,12 +25,7 @@ if TYPE_CHECKING:
 
 def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -> None:
     """Declare the options of every manual constraint."""
-    parser.add_argument(
-        "--because", type=values.remark, default="", metavar="TEXT", help="why; for those who wonder later"
-    )
-    parser.add_argument(
-        "--by", type=values.remark, metavar="NAME", help="your name (default: the login name)"
-    )
+    add_reason(parser)
     if undo:
         parser.add_argument("--undo", action="store_true", help="take it back")
     parser.add_argument("--check", action="store_true", help="only say what it would do; change nothing")
@@ -35,13 +36,7 @@ def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -
     parser.add_argument(
         "-o", "--out", type=Path, metavar="OUT", help="with --map: write a map file there instead"
     )
-    parser.add_argument(
-        "--timeout",
-        type=values.seconds,
-        default=20.0,
-        metavar="S",
-        help="longest wait for an answer (default: 20)",
-    )
+    add_timeout(parser)
     add_network(parser)
 
 
@@ -62,7 +57,7 @@ def constrain(arguments: argparse.Namespace, about: Subject) -> None:
         raise UsageError("--out goes with --map: a server keeps its own record")
     holder = None if arguments.map is not None else key_holder(network_of(arguments, settings_of(arguments)))
     check_role(holder)
-    by = author(holder, arguments.by or "")
+    by = author(holder, arguments.by)
     with arguments_read():
         constraint = ManualConstraint(about, not arguments.undo, by, time.time_ns(), arguments.because)
         request = ConstraintRequest(constraint, arguments.check)

@@ -8,7 +8,7 @@ from typing import Any
 
 from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source
-from mapweave.commands.network import add_network
+from mapweave.commands.network import add_network, add_timeout
 
 
 def add_to(actions: Any) -> None:
@@ -26,13 +26,7 @@ def add_to(actions: Any) -> None:
     )
     parser.add_argument("--draw", type=values.png, metavar="PNG", help="draw the landmarks of the two nodes")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument(
-        "--timeout",
-        type=values.seconds,
-        default=20.0,
-        metavar="S",
-        help="longest wait for an answer (default: 20)",
-    )
+    add_timeout(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 

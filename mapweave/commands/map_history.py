@@ -6,9 +6,8 @@ import argparse
 import json
 from typing import TYPE_CHECKING, Any
 
-from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, opened
-from mapweave.commands.network import add_network
+from mapweave.commands.network import add_network, add_timeout
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.map_event import History
@@ -28,13 +27,7 @@ def add_to(actions: Any) -> None:
     parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     parser.add_argument("--most", type=int, default=40, metavar="N", help="the newest so many (default: 40)")
     parser.add_argument("--json", action="store_true", help="print one JSON object, with all")
-    parser.add_argument(
-        "--timeout",
-        type=values.seconds,
-        default=20.0,
-        metavar="S",
-        help="longest wait for an answer (default: 20)",
-    )
+    add_timeout(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.network import add_network, connect, network_of, reach, settings_of
+from mapweave.commands.network import add_network, add_timeout, connect, network_of, reach, settings_of
 
 
 def add_to(actions: Any) -> None:
@@ -32,13 +32,7 @@ def add_to(actions: Any) -> None:
         "--name", type=values.name, help="of the map in the fleet (default: OUT without its ending)"
     )
     parser.add_argument("--send", action="store_true", help="hand the map over to a running server")
-    parser.add_argument(
-        "--timeout",
-        type=values.seconds,
-        default=20.0,
-        metavar="S",
-        help="longest wait for the server (default: 20)",
-    )
+    add_timeout(parser, of="the server")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(parser)
     parser.set_defaults(run=run)

@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_record_options, record_of
+from mapweave.commands.annotating import add_record_options, add_remove, record_of
 
 KINDS = ("lift", "ramp", "door")
 
@@ -46,15 +46,11 @@ def add_to(actions: Any) -> None:
     add_record_options(portals, changes=False)
     portals.set_defaults(run=run_list)
 
-    remove: argparse.ArgumentParser = steps.add_parser(
-        "remove",
-        help="remove a portal",
-        description="Remove a portal: `mapweave map portal remove 'east lift'`. `mapweave map history` still "
+    add_remove(
+        steps, "portal", "remove a portal", "of the portal",
+        "Remove a portal: `mapweave map portal remove 'east lift'`. `mapweave map history` still "
         "shows it; `map portal add` brings it back. For a time: `mapweave close A B`.",
-    )
-    remove.add_argument("name", metavar="NAME", help="of the portal")
-    add_record_options(remove, changes=True)
-    remove.set_defaults(run=run_remove)
+    )  # fmt: skip
 
 
 def run_add(arguments: argparse.Namespace) -> int:
@@ -66,13 +62,6 @@ def run_add(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{a.a} twice: a portal leads from one node to another")
     with record_of(a) as record:
         print(record.annotate("portal", a.name, a.because, a=a.a, b=a.b, means=a.kind, note=a.note))
-    return 0
-
-
-def run_remove(arguments: argparse.Namespace) -> int:
-    """Remove a portal."""
-    with record_of(arguments) as record:
-        print(record.withdraw("portal", arguments.name, arguments.because))
     return 0
 
 

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, router_of
-from mapweave.commands.network import add_network
+from mapweave.commands.network import add_network, add_timeout
 from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
@@ -46,13 +46,7 @@ def add_to(actions: Any) -> None:
     parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     parser.add_argument("--draw", type=values.png, metavar="PNG", help="draw the way on the map")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
-    parser.add_argument(
-        "--timeout",
-        type=values.seconds,
-        default=20.0,
-        metavar="S",
-        help="longest wait for an answer (default: 20)",
-    )
+    add_timeout(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 

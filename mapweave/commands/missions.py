@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.network import add_network, network_of, settings_of
+from mapweave.commands.network import add_author, add_network, network_of, settings_of
 from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
@@ -93,9 +93,7 @@ def _add_common(parser: argparse.ArgumentParser, patience: float | None) -> None
             "--timeout", type=values.seconds, default=patience, metavar="S",
             help=f"with --wait: at most so long (default: {patience:g})",
         )  # fmt: skip
-    parser.add_argument(
-        "--by", type=values.remark, default="", metavar="NAME", help="your name (default: the login name)"
-    )
+    add_author(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(parser)
 

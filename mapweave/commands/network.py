@@ -67,6 +67,29 @@ def add_log_format(parser: argparse.ArgumentParser) -> None:
     )  # fmt: skip
 
 
+def add_timeout(parser: argparse.ArgumentParser, default: float = 20.0, of: str = "an answer") -> None:
+    """How long a command waits."""
+    parser.add_argument(
+        "--timeout", type=values.seconds, default=default, metavar="S",
+        help=f"longest wait for {of} (default: {default:g})",
+    )  # fmt: skip
+
+
+def add_author(parser: argparse.ArgumentParser) -> None:
+    """Who gives an order or changes a record."""
+    parser.add_argument(
+        "--by", type=values.remark, default="", metavar="NAME", help="your name (default: the login name)"
+    )
+
+
+def add_reason(parser: argparse.ArgumentParser) -> None:
+    """Why a record is changed, and who does."""
+    parser.add_argument(
+        "--because", type=values.remark, default="", metavar="TEXT", help="why; for those who wonder later"
+    )
+    add_author(parser)
+
+
 def settings_of(arguments: argparse.Namespace) -> Settings:
     """The settings file with the command line over it."""
     from mapweave.settings import load_settings

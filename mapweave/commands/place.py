@@ -7,7 +7,13 @@ import json
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_area_options, add_record_options, area_fields, record_of
+from mapweave.commands.annotating import (
+    add_area_options,
+    add_record_options,
+    add_remove,
+    area_fields,
+    record_of,
+)
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
@@ -52,15 +58,11 @@ def add_to(commands: Any) -> None:
     add_record_options(names, changes=False)
     names.set_defaults(run=run_list)
 
-    remove: argparse.ArgumentParser = actions.add_parser(
-        "remove",
-        help="remove a name",
-        description="Remove the name of a place: `mapweave place remove kitchen`. `mapweave map history` "
+    add_remove(
+        actions, "place", "remove a name", "of the place",
+        "Remove the name of a place: `mapweave place remove kitchen`. `mapweave map history` "
         "still shows it; `place add` brings it back.",
-    )
-    remove.add_argument("name", metavar="NAME", help="of the place")
-    add_record_options(remove, changes=True)
-    remove.set_defaults(run=run_remove)
+    )  # fmt: skip
 
 
 def run_add(arguments: argparse.Namespace) -> int:
@@ -77,13 +79,6 @@ def run_add(arguments: argparse.Namespace) -> int:
         fields["node"] = arguments.where
     with record_of(arguments) as record:
         print(record.annotate("place", arguments.name, arguments.because, **fields))
-    return 0
-
-
-def run_remove(arguments: argparse.Namespace) -> int:
-    """Remove a name."""
-    with record_of(arguments) as record:
-        print(record.withdraw("place", arguments.name, arguments.because))
     return 0
 
 

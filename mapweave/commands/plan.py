@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_record_options, record_of, two_numbers
+from mapweave.commands.annotating import add_near, add_record_options, add_remove, record_of, two_numbers
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
@@ -51,10 +51,7 @@ def add_to(commands: Any) -> None:
         help="of the plan (default: the file's, without its ending)",
     )  # fmt: skip
     add.add_argument("--metres-per-pixel", type=float, metavar="M", help="scale of the image, m")
-    add.add_argument(
-        "--near", type=values.node, metavar="NODE|PLACE",
-        help="positions are in the part of the map where this is (default: the largest part)",
-    )  # fmt: skip
+    add_near(add)
     add_record_options(add, changes=True)
     add.set_defaults(run=run_add)
 
@@ -85,14 +82,10 @@ def add_to(commands: Any) -> None:
     add_record_options(export, changes=False)
     export.set_defaults(run=run_export)
 
-    remove: argparse.ArgumentParser = actions.add_parser(
-        "remove",
-        help="remove a plan",
-        description="Remove a plan: `mapweave plan remove office`. `mapweave map history` still shows it.",
-    )
-    remove.add_argument("name", metavar="NAME", help="of the plan")
-    add_record_options(remove, changes=True)
-    remove.set_defaults(run=run_remove)
+    add_remove(
+        actions, "plan", "remove a plan", "of the plan",
+        "Remove a plan: `mapweave plan remove office`. `mapweave map history` still shows it.",
+    )  # fmt: skip
 
 
 def _add_component(parser: argparse.ArgumentParser) -> None:
@@ -172,13 +165,6 @@ def run_export(arguments: argparse.Namespace) -> int:
     print(WRITERS[arguments.format](placed, part), end="")
     for doubt in part.doubts:
         print(f"mapweave: {doubt}", file=sys.stderr)
-    return 0
-
-
-def run_remove(arguments: argparse.Namespace) -> int:
-    """Withdraw a plan."""
-    with record_of(arguments) as record:
-        print(record.withdraw("plan", arguments.name, arguments.because))
     return 0
 
 

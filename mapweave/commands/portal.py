@@ -6,7 +6,7 @@ import argparse
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.network import add_network
+from mapweave.commands.network import add_author, add_network
 
 
 def add_to(commands: Any) -> None:
@@ -25,9 +25,7 @@ def add_to(commands: Any) -> None:
         "goes on. The message goes to the robot directly, and works without a map server.",
     )
     done.add_argument("robot", type=values.name, help="the robot's name, for example r0")
-    done.add_argument(
-        "--by", type=values.remark, default="", metavar="NAME", help="your name (default: the login name)"
-    )
+    add_author(done)
     add_network(done)
     done.set_defaults(run=run_done)
 

@@ -13,7 +13,14 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, router_of
-from mapweave.commands.network import add_network, key_holder, network_of, reach, settings_of
+from mapweave.commands.network import (
+    add_network,
+    add_timeout,
+    key_holder,
+    network_of,
+    reach,
+    settings_of,
+)
 from mapweave.commands.plan import add_plan_option, plan_of, plan_place
 from mapweave.exit_status import DONE, NO
 
@@ -52,13 +59,7 @@ def add_to(commands: Any) -> None:
         help="draw the best candidate's landmarks next to the image, joined where they match",
     )  # fmt: skip
     add_plan_option(parser)
-    parser.add_argument(
-        "--timeout",
-        type=values.seconds,
-        default=5.0,
-        metavar="S",
-        help="longest wait for an answer (default: 5)",
-    )
+    add_timeout(parser, 5.0)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(parser)
     parser.set_defaults(run=run)
