@@ -8,6 +8,7 @@ by itself waits for ever in all three cases.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import errno
 import logging
 import socket
@@ -37,6 +38,8 @@ LINGER = 1.0
 """s in which a peer may finish sending what is refused: a connection that is reset loses the answer too."""
 MAX_VIEWER_BYTES = 1024
 """Of a message by a viewer, which has nothing to say."""
+GRACE = 1.0
+"""s in which requests in work may end when the server ends."""
 START = 10.0
 """s in which the thread has to be there."""
 POLICY = (
@@ -202,10 +205,35 @@ class _Loop(asyncio.SelectorEventLoop):
 
 
 class _Server(uvicorn.Server):
+    """Ends as soon as it is to and no request is in work; uvicorn itself looks ten times a second."""
+
+    def __init__(self, config: uvicorn.Config) -> None:
+        super().__init__(config)
+        self._ending = asyncio.Event()
+
+    def end(self) -> None:
+        """Stop serving. In the server's loop."""
+        self.should_exit = True
+        self._ending.set()
+
+    async def main_loop(self) -> None:
+        """Serve until it is to end. The headers of answers never change; uvicorn makes them each second."""
+        if not await self.on_tick(0):
+            await self._ending.wait()
+
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End every connection, also those of peers that take nothing."""
-        await super().shutdown(sockets)
-        for connection in list(self.server_state.connections):
+        """End every connection, also those of peers that take nothing; requests in work have a moment."""
+        for listening in (*self.servers, *(sockets or ())):
+            listening.close()
+        state = self.server_state
+        for connection in list(state.connections):
+            connection.shutdown()
+        end = time.monotonic() + GRACE
+        while (state.connections or state.tasks) and time.monotonic() < end:
+            await asyncio.sleep(0.005)
+        for task in state.tasks:
+            task.cancel()
+        for connection in list(state.connections):
             connection.transport.abort()
         await asyncio.sleep(0)
 
@@ -257,14 +285,13 @@ class HttpThread:
             headers=list(HEADERS.items()),
             # A head whose end is not among so many bytes is longer.
             h11_max_incomplete_event_size=MAX_HEAD_BYTES - 1,
-            timeout_graceful_shutdown=1,
             # A proxy on this machine names the client for which it asks.
             forwarded_allow_ips="127.0.0.1,::1",
         )
         config.load()
         config.ssl = tls
         self._server = _Server(config)
-        self._head = limits.head
+        self._loop = _Loop(limits.head)
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
         end = time.monotonic() + START
@@ -274,7 +301,7 @@ class HttpThread:
             raise NotConnected("the server's thread did not start")
 
     def _run(self) -> None:
-        with asyncio.Runner(loop_factory=lambda: _Loop(self._head)) as runner:
+        with asyncio.Runner(loop_factory=lambda: self._loop) as runner:
             runner.run(self._server.serve(sockets=[self._socket]))
 
     @property
@@ -294,7 +321,8 @@ class HttpThread:
 
     def close(self) -> None:
         """Stop serving; connections end. Idempotent."""
-        self._server.should_exit = True
+        with contextlib.suppress(RuntimeError):  # it has ended already
+            self._loop.call_soon_threadsafe(self._server.end)
         self._thread.join(10.0)
 
 

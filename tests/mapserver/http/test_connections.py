@@ -6,6 +6,7 @@ import resource
 import socket
 import threading
 import time
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from mapweave.mapserver.http import serving, web
 from mapweave.mapserver.http.body import MOST_BYTES
 from mapweave.mapserver.http.serving import Limits
 from mapweave.mapserver.http.web import Questions, Web, parse_address
+from mapweave.wire.log_messages import Scalar
 from tests.mapserver.http.client import ask, post, raw
 from tests.mapserver.stub_services import StubServices
 from tests.waiting import eventually
@@ -223,6 +225,33 @@ def test_a_server_that_is_closed_leaves_nothing_behind(services: StubServices) -
         served.close()
         with Web(("127.0.0.1", served.port), services) as again:
             assert ask(again, "GET", "/status")[0] == 200
+
+
+def test_a_server_ends_without_delay(services: StubServices) -> None:
+    took = []
+    for _ in range(5):
+        with Web(("127.0.0.1", 0), services) as served:
+            assert ask(served, "GET", "/status")[0] == 200
+            begin = time.monotonic()
+            served.close()
+            took.append(time.monotonic() - begin)
+    assert min(took) < 0.1  # s
+
+
+def test_a_request_in_work_is_answered_when_the_server_ends(services: StubServices) -> None:
+    begun = threading.Event()
+
+    def slow_status() -> dict[str, Scalar]:
+        begun.set()
+        time.sleep(0.3)
+        return {"summary": "late"}
+
+    services.status = slow_status  # type: ignore[method-assign]
+    with Web(("127.0.0.1", 0), services) as served, ThreadPoolExecutor() as client:
+        answer = client.submit(ask, served, "GET", "/status")
+        assert begun.wait(10.0)
+        served.close()
+        assert answer.result()[0] == 200 and b"late" in answer.result()[2]
 
 
 def test_noise_instead_of_http(served: Web) -> None:

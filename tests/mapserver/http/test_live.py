@@ -252,6 +252,15 @@ def test_only_so_many_watch(served: Web) -> None:
         assert viewers[0].until("state")
 
 
+def test_a_server_that_ends_says_so_to_viewers(services: StubServices) -> None:
+    with Web(("127.0.0.1", 0), services) as served, viewer(served) as watching:
+        watching.until("state")
+        served.close()
+        with pytest.raises(ConnectionClosed) as closed:
+            watching.until("nothing")
+        assert closed.value.rcvd is not None and closed.value.rcvd.code == 1012
+
+
 class SlowSocket:
     """A viewer that takes a message when the test lets it."""
 
