@@ -33,6 +33,7 @@ from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.robots_in_view import RobotsInView, nodes_around
 from mapweave.agent.sensor_health.sensor_monitor import Fault, SensorMonitor
+from mapweave.agent.sensor_health.turn_convention import TurnConvention
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
@@ -100,6 +101,7 @@ class Pipeline:
             description = replace(description, distortion=NO_DISTORTION)
         self._map_id = map_id
         self._settings = settings or AgentSettings()
+        self._convention = TurnConvention(description.camera)
         calibration = calibration or OnlineCalibration(description)
         self._map_making = MapMaking(map_id, calibration, self._settings, contents, next_number, released)
         description = self._map_making.description
@@ -120,6 +122,12 @@ class Pipeline:
     def refuted(self) -> int:
         """Answers of the fleet that its view did not bear out, on the present mission."""
         return 0 if self._navigator is None else self._navigator.refuted
+
+    @property
+    def complaints(self) -> list[str]:
+        """What was found to be wrong with the odometry and with the declared geometry, a line each."""
+        lines = [self._convention.complaint, *map(str, self.calibration.causes)]
+        return [line for line in lines if line]
 
     @property
     def map(self) -> HybridMap:
@@ -238,6 +246,7 @@ class Pipeline:
             # From here on the camera is a pinhole.
             observation = replace(observation, image=self._fisheye.rectified(observation.image))
         self._image = observation.image
+        self._convention.see(observation)
         observation = self.calibration.correct(observation)
         observation = self._blind_zone.fill(self._sensors.see(observation, self._command))
         if self._sensors.clock_jumped:

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.vision.image_quality import LEAST_CORNERS, strongest_corners
-from mapweave.agent.vision.visual_odometry import VisualMotion, visual_motion
+from mapweave.agent.vision.visual_odometry import VisualMotion, reduced, visual_motion
 from mapweave.hybridmap.pose import Array
 
 WINDOW = 1.0
@@ -43,8 +43,6 @@ STILL = (0.02, 0.005)
 """Turn, rad, and way over depth below which the image has stood: 0.15 m up to 30 m away are more."""
 MOVES = (0.05, 0.01)
 """The same above which it has moved."""
-WIDTH_PX = 160
-"""Images are reduced to this width: turns need no more, and it takes a quarter of the time of 320 px."""
 SMALL_PX = (64, 48)
 AT_REST = 3.0
 """Mean difference of reduced images, grey levels, below which nothing has moved; as in `mapping_monitor`."""
@@ -124,7 +122,7 @@ class EncoderMonitor:
         commanded = self._wheels_from_body @ [command.forward, command.turn] * seconds
         small = None
         if image is not None:
-            image = _reduced(image)
+            image = reduced(image)
             small = np.asarray(cv2.resize(image, SMALL_PX, interpolation=cv2.INTER_AREA), np.float32)
         self._count += 1
         self._moments.append(_Moment(self._count, commanded, measured, image, small))
@@ -243,12 +241,3 @@ class EncoderMonitor:
         if pair not in self._motions:
             self._motions[pair] = visual_motion(before.image, now.image, self._description.camera)
         return self._motions[pair]
-
-
-def _reduced(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """A grey image (H, W), at most WIDTH_PX wide."""
-    height, width = image.shape
-    if width <= WIDTH_PX:
-        return image
-    size = (WIDTH_PX, max(round(height * WIDTH_PX / width), 1))
-    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

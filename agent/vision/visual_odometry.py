@@ -22,6 +22,8 @@ from mapweave.hybridmap.camera import Camera
 WINDOW_PX = (15, 15)
 POINTS = 100
 LEAST_POINTS = 12
+WIDTH_PX = 160
+"""Images are reduced to this width: turns need no more, and it takes a quarter of the time of 320 px."""
 ROUNDS = 4
 """Of least squares, each with the points that the one before fits worst weighed down."""
 
@@ -68,3 +70,12 @@ def visual_motion(before: NDArray[np.uint8], now: NDArray[np.uint8], camera: Cam
         spread = max(median(miss), 1e-5)
         weights = 1.0 / (1.0 + (miss / (2.0 * spread)) ** 2)
     return VisualMotion(float(solution[0]), float(solution[1]))
+
+
+def reduced(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """A grey image (H, W), at most WIDTH_PX wide."""
+    height, width = image.shape
+    if width <= WIDTH_PX:
+        return image
+    size = (WIDTH_PX, max(round(height * WIDTH_PX / width), 1))
+    return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_AREA), np.uint8)

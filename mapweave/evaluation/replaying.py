@@ -62,7 +62,7 @@ class ReplayEvaluation:
         frames: all, in order.
         maps: that were made.
         truth: (N, 3) pose of each frame, NaN where unknown.
-        notes: what is wrong with the declared geometry, a line each.
+        notes: what is wrong with the declared geometry or the odometry, a line each.
     """
 
     name: str
@@ -190,7 +190,7 @@ def evaluate_replay(
     pipelines[-1].finish()
     stamps = np.array([frame.stamp_ns for frame in frames], np.int64)
     maps = [pipeline.map for pipeline in pipelines]
-    notes = [str(cause) for cause in pipelines[-1].calibration.causes]
+    notes = list(dict.fromkeys(line for pipeline in pipelines for line in pipeline.complaints))
     return ReplayEvaluation(str(replay.recording.path), frames, maps, true_poses(truth, stamps), notes)
 
 

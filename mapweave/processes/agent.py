@@ -142,7 +142,8 @@ class Agent:
         self._teleoperation = Teleoperation(refusal=refusal)
         self._options = options
         self._on_step = on_step
-        self._causes = self._stamp_ns = 0
+        self._stamp_ns = 0
+        self._complaints = set[str]()
         self._print, self._server_watch = print_line, ServerWatch(options.server)
         options.data.mkdir(parents=True, exist_ok=True)
         self.journal = Journal(options.data / f"{options.name}.sqlite", options.name)
@@ -272,10 +273,11 @@ class Agent:
             self._say(line)
         self._on_step(observation, step)
         self._portal_command.see(step.status.portal)
-        # A geometry that is found to be declared wrongly is reported once.
-        for cause in self.pipeline.calibration.causes[self._causes :]:
-            self._say(str(cause))
-            self._causes += 1
+        # A geometry that is found to be declared wrongly is reported once, as are turns in another unit.
+        for line in self.pipeline.complaints:
+            if line not in self._complaints:
+                self._complaints.add(line)
+                self._say(line)
 
     @property
     def server_in_reach(self) -> bool:

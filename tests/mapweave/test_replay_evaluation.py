@@ -121,3 +121,30 @@ def test_a_recording_is_scored_and_its_trajectory_is_read_by_evo(
     assert matched.num_poses == 30
     missing = tmp_path / "none.csv"
     assert f"{missing}: no such file" in complaint(capfd, "eval", "replay", folder, "--truth", missing)
+
+
+@pytest.mark.parametrize(
+    ("times", "words"), [(1.0, ""), (-1.0, "the other way than the odometry"), (57.2958, "in degrees")]
+)
+def test_odometry_with_turns_in_degrees_or_reversed_is_named(
+    times: float, words: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    walls, folder = PhotoWalls(), tmp_path / "walk"
+    (folder / "images").mkdir(parents=True)
+    (folder / "camera.toml").write_text(
+        "width = 320\nheight = 240\nfx = 277\nfy = 277\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
+    )
+    odometry, before = ["forward_m,turn_rad"], 0.0
+    for k in range(60):
+        heading = 0.25 * np.sin(0.15 * k)
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), walls.render(Pose2(0.01 * k, 0.0, heading)))
+        odometry.append(f"{0.01 if k else 0.0},{times * (heading - before)}")
+        before = heading
+    (folder / "odometry.csv").write_text("\n".join(odometry) + "\n")
+    for arguments in (
+        ["replay", str(folder), "--offline", "--data", str(tmp_path / "data")],
+        ["eval", "replay", str(folder), "--out", str(tmp_path / "out")],
+    ):
+        assert main(arguments) == 0
+        said = " ".join("".join(capfd.readouterr()).split())
+        assert said.count(words or "the map is wrong") == (1 if words else 0)
