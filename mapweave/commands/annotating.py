@@ -10,7 +10,10 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source
-from mapweave.commands.network import add_network, add_reason
+from mapweave.commands.missions import fleet_of
+from mapweave.commands.network import add_network, add_reason, settings_of
+from mapweave.commands.usage import UsageError
+from mapweave.hybridmap.errors import InvalidValue
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
@@ -73,9 +76,7 @@ def area_fields(arguments: argparse.Namespace) -> dict[str, object]:
         UsageError: a corner is no position, there are too few or too many, their outline crosses itself, or
             the radius is no length.
     """
-    from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.area import FARTHEST, LEAST_CORNERS, MOST_CORNERS, check_outline
-    from mapweave.hybridmap.errors import InvalidValue
 
     fields: dict[str, object] = {}
     if arguments.radius is not None:
@@ -100,7 +101,6 @@ def area_fields(arguments: argparse.Namespace) -> dict[str, object]:
 
 def two_numbers(word: str) -> tuple[float, float] | None:
     """A position or a pixel; None for what is neither."""
-    from mapweave.hybridmap.errors import InvalidValue
     from mapweave.mapserver.places import position_of
 
     try:
@@ -116,18 +116,14 @@ def record_of(arguments: argparse.Namespace) -> Iterator[Fleet | OfflineAnnotati
     Raises:
         MapweaveError: no server answers, or the file cannot be read.
     """
-    from mapweave.commands.usage import UsageError
     from mapweave.fleet import login
 
     if arguments.map is None:
-        from mapweave.commands.missions import fleet_of
-
         if getattr(arguments, "out", None) is not None:
             raise UsageError("--out goes with --map: a server keeps its own record")
         with fleet_of(arguments) as fleet:
             yield fleet
     else:
-        from mapweave.commands.network import settings_of
         from mapweave.offline_annotations import OfflineAnnotations
 
         by, out = getattr(arguments, "by", "") or login(), getattr(arguments, "out", None)

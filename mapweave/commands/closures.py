@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.annotating import add_area_options, add_record_options, area_fields, record_of
+from mapweave.commands.usage import UsageError, arguments_read
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
@@ -81,7 +82,6 @@ def _add_where(parser: argparse.ArgumentParser) -> None:
 
 def run_close(arguments: argparse.Namespace) -> int:
     """Close a way."""
-    from mapweave.commands.usage import arguments_read
     from mapweave.hybridmap.wall_time import local_words, read_time, utc_words
 
     now_ns = time.time_ns()
@@ -99,7 +99,6 @@ def run_close(arguments: argparse.Namespace) -> int:
 
 def run_prefer(arguments: argparse.Namespace) -> int:
     """Prefer or avoid a way, or withdraw that."""
-    from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.annotation import LEAST_FACTOR, MOST_FACTOR
 
     least, most = (LEAST_FACTOR, 1.0) if arguments.verb == "prefer" else (1.0, MOST_FACTOR)
@@ -153,7 +152,6 @@ def _meant(arguments: argparse.Namespace, record: Fleet | OfflineAnnotations) ->
     Raises:
         UsageError: nothing, or too much, is given.
     """
-    from mapweave.commands.usage import UsageError
     from mapweave.mapserver.annotation_words import AROUND
 
     where, fields = arguments.where, dict[str, Any](area_fields(arguments))

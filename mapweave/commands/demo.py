@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands import values
+from mapweave.commands.usage import arguments_read
 from mapweave.exit_status import DONE, NO
 
 
@@ -39,7 +40,6 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.extras import TRIAL, need
 
     need(*TRIAL)
-    from mapweave.commands.usage import arguments_read
     from mapweave.demo.options import DemoOptions
     from mapweave.demo.report import summary_table
     from mapweave.demo.run import run_demo

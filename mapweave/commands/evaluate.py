@@ -9,6 +9,7 @@ from typing import Any
 
 from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
+from mapweave.commands.network import settings_of
 from mapweave.commands.replay import add_recording, options_of
 
 
@@ -105,7 +106,6 @@ def run_replay(arguments: argparse.Namespace) -> int:
     from rich.table import Table
 
     from mapweave.agent.drivers.replay import Replay
-    from mapweave.commands.network import settings_of
     from mapweave.evaluation.replaying import evaluate_replay, rows
     from mapweave.output_folder import check_output
     from mapweave.terminal import Bar, plain_or_terminal
@@ -140,7 +140,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Examine and print."""
     from rich.table import Table
 
-    from mapweave.commands.network import settings_of
     from mapweave.evaluation.relocalization import evaluate_map, evaluate_relocalization
     from mapweave.output_folder import check_output
     from mapweave.terminal import plain_or_terminal
@@ -182,7 +181,6 @@ def run_merge(arguments: argparse.Namespace) -> int:
     need("server", "viz")
     from rich.table import Table
 
-    from mapweave.commands.network import settings_of
     from mapweave.evaluation.merging import evaluate_merging
     from mapweave.output_folder import check_output
     from mapweave.terminal import plain_or_terminal

@@ -7,6 +7,7 @@ from typing import Any
 
 from mapweave.commands import values
 from mapweave.commands.annotating import add_record_options, record_of
+from mapweave.commands.usage import UsageError
 
 
 def add_to(commands: Any) -> None:
@@ -28,7 +29,6 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Label a map, or withdraw its label."""
-    from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.query import ResolveRequest
 
     if (arguments.label is None) != arguments.undo:

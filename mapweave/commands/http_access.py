@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from mapweave.commands.usage import arguments_read
+
 if TYPE_CHECKING:
     from mapweave.identities.key_folder import KeyFolder
     from mapweave.identities.logins import Logins
@@ -86,7 +88,6 @@ def http_access(words: str, folder: KeyFolder | None, server: str) -> HttpAccess
         UsageError: other machines would be served without a login, or unencrypted.
         SettingsError: a key is missing.
     """
-    from mapweave.commands.usage import arguments_read
     from mapweave.identities.key_file import read_key_file
     from mapweave.identities.logins import Logins
     from mapweave.mapserver.http.tls import server_context

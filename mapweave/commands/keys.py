@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands import values
+from mapweave.commands.usage import UsageError, arguments_read
+from mapweave.hybridmap.errors import Refused
 
 ROLES = ("robot", "server", "operator", "viewer")
 
@@ -88,7 +90,6 @@ def _action(actions: Any, name: str, words: str) -> argparse.ArgumentParser:
 
 
 def _init(arguments: argparse.Namespace) -> int:
-    from mapweave.commands.usage import arguments_read
     from mapweave.identities.key_folder import KeyFolder, Profile
 
     profile = Profile(arguments.profile)
@@ -105,7 +106,6 @@ def _init(arguments: argparse.Namespace) -> int:
 
 
 def _add(arguments: argparse.Namespace) -> int:
-    from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.identities.hosts import check_hosts
     from mapweave.identities.key_folder import KeyFolder, Profile
     from mapweave.wire.credentials import Role
@@ -142,7 +142,6 @@ def _token(arguments: argparse.Namespace) -> int:
 
 
 def _check_days(days: float) -> None:
-    from mapweave.commands.usage import UsageError
 
     if not 0.0 < days <= 3650.0:
         raise UsageError(f"--days {days:g}: give 1 to 3650")
@@ -180,7 +179,6 @@ def _list(arguments: argparse.Namespace) -> int:
 
 
 def _revoke(arguments: argparse.Namespace) -> int:
-    from mapweave.hybridmap.errors import Refused
     from mapweave.identities.key_folder import KeyFolder
 
     folder = KeyFolder(arguments.keys)

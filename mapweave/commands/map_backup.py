@@ -7,6 +7,8 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands.map_input import map_source
+from mapweave.commands.usage import UsageError
+from mapweave.hybridmap.errors import InvalidFile
 
 
 def add_to(actions: Any) -> None:
@@ -29,8 +31,6 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Copy it, and say how large it is."""
-    from mapweave.commands.usage import UsageError
-    from mapweave.hybridmap.errors import InvalidFile
     from mapweave.mapserver.store_backup import back_up
     from mapweave.opened_map import MapSource, source_of
     from mapweave.storage.database_copy import check_new

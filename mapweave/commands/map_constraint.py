@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mapweave.commands.map_input import SOURCES, map_source, opened
+from mapweave.commands.map_input import SOURCES, map_source, merge_progress, merged_with_progress, opened
 from mapweave.commands.network import (
     add_network,
     add_reason,
@@ -17,6 +17,8 @@ from mapweave.commands.network import (
     network_of,
     settings_of,
 )
+from mapweave.commands.usage import UsageError, arguments_read
+from mapweave.hybridmap.errors import InvalidFile
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.constraint_subject import Subject
@@ -48,7 +50,6 @@ def constrain(arguments: argparse.Namespace, about: Subject) -> None:
     Raises:
         MapweaveError: the constraint has no effect, or there is no place to keep it.
     """
-    from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.fleet import author
     from mapweave.fleet_questions import check_role
     from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
@@ -111,9 +112,7 @@ def _settled(arguments: argparse.Namespace) -> None:
 
 
 def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
-    from mapweave.commands.map_input import merge_progress, merged_with_progress
     from mapweave.hybridmap.annotation import Annotations
-    from mapweave.hybridmap.errors import InvalidFile
     from mapweave.hybridmap.manual_constraint import ManualConstraints, event_words
     from mapweave.mapserver.map_files import map_file_of
     from mapweave.mapserver.map_history import between

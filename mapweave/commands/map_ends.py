@@ -8,6 +8,7 @@ from collections.abc import Callable
 from functools import cache
 from typing import TYPE_CHECKING
 
+from mapweave.commands.map_input import router_of
 from mapweave.commands.network import key_holder, network_of, reach, settings_of
 from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.annotation import Annotations
@@ -66,7 +67,6 @@ def names_of(arguments: argparse.Namespace, router: Router | None = None) -> tup
                 decode(ask(arguments, Keys.any_resolve, encode(request))[0].payload, ResolveAnswer),
             ),
         )
-    from mapweave.commands.map_input import router_of
     from mapweave.mapserver.places import Places
 
     known = cache(lambda: router or router_of(arguments))
@@ -103,7 +103,6 @@ def explanation_of(
     """
     if arguments.map is None:
         return decode_explanation(ask(arguments, Keys.any_explain, encode(request))[0].payload, request)
-    from mapweave.commands.map_input import router_of
     from mapweave.mapserver.explanations import explained
 
     with refusals():

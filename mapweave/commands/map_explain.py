@@ -9,6 +9,7 @@ from typing import Any
 from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.commands.network import add_network, add_timeout
+from mapweave.commands.usage import UsageError
 
 
 def add_to(actions: Any) -> None:
@@ -34,7 +35,6 @@ def add_to(actions: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Ask, print, draw."""
     from mapweave.commands.map_ends import different_ends_of, explanation_of, resolved
-    from mapweave.commands.usage import UsageError
     from mapweave.explanation_text import maps_words, pair_words
     from mapweave.extras import need
     from mapweave.hybridmap.constraint_subject import EXAMPLE

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.map_input import SOURCES, map_source, opened
 from mapweave.commands.network import add_network, add_timeout
+from mapweave.commands.usage import UsageError
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.map_event import History
@@ -34,7 +35,6 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from mapweave.commands.usage import UsageError
     from mapweave.mapserver.http.json_values import json_values, time_of
 
     if arguments.most < 1:

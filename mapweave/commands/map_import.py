@@ -8,6 +8,9 @@ import math
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.usage import UsageError
+from mapweave.hybridmap.errors import InvalidFile
+
 
 def add_to(actions: Any) -> None:
     """Declare the action."""
@@ -33,10 +36,8 @@ def run(arguments: argparse.Namespace) -> int:
     import gtsam  # noqa: F401, where it is missing this says so before a file is read
     import numpy as np
 
-    from mapweave.commands.usage import UsageError
     from mapweave.formats.g2o import read_g2o, write_g2o
     from mapweave.formats.g2o_optimum import optimum_of
-    from mapweave.hybridmap.errors import InvalidFile
 
     if arguments.out.suffix == ".mapweave":
         raise UsageError(f"{arguments.out}: what is written is a pose graph, no map; end its name with .g2o")

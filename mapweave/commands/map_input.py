@@ -10,6 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapweave.commands.network import settings_of
+
 if TYPE_CHECKING:
     from mapweave.mapserver.routes import Router
     from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -56,7 +58,6 @@ def router_of(arguments: argparse.Namespace) -> Router:
     Raises:
         InvalidFile: it is none, or cannot be read.
     """
-    from mapweave.commands.network import settings_of
     from mapweave.hybridmap.annotation import Annotations
     from mapweave.mapserver.routes import Router
 

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from mapweave.commands.map_constraint import add_constraint_options, constrain
+from mapweave.commands.usage import UsageError, arguments_read
 
 
 def add_to(actions: Any) -> None:
@@ -31,7 +32,6 @@ def add_to(actions: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Set the constraint, and print its effect."""
     from mapweave.commands.map_ends import names_of, node_of
-    from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.hybridmap.constraint_subject import Linked, read_pose
     from mapweave.hybridmap.named_nodes import own_ids_of
 

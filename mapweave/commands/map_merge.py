@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands.map_input import SOURCES, map_source, merge_progress, opened
+from mapweave.commands.network import settings_of
 
 
 def add_to(actions: Any) -> None:
@@ -31,7 +32,6 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Merge, write, print the outcome."""
-    from mapweave.commands.network import settings_of
     from mapweave.mapserver.map_files import map_file_of
     from mapweave.merge.explanation.component_changes import joinings
     from mapweave.merge.explanation.map_explanation import explain_fleet

@@ -10,6 +10,7 @@ from typing import Any
 
 from mapweave.commands import values
 from mapweave.commands.network import add_network, add_timeout, connect, network_of, reach, settings_of
+from mapweave.hybridmap.errors import NotConnected
 
 
 def add_to(actions: Any) -> None:
@@ -43,7 +44,6 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.agent.recordings.camera_file import read_camera
     from mapweave.agent.recordings.image_folder import images_in
     from mapweave.hybridmap.change import NodePut
-    from mapweave.hybridmap.errors import NotConnected
     from mapweave.hybridmap.ids import MapId, check_name
     from mapweave.photographs import map_of_photographs, send_map
     from mapweave.storage.atomic_file import check_place

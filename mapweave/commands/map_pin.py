@@ -9,6 +9,7 @@ from typing import Any
 
 from mapweave.commands import values
 from mapweave.commands.annotating import add_record_options, record_of
+from mapweave.commands.usage import UsageError
 
 
 def add_to(actions: Any) -> None:
@@ -32,7 +33,6 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Pin a node, take a pin out, or list them."""
-    from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.query import ResolveRequest
 
     if arguments.node is None:
@@ -75,7 +75,6 @@ def _pose(word: str) -> list[float]:
     Raises:
         UsageError: it is no pose.
     """
-    from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.pin import FARTHEST
 
     try:

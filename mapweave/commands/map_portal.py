@@ -8,6 +8,7 @@ from typing import Any
 
 from mapweave.commands import values
 from mapweave.commands.annotating import add_record_options, add_remove, record_of
+from mapweave.commands.usage import UsageError
 
 KINDS = ("lift", "ramp", "door")
 
@@ -55,8 +56,6 @@ def add_to(actions: Any) -> None:
 
 def run_add(arguments: argparse.Namespace) -> int:
     """Add a portal."""
-    from mapweave.commands.usage import UsageError
-
     a = arguments
     if a.a == a.b:
         raise UsageError(f"{a.a} twice: a portal leads from one node to another")

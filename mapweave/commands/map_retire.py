@@ -7,6 +7,7 @@ import time
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.map_constraint import add_constraint_options, constrain
+from mapweave.commands.usage import UsageError, arguments_read
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.constraint_subject import Subject
@@ -49,7 +50,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _subject(arguments: argparse.Namespace) -> Subject:
     from mapweave.commands.map_ends import map_of, names_of, node_of
-    from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.hybridmap.area import Area, read_corner
     from mapweave.hybridmap.constraint_subject import RetiredArea, read_window
     from mapweave.hybridmap.named_nodes import own_ids_of, retired_of

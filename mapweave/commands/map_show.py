@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.refusals import check_component
 
 if TYPE_CHECKING:
@@ -48,7 +49,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     from mapweave.drawing.map_picture import MapPicture, draw_map
     from mapweave.extras import MissingExtra, need
-    from mapweave.hybridmap.errors import InvalidFile
     from mapweave.hybridmap.hybrid_map import HybridMap
     from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.hybridmap.node import EdgeKind

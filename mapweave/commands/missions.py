@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.network import add_author, add_network, network_of, settings_of
+from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
@@ -108,8 +109,6 @@ def fleet_of(arguments: argparse.Namespace) -> Fleet:
 
 def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -> int:
     """Give a mission, and wait for its end if that is wanted."""
-    from mapweave.commands.usage import UsageError
-
     if arguments.wait and not arguments.timeout > 0.0:
         raise UsageError(f"--timeout {arguments.timeout:g}: give seconds")
     _robot(arguments)
@@ -148,7 +147,6 @@ def run_missions(arguments: argparse.Namespace) -> int:
 
 def _robot(arguments: argparse.Namespace) -> str:
     """The robot that is named, or none."""
-    from mapweave.commands.usage import arguments_read
     from mapweave.hybridmap.ids import check_name
 
     with arguments_read():

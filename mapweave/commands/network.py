@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING
 
 from mapweave.commands import values
 from mapweave.connection import LOOK, SOON
+from mapweave.hybridmap.errors import SettingsError
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -108,7 +109,6 @@ def network_of(arguments: argparse.Namespace, settings: Settings, name: str = ""
     Raises:
         SettingsError: the key file is missing or damaged, or of another fleet or robot.
     """
-    from mapweave.hybridmap.errors import SettingsError
     from mapweave.identities.key_file import read_key_file
     from mapweave.settings import NetworkSettings
 
@@ -173,7 +173,6 @@ def router_settings(network: NetworkSettings, server: str) -> tuple[BusSettings,
     Raises:
         SettingsError: there are no keys in the folder, or none of this server.
     """
-    from mapweave.hybridmap.errors import SettingsError
     from mapweave.identities.key_folder import KeyFolder
     from mapweave.settings import NetworkSettings
     from mapweave.wire.bus_settings import BusSettings

@@ -14,6 +14,8 @@ from mapweave.commands.annotating import (
     area_fields,
     record_of,
 )
+from mapweave.commands.usage import UsageError, arguments_read
+from mapweave.hybridmap.errors import InvalidValue
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
@@ -67,7 +69,6 @@ def add_to(commands: Any) -> None:
 
 def run_add(arguments: argparse.Namespace) -> int:
     """Name a place."""
-    from mapweave.commands.usage import UsageError, arguments_read
     from mapweave.hybridmap.annotation import check_place_name
 
     with arguments_read():
@@ -106,7 +107,6 @@ def run_list(arguments: argparse.Namespace) -> int:
 
 def _where(record: Fleet | OfflineAnnotations, entry: Annotation) -> tuple[str | None, str]:
     """The node to which robots go, and what is to be said about it; None if there is none."""
-    from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.query import ResolveRequest
 
     try:

@@ -11,6 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.annotating import add_near, add_record_options, add_remove, record_of, two_numbers
+from mapweave.commands.network import settings_of
+from mapweave.commands.usage import UsageError
+from mapweave.hybridmap.errors import InvalidFile
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
@@ -97,9 +100,7 @@ def _add_component(parser: argparse.ArgumentParser) -> None:
 
 def run_add(arguments: argparse.Namespace) -> int:
     """Read the image, keep it, and say how it fits."""
-    from mapweave.commands.usage import UsageError
     from mapweave.formats.plan_export import plan_words
-    from mapweave.hybridmap.errors import InvalidFile
     from mapweave.storage.nav2_map import SUFFIXES, read_nav2_map
     from mapweave.storage.plan_image import read_plan_file
     from mapweave.wire.typed import packed
@@ -136,7 +137,6 @@ def run_add(arguments: argparse.Namespace) -> int:
 
 def run_show(arguments: argparse.Namespace) -> int:
     """Print, and draw."""
-    from mapweave.commands.usage import UsageError
     from mapweave.formats.plan_export import plan_words
     from mapweave.hybridmap.floor_plan import PlacedPlans
     from mapweave.mapserver.http.json_values import json_values
@@ -198,8 +198,6 @@ def _pair(word: str) -> dict[str, Any]:
     Raises:
         UsageError: it is none.
     """
-    from mapweave.commands.usage import UsageError
-
     place, equals, pixel = word.rpartition("=")
     position = two_numbers(pixel) if equals and place.strip() else None
     if position is None:
@@ -226,7 +224,6 @@ def _draw(record: Fleet | OfflineAnnotations, placed: PlacedPlan, arguments: arg
 
 
 def _merged(record: Fleet | OfflineAnnotations, arguments: argparse.Namespace) -> MergedMap:
-    from mapweave.commands.network import settings_of
     from mapweave.fleet import Fleet
     from mapweave.mapserver.map_files import merged_of
     from mapweave.terminal import Bar, plain_or_terminal

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from mapweave.commands import values
+from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_author, add_network
 
 
@@ -32,8 +33,6 @@ def add_to(commands: Any) -> None:
 
 def run_done(arguments: argparse.Namespace) -> int:
     """Tell the robot."""
-    from mapweave.commands.missions import fleet_of
-
     with fleet_of(arguments) as fleet:
         print(fleet.portal_done(arguments.robot))
     return 0

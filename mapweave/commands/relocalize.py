@@ -22,7 +22,9 @@ from mapweave.commands.network import (
     settings_of,
 )
 from mapweave.commands.plan import add_plan_option, plan_of, plan_place
+from mapweave.commands.usage import UsageError
 from mapweave.exit_status import DONE, NO
+from mapweave.hybridmap.errors import DeviceError, NotConnected, Refused
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -68,9 +70,7 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
     from mapweave.agent.recordings.camera_file import read_camera
-    from mapweave.commands.usage import UsageError
     from mapweave.drawing.match_picture import draw_matches
-    from mapweave.hybridmap.errors import DeviceError
     from mapweave.hybridmap.query import Certainty
     from mapweave.storage.image_file import read_grey
     from mapweave.vision.lens import Lens
@@ -147,7 +147,6 @@ def _by_map(arguments: argparse.Namespace, view: View) -> tuple[RelocalizeAnswer
 def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, patience: float) -> bytes:
     """Ask until a server answers; a busy server is asked again at its retry time."""
     from mapweave.connection import no_server
-    from mapweave.hybridmap.errors import NotConnected, Refused
 
     end = time.monotonic() + patience
     while True:
@@ -167,7 +166,6 @@ def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, pati
 
 def _node(bus: ZenohBus, keys: Keys, network: NetworkSettings, node_id: NodeId, patience: float) -> Node:
     """A node of the merged map: the beginning of the way from itself to itself."""
-    from mapweave.hybridmap.errors import NotConnected
     from mapweave.hybridmap.query import RouteAnswer, RouteRequest
     from mapweave.wire.messages import decode, encode
 

@@ -27,8 +27,10 @@ from mapweave.commands.network import (
     stop_on_signals,
     warn_without_router,
 )
+from mapweave.commands.usage import UsageError
 from mapweave.connection import SOON
 from mapweave.extras import need
+from mapweave.hybridmap.errors import InvalidFile
 
 DATA = Path("out/server")
 DEMO_HTTP = "8080"
@@ -88,8 +90,6 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Serve until stopped."""
-    from mapweave.commands.usage import UsageError
-
     # What is wrong on the command line is said before anything is loaded for a second.
     if arguments.demo and (arguments.data is not None or arguments.store is not None):
         raise UsageError("--demo keeps nothing: leave out --data and --store")
@@ -102,7 +102,6 @@ def run(arguments: argparse.Namespace) -> int:
 
     # Modules stay: looking among them for garbage took a sixth of the start.
     gc.disable()
-    from mapweave.hybridmap.errors import InvalidFile
     from mapweave.hybridmap.ids import check_name
     from mapweave.terminal import log_with_time, stamped
 

@@ -19,6 +19,7 @@ from mapweave.commands.network import (
     stop_on_signals,
     warn_without_router,
 )
+from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
@@ -208,8 +209,6 @@ def run_batch(arguments: argparse.Namespace) -> int:
 
 def run_serve(arguments: argparse.Namespace) -> int:
     """Serve the simulated robots until stopped."""
-    from mapweave.commands.usage import UsageError
-
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     if network.keys and not arguments.listen:
@@ -245,7 +244,6 @@ def _scenario(arguments: argparse.Namespace) -> Scenario:
         UsageError: there is none of this name, or what is to be changed is not in it.
         SettingsError: its file is wrong.
     """
-    from mapweave.commands.usage import arguments_read
     from mapweave.scenarios.scenario import load_scenario, scenario_path
 
     with arguments_read():

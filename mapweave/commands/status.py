@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, NoReturn
 from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_network
 from mapweave.commands.plan import add_plan_option
+from mapweave.hybridmap.errors import NotConnected
 
 if TYPE_CHECKING:
     from rich.console import RenderableType
@@ -64,7 +65,6 @@ def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
     from rich.live import Live
 
-    from mapweave.hybridmap.errors import NotConnected
     from mapweave.terminal import plain_or_terminal, stamped
 
     with fleet_of(arguments) as fleet:
@@ -94,8 +94,6 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _watch_json(fleet: Fleet, arguments: argparse.Namespace) -> NoReturn:
     """A line each time until interrupted; on stderr, once, why there is none for a while."""
-    from mapweave.hybridmap.errors import NotConnected
-
     said = ""
     while True:
         try:

@@ -10,11 +10,11 @@ import math
 from pathlib import Path
 
 from mapweave.commands.usage import UsageError
+from mapweave.hybridmap.errors import InvalidValue
 
 
 def name(text: str) -> str:
     """The name of a robot, server or fleet."""
-    from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.ids import check_name
 
     try:
@@ -45,7 +45,6 @@ def goal(text: str) -> str:
 def node(text: str) -> str:
     """A node, the name of a place or a position; the map says whether it is there."""
     from mapweave.hybridmap.constraint_subject import read_end
-    from mapweave.hybridmap.errors import InvalidValue
     from mapweave.hybridmap.ids import NodeId
 
     try:
