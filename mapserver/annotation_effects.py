@@ -8,6 +8,7 @@ import numpy as np
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor, Place, Preference
 from mapweave.hybridmap.area import Area
+from mapweave.hybridmap.counted import counted
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.route_rules import RouteRules
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -24,13 +25,13 @@ def effects_of(annotation: Annotation, places: Places) -> Iterator[str]:
         return
     match annotation.body:
         case Place(area=Area() as area):
-            yield f"{_counted(_nodes_in(area, places.merged), 'node')} in it"
+            yield f"{counted(_nodes_in(area, places.merged), 'node')} in it"
         case Closure() | Preference() as body:
             # A closure of tomorrow has no effect now: at its beginning it has the one that is meant.
             when = (body.begin_ns or 0) if isinstance(body, Closure) else annotation.stamp_ns
             rules = RouteRules(places.router.roads, Annotations((annotation,)), when)
             verb = "closes" if isinstance(body, Closure) else "holds for"
-            yield f"it {verb} {_counted(len(rules.closed or rules.factors), 'way')} of robots"
+            yield f"it {verb} {counted(len(rules.closed or rules.factors), 'way')} of robots"
         case Floor(node, label):
             floors = {**places.annotations.floors, node.map: label}
             apart = sum(
@@ -38,7 +39,7 @@ def effects_of(annotation: Annotation, places: Places) -> Iterator[str]:
                 for link in places.merged.links
             )
             if apart:
-                yield f"{_counted(apart, 'link')} between this map and maps on other floors"
+                yield f"{counted(apart, 'link')} between this map and maps on other floors"
     before = places.annotations.last(annotation.kind, annotation.name)
     if before is not None:
         yield f"it takes the place of: {before.words}"
@@ -50,7 +51,3 @@ def _nodes_in(area: Area, merged: MergedMap) -> int:
     graph = merged.graphs[number]
     points = merged.pose(area.anchor).inverse().apply(np.asarray(graph.means)[:, :2])
     return int(area.contains(points).sum())
-
-
-def _counted(count: int, what: str) -> str:
-    return f"1 {what}" if count == 1 else f"{count} {what}s"

@@ -12,6 +12,7 @@ from dataclasses import dataclass, field, replace
 
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import Change, ChangeBody, NodePut
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
@@ -61,7 +62,7 @@ class BaseMap:
     def __str__(self) -> str:
         """For example `office.mapweave: 120 nodes of 3 maps`."""
         nodes = sum(len(hybrid.nodes) for hybrid in self.maps.values())
-        return f"{self.name}: {nodes} nodes of {len(self.maps)} maps"
+        return f"{self.name}: {counted(nodes, 'node')} of {counted(len(self.maps), 'map')}"
 
     def nodes(self) -> Iterator[NodeId]:
         """Every node."""

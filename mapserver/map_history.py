@@ -10,6 +10,7 @@ from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import replace
 
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.limits import MAX_WORDS
@@ -207,10 +208,8 @@ def _kept_apart(merged: MergedMap, parts: Sequence[frozenset[MapId]]) -> dict[Pa
         out[first, second] = wrong.reason
     for (first, second), counts in sorted(reasons.items()):
         count = sum(counts.values())
-        links = "1 link" if count == 1 else f"{count} links"
-        out[first, second] = (
-            f"{first} and {second} are kept apart: {links} refused ({counts.most_common(1)[0][0]})"
-        )
+        refused = f"{counted(count, 'link')} refused ({counts.most_common(1)[0][0]})"
+        out[first, second] = f"{first} and {second} are kept apart: {refused}"
     return out
 
 

@@ -10,6 +10,7 @@ from functools import partial
 from itertools import islice
 
 from mapweave.hybridmap.change import Change, NodePut
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
@@ -291,7 +292,7 @@ class MergeWorker:
 
     def _search_pairs(self) -> None:
         """A part of the work before the first merge, which must not hold up new changes."""
-        self._problem = f"{self._merger.uncompared} nodes are still to be compared with others"
+        self._problem = f"still to be compared with others: {counted(self._merger.uncompared, 'node')}"
         try:
             self._merger.search_pairs(SEARCHES_AT_ONCE)
         except Exception:  # the merge tries again, and reports if it cannot

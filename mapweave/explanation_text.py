@@ -10,6 +10,7 @@ from datetime import UTC, datetime
 import numpy as np
 
 from mapweave.hybridmap.constraint_subject import Apart, Linked
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.explanation import (
     ALIASED,
     Hop,
@@ -103,8 +104,8 @@ def maps_words(explanation: MapsExplanation) -> list[str]:
     lines = [explanation.reason]
     if explanation.refused or explanation.unverified:
         lines.append(
-            f"  {explanation.refused} links refused, "
-            f"{explanation.unverified} candidate pairs without a common pose"
+            f"  {counted(explanation.refused, 'link')} refused, "
+            f"{counted(explanation.unverified, 'candidate pair')} without a common pose"
         )
     if explanation.nearest:
         lines.append("  weakest links:" if explanation.joined else "  nearest to a link:")

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from mapweave.evaluation.map_score import align
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import event_words
 from mapweave.hybridmap.pose import wrap_angle
@@ -104,10 +105,10 @@ class MapDifference:
             if items:
                 more = f" and {len(items) - NAMED} more" if len(items) > NAMED else ""
                 listed = ", ".join(str(item) for item in items[:NAMED])
-                lines.append(f"{len(items)} {noun}{'s' * (len(items) > 1)} {what}: {listed}{more}")
+                lines.append(f"{counted(len(items), noun)} {what}: {listed}{more}")
         lines += [
-            f"{m.nodes} nodes moved by {m.median:.3f} m (median), at most {m.largest:.3f} m ({m.node}), "
-            f"turned by at most {math.degrees(m.turn):.1f} degrees"
+            f"{counted(m.nodes, 'node')} moved by {m.median:.3f} m (median), "
+            f"at most {m.largest:.3f} m ({m.node}), turned by at most {math.degrees(m.turn):.1f} degrees"
             for m in self.moved
             if m.largest >= 0.001 or m.turn >= 0.001
         ]

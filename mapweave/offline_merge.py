@@ -184,8 +184,10 @@ def merge_map_files(paths: Iterable[str | PathLike[str]]) -> MapFile:
 
     Raises:
         InvalidFile: a file cannot be read, or two hold different maps of one name.
-        InvalidValue: a map cannot be merged.
+        InvalidValue: a map cannot be merged, or one path is given in the place of a list.
     """
+    if isinstance(paths, (str, PathLike)):
+        raise InvalidValue(f"give a list of map files, such as [{str(paths)!r}], not one path")
     parts = parts_of({Path(path): read_map_file(Path(path)) for path in paths})
     merged = parts.merged()
     return map_file_of(merged, parts.history, parts.annotations, parts.images)

@@ -6,6 +6,7 @@ from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.entry import Entry
@@ -135,7 +136,7 @@ class Intake:
                 self._edges_left -= 1
                 if self._edges_left < 0 and (edges := self._count_edges(len(edges_here))):
                     self._edges_left = 0
-                    reason = f"{self._agent} has {edges} edges here, which is its quota: {RETIRE}"
+                    reason = f"{self._agent} has {counted(edges, 'edge')} here, which is its quota: {RETIRE}"
                     return count, Full("nodes", reason)
             if isinstance(entry.change, Change) and isinstance(entry.change.body, NodePut):
                 node = entry.change.body.node
@@ -143,7 +144,7 @@ class Intake:
                 nodes = self._nodes + (before is None)
                 landmarks = self._landmarks + len(node.landmarks) - (before or 0)
                 if nodes > settings.nodes or landmarks > settings.landmarks:
-                    what = f"{self._nodes} nodes with {self._landmarks} landmarks"
+                    what = f"{counted(self._nodes, 'node')} with {counted(self._landmarks, 'landmark')}"
                     return count, Full("nodes", f"{self._agent} has {what} here, {QUOTA} `nodes`")
                 self._nodes, self._landmarks = nodes, landmarks
                 added[node.id] = len(node.landmarks)
@@ -195,4 +196,4 @@ class Intakes:
         kept = sum(other.agent == map_id.agent and other not in retired for other in known)
         if kept < self._quotas.settings.maps:
             return ""
-        return f"{map_id.agent} has {kept} maps here, {QUOTA} `maps`"
+        return f"{map_id.agent} has {counted(kept, 'map')} here, {QUOTA} `maps`"

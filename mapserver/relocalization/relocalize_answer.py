@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import PoseGaussian, wrap_angle
@@ -148,7 +149,7 @@ def _rivalry(rivals: Sequence[PlaceHypothesis], merged: MergedMap) -> str:
     words = f"it may be {names}: they explain {most} to {least} features"
     around = max(place.nodes_around for place in rivals)
     if around:
-        words += f", and {around} nodes around them look the same"
+        words += f", and {counted(around, 'node')} around them {'looks' if around == 1 else 'look'} the same"
     if any(between(merged, rivals[0].best.node, place.best.node) is None for place in rivals):
         words += ", and nothing joins their parts of the map yet"
     return words

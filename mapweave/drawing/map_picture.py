@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.drawing.names import Name, draw_names
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Array, Pose2
@@ -363,7 +364,7 @@ def _draw_nodes(axes: Any, picture: MapPicture, colours: Mapping[str, str]) -> N
                 own[:, 0], own[:, 1], np.cos(own[:, 2]), np.sin(own[:, 2]), color=colour,
                 angles=np.degrees(own[:, 2]), scale=1.0 / ARROW, width=0.0022, headwidth=4, zorder=3,
             )  # fmt: skip
-        label = f"{agent}: {len(own)} nodes"
+        label = f"{agent}: {counted(len(own), 'node')}"
         size = 2 if crowded else 4
         axes.plot(own[:, 0], own[:, 1], "o", color=colour, markersize=size, zorder=3, label=label)
 

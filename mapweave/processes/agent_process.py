@@ -16,6 +16,7 @@ from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.pipeline import Step
 from mapweave.agent.settings import AgentSettings
 from mapweave.extras import need
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.processes.agent_progress import AgentProgress
@@ -91,14 +92,16 @@ def run_agent(
                 path = agent.write_map()
                 nodes, edges = len(agent.pipeline.map.nodes), len(agent.pipeline.map.edges)
                 why = agent.runner.why_no_node if options.recorded and not nodes else ""
-                say(f"{options.name}: {nodes} nodes and {edges} edges in {path}{'; ' * bool(why)}{why}")
+                what = f"{counted(nodes, 'node')} and {counted(edges, 'edge')}"
+                say(f"{options.name}: {what} in {path}{'; ' * bool(why)}{why}")
             finally:
                 # The journal is complete also where a full disk takes no map file.
                 _hand_over(say, agent, bus, options)
                 agent.close()
         status = agent.replicator.status()
         if status.waiting:
-            raise InvalidFile(f"{options.name}: {status.waiting} changes are lost: {status.failure}")
+            lost = f"{counted(status.waiting, 'change')} {'is' if status.waiting == 1 else 'are'} lost"
+            raise InvalidFile(f"{options.name}: {lost}: {status.failure}")
 
 
 def rerun_log(target: str, robot: str) -> RerunLog:

@@ -10,6 +10,7 @@ from rich.console import Console
 
 from mapweave.agent.observation import Observation
 from mapweave.agent.pipeline import Step
+from mapweave.hybridmap.counted import counted
 from mapweave.terminal import Bar, EventLog
 
 BURST, A_SECOND = 20.0, 1.0
@@ -54,14 +55,14 @@ class AgentProgress:
         """Show a tick."""
         status = step.status
         if self._bar is not None:
-            self._bar.advance(1, f"{status.nodes} nodes, {status.detail}")
+            self._bar.advance(1, f"{counted(status.nodes, 'node')}, {status.detail}")
             return
         self._changes += status.doing != self._doing
         self._doing = status.doing
         if status.doing != self._said and self._may_say():
             also = f" ({self._changes - 1} changes before are left out)" if self._changes > 1 else ""
             self._said, self._changes = status.doing, 0
-            self._say(f"{self._name}: {status.doing} ({status.nodes} nodes) {status.detail}{also}")
+            self._say(f"{self._name}: {status.doing} ({counted(status.nodes, 'node')}) {status.detail}{also}")
 
     def _may_say(self) -> bool:
         """Whether there have not been too many lines recently; takes one of those that may come."""

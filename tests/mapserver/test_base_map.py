@@ -71,6 +71,11 @@ def wanted(*maps: MapId) -> dict[MapId, list[bytes]]:
     return {map_id: sorted(map(encode_body, LOGS[map_id])) for map_id in maps}
 
 
+def test_a_small_base_map_in_words() -> None:
+    (first, *_) = [body for body in LOGS[R0] if isinstance(body, NodePut)]
+    assert str(BaseMap("a.mapweave", {R0: HybridMap([first])})) == "a.mapweave: 1 node of 1 map"
+
+
 def test_a_robot_that_begins_anywhere_joins_the_map_that_is_there(tmp_path: Path) -> None:
     with serving(tmp_path, BASE) as (server, hub):
         assert contents(server) == wanted(R0, R1) and server.status()["components"] == 1

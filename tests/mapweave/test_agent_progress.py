@@ -33,3 +33,11 @@ def test_a_robot_that_changes_its_mind_each_tick_does_not_fill_the_log() -> None
         now += 0.1
         tick("lost")
     assert "r0: lost (0 nodes)" in output.getvalue().splitlines()[-1], "what it does in the end is said"
+
+
+def test_one_node_is_no_nodes() -> None:
+    output = io.StringIO()
+    show = AgentProgress(Console(file=output, width=200), "r0", None, lambda: 0.0)
+    status = Status("mapping", "", 1, 0, Pose2(), False)
+    show(Observation(0, Odometry(0.0, 0.0)), Step(Command(), (), (), status))
+    assert "r0: mapping (1 node)" in output.getvalue()

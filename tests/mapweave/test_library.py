@@ -148,6 +148,12 @@ def test_maps_are_written_read_merged_and_say_where_a_view_was_taken(tmp_path: P
     assert mapweave.relocalizer_of(read).answer(view).certainty is mapweave.Certainty.UNKNOWN
 
 
+def test_one_path_is_no_list_of_map_files(tmp_path: Path) -> None:
+    for one in ("one.mapweave", tmp_path / "one.mapweave"):
+        with pytest.raises(mapweave.MapweaveError, match="give a list of map files, such as"):
+            mapweave.merge_map_files(one)  # type: ignore[arg-type]
+
+
 def test_a_path_may_be_text(tmp_path: Path) -> None:
     """As of `mapweave.open`; what is wrong with one is an error of one line."""
     at = str(tmp_path / "empty.mapweave")

@@ -1,7 +1,7 @@
 // What can be changed by a form: each kind of edit with its fields, and the request that it makes of the selection.
 // A further kind is one more entry.
 const lacks = words => { throw new Error(words); };
-const plural = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
+export const plural = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
 
 function nodes({ names, area }, count, what) {
   if (area) lacks(`${what} is about nodes: select them on the map or type them above, not an area.`);
