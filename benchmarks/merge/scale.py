@@ -17,10 +17,10 @@ import numpy as np
 from rich.progress import Progress, TaskID
 
 from benchmarks.process_usage import resident_mb
+from mapweave.evaluation.map_score import align
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.building import Building
@@ -34,6 +34,8 @@ EVERY = 5
 """Nodes from merge to merge: as many robots make a node each in a second or two."""
 TRUE = 0.5
 """A link that is off by less than this is true, m."""
+SAMPLE = 2000
+"""Nodes whose error is measured."""
 
 Figures = dict[str, float]
 
@@ -154,14 +156,10 @@ def _off(building: Building, merged: MergedMap, a: NodeId, b: NodeId) -> float:
     return found.distance(building.world_from(a).inverse() @ building.world_from(b))
 
 
-def _error(building: Building, merged: MergedMap, sample: int = 2000) -> float:
+def _error(building: Building, merged: MergedMap) -> float:
     """Median position error in the largest component after a rigid alignment to the truth, m."""
     nodes = sorted(merged.components[0])
-    nodes = nodes[:: max(len(nodes) // sample, 1)]
+    nodes = nodes[:: max(len(nodes) // SAMPLE, 1)]
     found = np.array([[merged.pose(node).x, merged.pose(node).y] for node in nodes])
     true = np.array([[building.world_from(node).x, building.world_from(node).y] for node in nodes])
-    middle, true_middle = found.mean(axis=0), true.mean(axis=0)
-    cross = (found - middle).T @ (true - true_middle)
-    turn = float(np.arctan2(cross[0, 1] - cross[1, 0], cross[0, 0] + cross[1, 1]))
-    aligned = Pose2(0.0, 0.0, turn).apply(found - middle) + true_middle
-    return float(np.median(np.hypot(*(aligned - true).T)))
+    return float(np.median(np.hypot(*(align(found, true).apply(found) - true).T)))

@@ -175,12 +175,6 @@ def test_places_that_cannot_be_written(tmp_path, capfd, recording, closed):
 
 def one_node():
     """A map of one place."""
-    from mapweave.hybridmap.camera import Camera
-    from mapweave.hybridmap.change import NodePut
-    from mapweave.hybridmap.ids import NodeId
-    from mapweave.hybridmap.node import Landmarks, Node
-    from mapweave.hybridmap.pose import Pose2, PoseGaussian
-
     camera = Camera(64, 48, 60, 60, 32, 24, 0.3)
     here = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
     return (NodePut(Node(NodeId("r0", 1, 1), 0, here, camera, Landmarks.empty())),)

@@ -10,8 +10,10 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import closing
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import IO
 
 import cv2
 import numpy as np
@@ -157,25 +159,26 @@ def test_asking_about_an_image(capfd, recording, tmp_path, closed):
     )
 
 
-def test_an_agent_interrupted_before_its_base_answers_reports_it(closed, tmp_path):
-    command = [
-        sys.executable,
-        "-m",
-        "mapweave",
-        "agent",
-        "r0",
-        "--connect",
-        closed,
-        "--data",
-        str(tmp_path),
-    ]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, text=True) as process:
-        watchdog = threading.Timer(40, process.kill)
+@contextmanager
+def started(*words: object, seconds: float = 40) -> Iterator[tuple[subprocess.Popen[str], IO[str]]]:
+    """A `mapweave` process, which is killed after this time, and its stderr."""
+    command = [sys.executable, "-m", "mapweave", *map(str, words)]
+    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
+        watchdog = threading.Timer(seconds, process.kill)
         watchdog.start()
+        assert process.stderr is not None
+        try:
+            yield process, process.stderr
+        finally:
+            watchdog.cancel()
+            process.kill()
+
+
+def test_an_agent_interrupted_before_its_base_answers_reports_it(closed, tmp_path):
+    with started("agent", "r0", "--connect", closed, "--data", tmp_path) as (process, _):
         eventually(lambda: (tmp_path / "r0.sqlite").exists())
         process.send_signal(signal.SIGINT)
         _, output = process.communicate()
-        watchdog.cancel()
     *before, last = output.splitlines()
     assert last.endswith("robot/r0/describe: stopped before its base has answered")
     known = ("waits for its robot", "finds no router", "no answer yet; start the robot's base")
@@ -194,19 +197,14 @@ def test_an_agent_interrupted_before_its_base_answers_reports_it(closed, tmp_pat
     ],
 )  # fmt: skip
 def test_waiting_is_reported_with_its_reason(command, hints, closed, tmp_path):
-    data = ["--data", str(tmp_path)] if command[0] == "agent" else []
-    whole = [sys.executable, "-m", "mapweave", *command, "--connect", closed, *data]
-    with subprocess.Popen(whole, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as process:
-        watchdog = threading.Timer(40, process.kill)
-        watchdog.start()
-        assert process.stderr is not None
-        for line in process.stderr:
+    data = ["--data", tmp_path] if command[0] == "agent" else []
+    with started(*command, "--connect", closed, *data) as (process, stderr):
+        for line in stderr:
             hints = {hint for hint in hints if hint.format(closed=closed) not in line}
             if not hints:
                 break
         process.send_signal(signal.SIGINT)
         process.communicate()
-        watchdog.cancel()
     assert not hints
 
 
@@ -214,37 +212,26 @@ def test_a_router_that_lets_no_one_in_without_a_key_is_no_missing_router(tmp_pat
     """It said to start a server, and that was running, with keys."""
     with socket.create_server(("127.0.0.1", 0)) as there:
         endpoint = f"tcp/127.0.0.1:{there.getsockname()[1]}"
-        words = ["agent", "r0", "--connect", endpoint, "--data", str(tmp_path)]
-        command = [sys.executable, "-m", "mapweave", *words]
-        with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as agent:
-            watchdog = threading.Timer(40, agent.kill)
-            watchdog.start()
-            assert agent.stderr is not None
-            lines = (line for line in agent.stderr if "finds no router" in line)
-            said = next(lines, "")
+        with started("agent", "r0", "--connect", endpoint, "--data", tmp_path) as (agent, stderr):
+            said = next((line for line in stderr if "finds no router" in line), "")
             agent.send_signal(signal.SIGINT)
             # Else the agent ends only when Zenoh gives up the attempt to connect, after 10 s.
             there.close()
             agent.communicate()
-            watchdog.cancel()
     assert f"r0 finds no router at {endpoint}: what listens there does not let this in" in said
     assert "--keys FILE" in said and "start `mapweave server`" not in said
 
 
 def test_a_router_that_is_found_after_all_is_reported_once(closed, tmp_path):
     """The line that there is none was the last word, though the agent had long been connected."""
-    command = [sys.executable, "-m", "mapweave", "agent", "r0", "--connect", closed, "--data", str(tmp_path)]
-    with subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as agent:
-        watchdog = threading.Timer(60, agent.kill)
-        watchdog.start()
-        assert agent.stderr is not None
-        lines = (line for line in agent.stderr if " a router" in line or "finds no router" in line)
+    words = "agent", "r0", "--connect", closed, "--data", tmp_path
+    with started(*words, seconds=60) as (agent, stderr):
+        lines = (line for line in stderr if " a router" in line or "finds no router" in line)
         assert "r0 finds no router" in next(lines, "")
         with closing(ZenohBus(BusSettings(mode="router", listen=(closed,)))):
             assert next(lines, "").rstrip().endswith("r0 has found a router")
             agent.send_signal(signal.SIGINT)
             assert not [line for line in lines if "router" in line]
-        watchdog.cancel()
 
 
 def test_a_router_that_is_lost_for_long_is_reported(closed, capfd, monkeypatch):
@@ -272,19 +259,11 @@ def test_the_own_certificate_that_has_expired_is_named_by_an_agent(tmp_path, clo
     """It said only that what listens there does not let it in."""
     path, at = expired_key(tmp_path / "keys"), closed.replace("tcp", "tls")
     router, _ = network.router_settings(NetworkSettings(endpoints=(at,), keys=str(tmp_path / "keys")), "s0")
-    words = ["agent", "r0", "--keys", str(path), "--connect", at, "--data", str(tmp_path)]
-    command = [sys.executable, "-m", "mapweave", *words]
-    with (
-        closing(ZenohBus(router)),
-        subprocess.Popen(command, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True) as agent,
-    ):
-        watchdog = threading.Timer(40, agent.kill)
-        watchdog.start()
-        assert agent.stderr is not None
-        said = next((line for line in agent.stderr if "finds no router" in line), "")
+    words = "agent", "r0", "--keys", path, "--connect", at, "--data", tmp_path
+    with closing(ZenohBus(router)), started(*words) as (agent, stderr):
+        said = next((line for line in stderr if "finds no router" in line), "")
         agent.send_signal(signal.SIGINT)
         agent.communicate()
-        watchdog.cancel()
     assert EXPIRED in said
     assert "`mapweave keys add r0 --role robot` at the server" in said
 

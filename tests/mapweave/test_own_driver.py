@@ -54,29 +54,28 @@ class Started:
         return self.process.wait(30)
 
 
-def settings(folder: Path, name: str) -> Path:
-    path = folder / f"{name}.toml"
-    path.write_text(f'[robot.options]\nlog = "{folder / name}.log"\n')
-    return path
+def started_agent(folder: Path, name: str, endpoint: str, driver: str) -> Started:
+    """An agent `r0` with this driver, which writes into `name`.log."""
+    program, settings = folder / "still.py", folder / f"{name}.toml"
+    program.write_text(driver)
+    settings.write_text(f'[robot.options]\nlog = "{folder / name}.log"\n')
+    return Started(
+        folder, name, "agent", "r0", "--robot", f"{program}:Still", "--connect", endpoint,
+        "--settings", settings, "--data", folder / name, "--epoch", "1",
+    )  # fmt: skip
 
 
 @pytest.mark.slow
 def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path: Path) -> None:
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    driver = tmp_path / "still.py"
-    driver.write_text(DRIVER.replace("{stamp}", "time.time_ns()"))
     router = Started(tmp_path, "router", "router", "--listen", endpoint)
     started = [router]
     try:
         eventually(lambda: router.says(f"router listens at {endpoint}"))
 
         def agent(name: str) -> Started:
-            started.append(
-                Started(
-                    tmp_path, name, "agent", "r0", "--robot", f"{driver}:Still", "--connect", endpoint,
-                    "--settings", settings(tmp_path, name), "--data", tmp_path / name, "--epoch", "1",
-                )
-            )  # fmt: skip
+            driver = DRIVER.replace("{stamp}", "time.time_ns()")
+            started.append(started_agent(tmp_path, name, endpoint, driver))
             return started[-1]
 
         first = agent("first")
@@ -110,12 +109,7 @@ def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path:
     [("time.time()", "stamp_ns .* whole nanoseconds"), ("7", "stamp_ns stands still at 7")],
 )
 def test_a_mistake_of_the_driver_is_one_line(stamp: str, words: str, tmp_path: Path, closed: str) -> None:
-    driver = tmp_path / "still.py"
-    driver.write_text(DRIVER.replace("{stamp}", stamp))
-    agent = Started(
-        tmp_path, "agent", "agent", "r0", "--robot", f"{driver}:Still", "--connect", closed,
-        "--settings", settings(tmp_path, "agent"), "--data", tmp_path / "data", "--epoch", "1",
-    )  # fmt: skip
+    agent = started_agent(tmp_path, "agent", closed, DRIVER.replace("{stamp}", stamp))
     assert agent.process.wait(60) == 1
     *_, last = agent.said.read_text().splitlines()
     assert re.match(f"mapweave: driver: {words}", last), last
@@ -125,12 +119,7 @@ def test_a_mistake_of_the_driver_is_one_line(stamp: str, words: str, tmp_path: P
 @pytest.mark.slow
 def test_a_driver_that_hangs_does_not_keep_the_process(tmp_path: Path, closed: str) -> None:
     hangs = DRIVER.replace("time.sleep(0.1)", "print('hangs', file=self.log); time.sleep(1000)")
-    driver = tmp_path / "still.py"
-    driver.write_text(hangs.replace("{stamp}", "time.time_ns()"))
-    agent = Started(
-        tmp_path, "agent", "agent", "r0", "--robot", f"{driver}:Still", "--connect", closed,
-        "--settings", settings(tmp_path, "agent"), "--data", tmp_path / "data", "--epoch", "1",
-    )  # fmt: skip
+    agent = started_agent(tmp_path, "agent", closed, hangs.replace("{stamp}", "time.time_ns()"))
     try:
         log = tmp_path / "agent.log"
         eventually(lambda: log.exists() and "hangs" in log.read_text())

@@ -205,14 +205,33 @@ def test_a_name_is_that_of_one_server(postgres: PostgresServer, tmp_path: Path) 
             process.wait()
 
 
+def need_programs(*names: str) -> None:
+    """Skip where PostgreSQL comes without one of its programs."""
+    folder = binaries()
+    if folder is None or not all((folder / name).exists() for name in names):
+        pytest.skip(f"this PostgreSQL comes without {', '.join(names)}")
+
+
+def dumped(postgres: PostgresServer, database: str) -> str:
+    """The file of a backup."""
+    dump = str(postgres.folder / f"{database}.dump")
+    postgres.run("pg_dump", "--format=custom", "--file", dump, database)
+    return dump
+
+
+def restore(postgres: PostgresServer, database: str, dump: str) -> None:
+    with psycopg.connect(postgres.address(), autocommit=True) as people:
+        people.execute(f"DROP DATABASE {database}")
+        people.execute(f"CREATE DATABASE {database}")
+    postgres.run("pg_restore", "--exit-on-error", "--dbname", database, dump)
+
+
 @pytest.mark.slow
 def test_what_a_robot_retired_after_a_backup_goes_when_that_is_restored(
     postgres: PostgresServer, tmp_path: Path
 ) -> None:
     """The robot has dropped the retirement, since the server had it."""
-    folder = binaries()
-    if folder is None or not all((folder / name).exists() for name in ("pg_dump", "pg_restore", "psql")):
-        pytest.skip("this PostgreSQL comes without pg_dump, pg_restore and psql")
+    need_programs("pg_dump", "pg_restore", "psql")
     address, hub = postgres.database(), MemoryHub()
     database = str(psycopg.conninfo.conninfo_to_dict(address)["dbname"])
     server = FrontServer(hub, address, "s0")
@@ -221,18 +240,14 @@ def test_what_a_robot_retired_after_a_backup_goes_when_that_is_restored(
     robot = Replicator(MemoryBus(hub), KEYS, journal, map_id, ("s0",), AGENT)
     robot.submit([node(map_id, number, rng) for number in range(1, 6)], 1)
     assert robot.wait_acknowledged(60)
-    dump = str(postgres.folder / f"{database}.dump")
-    postgres.run("pg_dump", "--format=custom", "--file", dump, database)
+    dump = dumped(postgres, database)
     robot.submit([NodeRetired(NodeId(*map_id, 2)), node(map_id, 6, rng)], 2)
     assert robot.wait_acknowledged(60)
     now = content_hash(open_map(address).content)
     assert journal.prune(map_id, ["s0"]) == 2
     server.close()
 
-    with psycopg.connect(postgres.address(), autocommit=True) as people:
-        people.execute(f"DROP DATABASE {database}")
-        people.execute(f"CREATE DATABASE {database}")
-    postgres.run("pg_restore", "--exit-on-error", "--dbname", database, dump)
+    restore(postgres, database, dump)
     page = (Path(__file__).parents[2] / "docs" / "operations.md").read_text()
     (command,) = re.findall(r"^\$ sudo -u postgres psql maps -c '(INSERT .*)'$", page, re.MULTILINE)
     postgres.run("psql", "--dbname", database, "--set", "ON_ERROR_STOP=1", "-c", command)
@@ -249,9 +264,7 @@ def test_a_restored_backup_has_the_map_and_robots_add_what_is_newer(
     postgres: PostgresServer, tmp_path: Path
 ) -> None:
     """The drill of docs/operations.md, by its own commands."""
-    folder = binaries()
-    if folder is None or not all((folder / name).exists() for name in ("pg_dump", "pg_restore")):
-        pytest.skip("this PostgreSQL comes without pg_dump and pg_restore")
+    need_programs("pg_dump", "pg_restore")
     address, hub = postgres.database(), MemoryHub()
     database = str(psycopg.conninfo.conninfo_to_dict(address)["dbname"])
     server = FrontServer(hub, address, "s0")
@@ -262,17 +275,13 @@ def test_a_restored_backup_has_the_map_and_robots_add_what_is_newer(
     robot.submit(bodies[:20], 1)
     assert robot.wait_acknowledged(60)
     then = content_hash(open_map(address).content)
-    dump = str(postgres.folder / f"{database}.dump")
-    postgres.run("pg_dump", "--format=custom", "--file", dump, database)
+    dump = dumped(postgres, database)
     robot.submit(bodies[20:], 2)
     assert robot.wait_acknowledged(60)
     now, store_id = content_hash(open_map(address).content), server.store.id
     server.close()
 
-    with psycopg.connect(postgres.address(), autocommit=True) as people:
-        people.execute(f"DROP DATABASE {database}")
-        people.execute(f"CREATE DATABASE {database}")
-    postgres.run("pg_restore", "--exit-on-error", "--dbname", database, dump)
+    restore(postgres, database, dump)
 
     assert content_hash(open_map(address).content) == then != now
     server = FrontServer(hub, address, "s0")

@@ -20,13 +20,18 @@ UNITS = sorted((Path(__file__).parents[2] / "examples" / "systemd").glob("*.serv
 INSTALLED = "/opt/mapweave/bin/mapweave"
 
 
-@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
-def test_systemd_has_nothing_to_say_about_a_unit(unit: Path, tmp_path: Path) -> None:
+def analyzed(unit: Path, folder: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    """What systemd-analyze says about a copy of a unit."""
     if shutil.which("systemd-analyze") is None:
         pytest.skip("needs systemd-analyze")
-    copy = tmp_path / unit.name.replace("@", "@r0")
+    copy = folder / unit.name.replace("@", "@r0")
     copy.write_text(unit.read_text().replace(INSTALLED, "/bin/true"))
-    done = subprocess.run(["systemd-analyze", "verify", copy], capture_output=True, text=True, check=False)
+    return subprocess.run(["systemd-analyze", *words, copy], capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
+def test_systemd_has_nothing_to_say_about_a_unit(unit: Path, tmp_path: Path) -> None:
+    done = analyzed(unit, tmp_path, "verify")
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
 
@@ -72,12 +77,7 @@ def test_it_is_hardened_and_writes_only_where_it_may(unit: Path) -> None:
 
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
 def test_systemd_finds_little_exposure(unit: Path, tmp_path: Path) -> None:
-    if shutil.which("systemd-analyze") is None:
-        pytest.skip("needs systemd-analyze")
-    copy = tmp_path / unit.name.replace("@", "@r0")
-    copy.write_text(unit.read_text().replace(INSTALLED, "/bin/true"))
-    command = ["systemd-analyze", "security", "--offline=true", "--threshold=20", "--no-pager", copy]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    done = analyzed(unit, tmp_path, "security", "--offline=true", "--threshold=20", "--no-pager")
     assert done.returncode == 0, done.stdout[-300:] + done.stderr
 
 

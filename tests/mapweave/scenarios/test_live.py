@@ -158,10 +158,7 @@ def test_closing_frees_the_port_and_ends_the_threads():
     assert next_part(viewer) is None
     with Live(urlsplit(live.url).port) as again:
         assert again.url == live.url
-    end = time.monotonic() + 30
-    while any(t.name == "live" for t in threading.enumerate()) and time.monotonic() < end:
-        time.sleep(0.01)
-    assert not any(t.name == "live" for t in threading.enumerate())
+    eventually(lambda: not any(t.name == "live" for t in threading.enumerate()))
 
 
 def test_waiting_for_a_frame_that_never_comes_ends(live):
