@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
 
 from mapweave.connection import ANSWERED, reach
 from mapweave.fleet_annotations import FleetAnnotations
@@ -177,9 +176,7 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         """Nothing more to do."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Disconnect."""
         self.close()
 

@@ -7,7 +7,6 @@ from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import cached_property
 from importlib.metadata import version
-from types import TracebackType
 from typing import NoReturn
 
 from mapweave.hybridmap.agent_status import FleetStatus
@@ -61,9 +60,7 @@ class ReadOnlyServer:
         """Nothing is left to do."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop answering."""
         self._admission.close()
         self._background.shutdown(cancel_futures=True)

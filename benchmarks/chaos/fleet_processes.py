@@ -15,7 +15,6 @@ import time
 from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
-from types import TracebackType
 
 from benchmarks.chaos.agent_process import ENOUGH, FLEET, Orders
 from benchmarks.chaos.lossy_link import Link, Links
@@ -70,9 +69,7 @@ class FleetProcesses:
         """Nothing runs yet."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """End all that runs."""
         for name in list(self._running):
             self.kill(name)

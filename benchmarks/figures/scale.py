@@ -184,7 +184,7 @@ def scale_page(results: Mapping[str, Result]) -> str:
     plan, head = Plan.of(costs), ("what", "formula", "figure", "basis")
     parts = [
         "# Plan for 10 000 robots", INTRODUCTION,
-        "## What one of each costs", _table(("what", "cost", "from", "basis"), _costs(costs, results)),
+        "## What one of each costs", _table(("what", "cost", "from", "basis"), _costs(costs)),
         "## The fleet", _table(("what", "", "", "basis"), _fleet_rows()),
         "## One site", _table(head, _site(costs, plan)),
         "## All sites", _table(head, _all(plan)), ALONE,
@@ -199,7 +199,7 @@ def _table(head: Row, rows: list[Row]) -> str:
     return "\n".join([*lines, *(f"| {' | '.join(row)} |" for row in rows)])
 
 
-def _costs(costs: Costs, results: Mapping[str, Result]) -> list[Row]:
+def _costs(costs: Costs) -> list[Row]:
     here = "encoded"
     return [
         ("a node with 150 landmarks on the wire", f"{costs.node_bytes:.0f} bytes", "landmarks", MEASURED),

@@ -12,7 +12,6 @@ import time
 from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
-from types import TracebackType
 
 from mapweave.scenarios.children import free_port
 
@@ -57,9 +56,7 @@ class RayNodes:
             raise
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """End all that was started here."""
         for node in self._nodes[::-1]:
             self._end(node)

@@ -7,7 +7,6 @@ import threading
 import time
 from contextlib import closing
 from pathlib import Path
-from types import TracebackType
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.change import ChangeBody
@@ -80,9 +79,7 @@ class RecordedFleet:
         """Nothing more to do."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Stop the robots."""
         self._stop.set()
         self._thread.join()

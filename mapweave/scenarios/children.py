@@ -8,7 +8,6 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from types import TracebackType
 
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.processes import parent_watchdog
@@ -41,9 +40,7 @@ class Children:
         """Prepare; nothing runs yet."""
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """End whatever still runs, last started first."""
         for name in list(self._running)[::-1]:
             self.end(name)

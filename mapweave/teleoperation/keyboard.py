@@ -6,7 +6,6 @@ import os
 import sys
 import termios
 import tty
-from types import TracebackType
 
 from mapweave.hybridmap.errors import DeviceError
 
@@ -99,9 +98,7 @@ class RawTerminal:
         tty.setcbreak(self._fd)
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """As before."""
         termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
 

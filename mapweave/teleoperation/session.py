@@ -8,7 +8,6 @@ from __future__ import annotations
 import secrets
 import threading
 import time
-from types import TracebackType
 
 from mapweave.agent.observation import Command
 from mapweave.agent.teleoperation import DEAD_MAN
@@ -66,9 +65,7 @@ class Session:
         self._sender.start()
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         """Give the wheels back."""
         self._closing = True
         self._changed.set()

@@ -112,9 +112,7 @@ def test_what_a_store_deletes_of_a_large_map_is_not_lost(
     assert account(sent, journal, [store]).lost == 1
 
 
-def test_what_is_twice_or_elsewhere_is_counted(
-    fleet: tuple[list[Change], Journal, SqliteStore], tmp_path: Path
-) -> None:
+def test_what_is_twice_or_elsewhere_is_counted(fleet: tuple[list[Change], Journal, SqliteStore]) -> None:
     sent, journal, store = fleet
     # As if the last change had been taken twice, the second time under the next number.
     twice = Entry.read(sent[0].map, len(sent) + 1, encode_change(replace(sent[-1], sequence=len(sent) + 1)))

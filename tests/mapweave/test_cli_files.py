@@ -122,12 +122,11 @@ def test_a_damaged_recording_is_mapped_as_far_as_it_can_be_read(
     assert (tmp_path / "data" / "walk.1.mapweave").exists(), "what was mapped is kept"
 
 
-def test_a_recording_with_a_long_name_is_mapped_under_a_shorter_one(recording, tmp_path, capfd):
+def test_a_recording_with_a_long_name_is_mapped_under_a_shorter_one(recording, tmp_path):
     long = recording.rename(tmp_path / f"-{'Walk ' * 9}")
     assert main(["replay", str(long), "--offline", "--data", str(tmp_path / "data")]) == 0
     (path,) = (tmp_path / "data").glob("*.mapweave")
     assert path.name == f"{('walk-' * 9)[:32]}.1.mapweave"
-    capfd.readouterr()
 
 
 def test_a_bag_or_a_video_cannot_be_scored(tmp_path, capfd):
@@ -180,7 +179,7 @@ def one_node():
     return (NodePut(Node(NodeId("r0", 1, 1), 0, here, camera, Landmarks.empty())),)
 
 
-def test_a_recording_offline_is_mapped_without_a_session(recording, tmp_path, capfd, monkeypatch):
+def test_a_recording_offline_is_mapped_without_a_session(recording, tmp_path, monkeypatch):
     def refuse(*_: object) -> None:
         raise AssertionError("a session was opened")
 
@@ -189,7 +188,6 @@ def test_a_recording_offline_is_mapped_without_a_session(recording, tmp_path, ca
     assert main(["replay", str(recording), "--data", str(data), "--offline"]) == 0
     stamps = [line.split()[0] for line in (data / "walk.1.tum").read_text().splitlines() if line[0] != "#"]
     assert stamps == ["0.000000000", "0.100000000", "0.200000000"], "every frame, localized or not"
-    capfd.readouterr()
 
 
 def test_a_replay_that_is_interrupted_says_how_far_it_came(recording, tmp_path, capfd, monkeypatch):

@@ -126,7 +126,7 @@ def test_a_calibration_that_cannot_be_right(declared, distortion, words) -> None
     )
 
 
-def test_distortion_folds_where_opencv_brings_two_points_to_one(capfd) -> None:
+def test_distortion_folds_where_opencv_brings_two_points_to_one() -> None:
     description = RobotDescription(CAMERA, (-1.2, 0.1, 0.0, 0.0, 0.0))
     radius = camera_model.folding_radius(description)
     rays = np.zeros((2000, 3))

@@ -63,7 +63,7 @@ def test_a_cable_may_be_pulled_while_ports_are_listed(plugged, monkeypatch) -> N
     assert [port.path for port in ports.serial_ports(devices)] == [f"{devices}/ttyACM3"]
 
 
-def test_the_port_whose_cable_is_pulled_is_named(plugged, monkeypatch, capsys) -> None:
+def test_the_port_whose_cable_is_pulled_is_named(plugged, monkeypatch) -> None:
     devices, sketch = plugged
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
     asked = threading.Event()

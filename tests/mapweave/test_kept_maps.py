@@ -175,7 +175,7 @@ def test_a_map_that_is_not_there_cannot_be_resumed(tmp_path, capfd, closed, simu
     assert not list(tmp_path.iterdir()), "nothing is left behind"
 
 
-def test_a_file_of_a_map_of_before_counts_as_a_number_that_is_taken(tmp_path, recording, capfd):
+def test_a_file_of_a_map_of_before_counts_as_a_number_that_is_taken(tmp_path, recording):
     """The journal is lost, the map files are not."""
     data = tmp_path / "data"
     data.mkdir()
@@ -187,18 +187,16 @@ def test_a_file_of_a_map_of_before_counts_as_a_number_that_is_taken(tmp_path, re
         assert main(arguments) == 0
         assert (data / f"walk.{expected}.mapweave").exists()
     assert old.read_bytes() == before
-    capfd.readouterr()
 
 
-def test_replays_are_counted_from_one(tmp_path, recording, capfd):
+def test_replays_are_counted_from_one(tmp_path, recording):
     data = tmp_path / "data"
     for _ in range(2):
         assert main(["replay", str(recording), "--offline", "--data", str(data)]) == 0
     assert sorted(epochs_of_files(data, "walk")) == [1, 2]
-    capfd.readouterr()
 
 
-def test_a_file_is_set_aside_before_a_damaged_journal_writes_over_it(tmp_path, recording, capfd):
+def test_a_file_is_set_aside_before_a_damaged_journal_writes_over_it(tmp_path, recording):
     data = tmp_path / "data"
     data.mkdir()
     journal = Journal(data / "walk.sqlite", "walk")
@@ -216,7 +214,6 @@ def test_a_file_is_set_aside_before_a_damaged_journal_writes_over_it(tmp_path, r
     assert (data / "walk.1.before-damage.mapweave").read_bytes() == before
     assert len(HybridMap(read_map_file(whole).changes).nodes) == 1
     assert (data / "walk.2.mapweave").exists()
-    capfd.readouterr()
 
 
 def test_a_robot_that_is_lifted_begins_a_new_map_and_keeps_the_old_one(tmp_path):

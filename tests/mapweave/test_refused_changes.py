@@ -78,9 +78,7 @@ def test_a_merge_without_the_server_does_not_join_it(stores: tuple[Path, Path], 
     assert components(apart) == 2 and read_map_file(apart).refused_changes.keys() == {R1}
 
 
-def test_a_person_who_links_the_two_joins_them(
-    stores: tuple[Path, Path], tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_person_who_links_the_two_joins_them(stores: tuple[Path, Path], tmp_path: Path) -> None:
     whole = merged(tmp_path / "whole", stores[1])
     pair = next(pair for pair in read_map_file(whole).refused if WORDS in pair.reason)
     ends = str(pair.a), str(pair.b)
@@ -88,7 +86,6 @@ def test_a_person_who_links_the_two_joins_them(
     assert components(whole) == 1 and read_map_file(whole).refused_changes.keys() == {R1}
     assert main(["map", "link", *ends, "--undo", "--map", str(whole)]) == 0
     assert components(whole) == 2
-    capsys.readouterr()
 
 
 def test_a_correction_keeps_what_is_left_of_pruned_nodes(stores: tuple[Path, Path], tmp_path: Path) -> None:
@@ -115,7 +112,7 @@ def test_a_server_that_begins_with_the_file_does_not_join_it(
             assert server.settle(60) and server.status()["components"] == parts
 
 
-def test_a_damaged_store_still_says_which_map(stores: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_damaged_store_still_says_which_map(stores: tuple[Path, Path]) -> None:
     sound, unsound = stores
     assert salvage(sound).refused_changes == {}
     found = salvage(unsound).refused_changes

@@ -93,7 +93,7 @@ def test_cameras_show_their_images_in_their_shape():
     assert count(cells[2], NO_IMAGE) > 0.9 * width * height
 
 
-def test_robots_have_the_colours_of_the_map(tmp_path):
+def test_robots_have_the_colours_of_the_map():
     names = [f"r{k}" for k in range(16)]
     poses = {name: Pose2(0.4 + 0.45 * k, 2.0) for k, name in enumerate(names)}
     scene = FilmFrame(PLAN, names)
