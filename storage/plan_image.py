@@ -101,7 +101,7 @@ def _pixels(data: bytes) -> NDArray[np.uint8]:
     """(H, W) or (H, W, 3) as OpenCV has it, upright; what is transparent is white."""
     import cv2
 
-    png_with_alpha = data.startswith(b"\x89PNG") and len(data) > 25 and data[25] in WITH_ALPHA
+    png_with_alpha = data.startswith(b"\x89PNG") and len(data) > 25 and _is_transparent(data)
     try:
         flag = cv2.IMREAD_UNCHANGED if png_with_alpha else cv2.IMREAD_ANYCOLOR
         image = cv2.imdecode(np.frombuffer(to_end(data), np.uint8), flag)
@@ -115,3 +115,8 @@ def _pixels(data: bytes) -> NDArray[np.uint8]:
         alpha = image[:, :, -1:].astype(np.float32) / 255.0
         image = np.rint(image[:, :, :-1] * alpha + 255.0 * (1.0 - alpha)).astype(np.uint8)
     return np.asarray(image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image, np.uint8)
+
+
+def _is_transparent(png: bytes) -> bool:
+    """Whether it has a channel of transparency, or a colour of its palette is transparent."""
+    return png[25] in WITH_ALPHA or b"tRNS" in png[: png.find(b"IDAT")]

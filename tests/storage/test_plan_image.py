@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import zlib
 from pathlib import Path
 
 import cv2
@@ -51,6 +52,20 @@ def test_what_is_transparent_is_white_and_16_bits_become_8() -> None:
     for suffix in (".png", ".pgm"):
         found = plan_pixels(plan_file(cv2.imencode(suffix, deep)[1].tobytes()).png)
         assert np.array_equal(found, GREY)
+
+
+def test_a_transparent_colour_of_a_palette_is_white() -> None:
+    """Black lines on a transparent ground were black on black."""
+
+    def chunk(kind: bytes, data: bytes) -> bytes:
+        return len(data).to_bytes(4, "big") + kind + data + zlib.crc32(kind + data).to_bytes(4, "big")
+
+    head = (3).to_bytes(4, "big") + (1).to_bytes(4, "big") + bytes([8, 3, 0, 0, 0])
+    png = b"\x89PNG\r\n\x1a\n" + b"".join([
+        chunk(b"IHDR", head), chunk(b"PLTE", bytes(6)), chunk(b"tRNS", bytes([0, 255])),
+        chunk(b"IDAT", zlib.compress(bytes([0, 0, 1, 0]))), chunk(b"IEND", b""),
+    ])  # fmt: skip
+    assert in_colour(plan_pixels(plan_file(png).png))[0, :, 0].tolist() == [255, 0, 255]
 
 
 def test_no_image_and_too_large_ones_are_refused(tmp_path: Path) -> None:
