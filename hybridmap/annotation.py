@@ -199,11 +199,7 @@ class Annotation:
     because: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse names and words that are no single printable line.
-
-        Raises:
-            InvalidValue: likewise, and a place that is called like a node or a position.
-        """
+        """Refuse what is no printable line, and a place called like a node or a position (InvalidValue)."""
         if not 1 <= len(self.name) <= MAX_NAME or not self.name.isprintable():
             raise InvalidValue(f"a name has 1 to {MAX_NAME} printable characters")
         if isinstance(self.body, Place):

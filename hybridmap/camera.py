@@ -42,11 +42,7 @@ class Camera:
     mount_forward: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what no camera can be.
-
-        Raises:
-            InvalidValue: a size, focal length or mount out of range.
-        """
+        """Refuse a size, focal length or mount out of range (InvalidValue)."""
         numbers = (self.fx, self.fy, self.cx, self.cy, self.mount_height, self.mount_forward)
         if not all(math.isfinite(n) for n in numbers):
             raise InvalidValue("camera: every number must be finite")

@@ -91,11 +91,7 @@ class Linked:
     evidence: Annotated[tuple[tuple[Key, float], ...], Meta(max_length=64)] = ()
 
     def __post_init__(self) -> None:
-        """Put the smaller node first.
-
-        Raises:
-            InvalidValue: the same node twice, or a covariance that is none.
-        """
+        """Put the smaller node first; refuse one node twice, and a covariance that is none (InvalidValue)."""
         if self.a == self.b:
             raise InvalidValue(f"{self.a} twice: give two different nodes")
         if len(self.covariance) != (6 if self.covariance else 0) or (self.covariance and self.pose is None):

@@ -135,11 +135,7 @@ class PairExplanation:
     constraints: tuple[ManualConstraint, ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse what does not belong together.
-
-        Raises:
-            InvalidValue: pairs of landmarks that the nodes do not have, or residuals of others.
-        """
+        """Refuse pairs of landmarks that the nodes do not have, and residuals of others (InvalidValue)."""
         counts = [len(self.a.landmarks), len(self.b.landmarks)]
         for pairs in (self.matches, self.shared):
             if pairs.shape != (len(pairs), 2) or not ((pairs >= 0) & (pairs < counts)).all():

@@ -52,11 +52,7 @@ class LandmarkTables:
     cells: NDArray[np.int64]
 
     def __post_init__(self) -> None:
-        """Check shapes and sums.
-
-        Raises:
-            InvalidFile: these are no tables.
-        """
+        """Refuse shapes and sums that are not those of tables (InvalidFile)."""
         shapes = tuple(a.shape for a in (self.mean, self.basis, self.codes, self.shares, self.cells))
         wanted = (
             (SIFT_DIMENSIONS,), (SIFT_DIMENSIONS, DIMENSIONS), (DIMENSIONS, SYMBOLS), (SYMBOLS,), (SYMBOLS,),

@@ -51,11 +51,7 @@ class Landmarks:
     depth_sigmas: NDArray[np.float32]
 
     def __post_init__(self) -> None:
-        """Check shapes.
-
-        Raises:
-            InvalidValue: shapes that do not belong together.
-        """
+        """Refuse shapes that do not belong together (InvalidValue)."""
         n = len(self.pixels)
         shapes = (self.pixels.shape, self.codes.shape, self.depths.shape, self.depth_sigmas.shape)
         if shapes != ((n, 2), (n, CODE_BYTES), (n,), (n,)):
@@ -159,11 +155,7 @@ class Node:
     segment: TrajectorySegment = NO_SEGMENT
 
     def __post_init__(self) -> None:
-        """Refuse a trajectory segment of other sensors.
-
-        Raises:
-            InvalidValue: the segment has readings of more or fewer sensors, or beyond their reach.
-        """
+        """Refuse a trajectory segment of more or fewer sensors, or beyond their reach (InvalidValue)."""
         if not len(self.segment):
             return
         distances = self.segment.distances
