@@ -100,11 +100,7 @@ class PoseGaussian:
     covariance: Array
 
     def __post_init__(self) -> None:
-        """Refuse what is no covariance.
-
-        Raises:
-            InvalidValue: wrong shape, not finite, not symmetric or not positive semi-definite.
-        """
+        """Refuse what is not finite, (3, 3), symmetric and positive semi-definite (InvalidValue)."""
         p = np.asarray(self.covariance, dtype=np.float64)
         numbers: list[float] = p.ravel().tolist()
         mean = self.mean

@@ -197,11 +197,7 @@ class KnownAnswer:
     reason: Words
 
     def __post_init__(self) -> None:
-        """Refuse impossible views.
-
-        Raises:
-            InvalidValue: more views than a message holds, or a number out of range.
-        """
+        """Refuse more views than a message holds, and a number out of range (InvalidValue)."""
         if self.views.shape != (len(self.views), 4) or len(self.views) > MAX_KNOWN:
             raise InvalidValue(f"views of shape {self.views.shape}; at most ({MAX_KNOWN}, 4) are sent")
         # A comparison with what is no number is false.

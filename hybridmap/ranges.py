@@ -33,11 +33,7 @@ class Ranges:
     reach: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what does not belong together.
-
-        Raises:
-            InvalidValue: other shapes, or numbers out of range.
-        """
+        """Refuse shapes that do not belong together, and numbers out of range (InvalidValue)."""
         shape = np.shape(self.bearings)
         if len(shape) != 1 or np.shape(self.distances) != shape or shape[0] > MOST:
             raise InvalidValue("ranges: bearings and distances do not belong together")

@@ -33,11 +33,7 @@ class TrajectorySegment:
     distances: Array = field(default_factory=lambda: np.zeros((0, 0)))
 
     def __post_init__(self) -> None:
-        """Refuse what does not belong together.
-
-        Raises:
-            InvalidValue: other shapes, or numbers out of range.
-        """
+        """Refuse shapes that do not belong together, and numbers out of range (InvalidValue)."""
         k = len(self.ages)
         shapes = (np.shape(self.ages), np.shape(self.node_from_robot), np.shape(self.distances)[:1])
         if shapes != ((k,), (k, 3), (k,)) or np.ndim(self.distances) != 2 or k > MOST:

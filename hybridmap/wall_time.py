@@ -49,22 +49,23 @@ def read_time(text: str, now_ns: int, zone: tzinfo | None = None) -> int:
         return _stamp(text, lambda: now + timedelta(hours=hours))
     if re.search(r"(utc|z)$", words, re.IGNORECASE):
         words, now = re.sub(r"\s*(utc|z)$", "", words, flags=re.IGNORECASE), now.astimezone(UTC)
-    if (clock := CLOCK.fullmatch(words)) is not None:
-        return _stamp(text, lambda: _next(now, int(clock[1]), int(clock[2])))
 
-    def dated() -> datetime:
-        time = datetime.fromisoformat(words)
-        if time.tzinfo is not None:
-            return time
+    def in_zone(time: datetime) -> datetime:
         # Of a zone that is not named, the distance from UTC on that day, not today's.
         return time.replace(tzinfo=now.tzinfo) if zone or now.tzinfo is UTC else time.astimezone()
 
-    return _stamp(text, dated)
+    def dated() -> datetime:
+        time = datetime.fromisoformat(words)
+        return time if time.tzinfo is not None else in_zone(time)
 
+    if (clock := CLOCK.fullmatch(words)) is None:
+        return _stamp(text, dated)
 
-def _next(now: datetime, hour: int, minute: int) -> datetime:
-    time = now.replace(hour=hour, minute=minute, second=0, microsecond=0)
-    return time if time > now else time + timedelta(days=1)
+    def shown_next() -> datetime:
+        today = now.replace(hour=int(clock[1]), minute=int(clock[2]), second=0, microsecond=0, tzinfo=None)
+        return next(time for days in (0, 1) if (time := in_zone(today + timedelta(days))) > now or days)
+
+    return _stamp(text, shown_next)
 
 
 def _stamp(text: str, make: Callable[[], datetime]) -> int:

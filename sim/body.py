@@ -57,11 +57,7 @@ class BodySettings:
     mass: float = 4.0
 
     def __post_init__(self) -> None:
-        """Refuse what no robot can be.
-
-        Raises:
-            InvalidValue: a number out of range.
-        """
+        """Refuse a number out of range (InvalidValue)."""
         within = {
             "radius_error": (0.0, 0.1), "axle_error": (0.0, 0.2), "slip": (0.0, 0.3),
             "ticks_per_turn": (8, 10**7), "motor_lag": (0.01, 2.0), "motor_force": (0.1, 20.0),

@@ -54,11 +54,7 @@ class Exposure:
     seconds: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what no camera can do.
-
-        Raises:
-            InvalidValue: a number out of range.
-        """
+        """Refuse a number out of range (InvalidValue)."""
         within = {
             "wanted": (1.0, 254.0), "band": (0.0, 10.0), "lag": (0.0, 60.0), "lowest": (1e-3, 1.0),
             "highest": (1.0, 1e3), "gain_error": (0.0, 0.3), "vignetting": (0.0, 0.95), "seconds": (0.0, 0.1),
@@ -89,11 +85,7 @@ class CameraSetup:
     dropped: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what no camera can be.
-
-        Raises:
-            InvalidValue: a number out of range, or a lens that shows one point in two places.
-        """
+        """Refuse a number out of range, and a lens that shows one point in two places (InvalidValue)."""
         check_range("camera: read_noise", self.read_noise, 0.0, 60.0)
         check_range("camera: shot_noise", self.shot_noise, 0.0, 60.0)
         check_range("camera: dropped", self.dropped, 0.0, 1.0)

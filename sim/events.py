@@ -38,11 +38,7 @@ class Kidnap:
     room: str = ""
 
     def __post_init__(self) -> None:
-        """Refuse an ambiguous place.
-
-        Raises:
-            InvalidValue: none, or more than one, of x with y, near and room.
-        """
+        """Refuse none, and more than one, of x with y, near and room (InvalidValue)."""
         point = self.x is not None and self.y is not None
         half = (self.x is None) != (self.y is None)
         if half or point + bool(self.near) + bool(self.room) != 1:
@@ -66,11 +62,7 @@ class Light:
     seconds: float = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse what no lamp can do.
-
-        Raises:
-            InvalidValue: a number out of range.
-        """
+        """Refuse a number out of range (InvalidValue)."""
         check_range("light: factor", self.factor, 0.0, 20.0)
         check_range("light: seconds", self.seconds, 0.0, LONGEST)
 
@@ -94,11 +86,7 @@ class Walk:
     seconds: float = 15.0
 
     def __post_init__(self) -> None:
-        """Refuse what cannot walk.
-
-        Raises:
-            InvalidValue: an unknown kind, no path or two, or a number out of range.
-        """
+        """Refuse an unknown kind, no path or two, and a number out of range (InvalidValue)."""
         if self.what not in ("person", "box"):
             raise InvalidValue(f"walk: what = {self.what!r}; known are person, box")
         if bool(self.near) == bool(self.path):
@@ -123,11 +111,7 @@ class MoveFurniture:
     share: float = 0.3
 
     def __post_init__(self) -> None:
-        """Refuse what is no share.
-
-        Raises:
-            InvalidValue: it is not above 0 and at most 1.
-        """
+        """Refuse what is not above 0 and at most 1 (InvalidValue)."""
         check_range("move_furniture: share", self.share, 1e-3, 1.0)
 
 
@@ -169,11 +153,7 @@ class Fail:
     amount: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse what cannot fail.
-
-        Raises:
-            InvalidValue: an unknown sensor or way to fail, or a number out of range.
-        """
+        """Refuse an unknown sensor or way to fail, and a number out of range (InvalidValue)."""
         if self.sensor not in WAYS_TO_FAIL:
             raise InvalidValue(f"fail: no sensor {self.sensor!r}; there are {', '.join(WAYS_TO_FAIL)}")
         ways = WAYS_TO_FAIL[self.sensor]

@@ -47,11 +47,7 @@ class RobotSetup:
     max_turn: float = 0.8
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be built.
-
-        Raises:
-            InvalidValue: a name that cannot be one, or a number out of range.
-        """
+        """Refuse a name that cannot be one, and a number out of range (InvalidValue)."""
         check_name(self.name)
         where = f"robot {self.name}"
         check_range(f"{where}: rangers", self.rangers, 0, 256)

@@ -29,11 +29,7 @@ class DemoOptions:
     quiet: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be shown.
-
-        Raises:
-            SettingsError: too few or too many robots or rooms.
-        """
+        """Refuse too few or too many robots or rooms (SettingsError)."""
         if not 2 <= self.robots <= 16:
             raise SettingsError(f"--robots {self.robots}: the demo needs 2 to 16")
         if not 3 <= self.rooms <= 12:

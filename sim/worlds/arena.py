@@ -28,11 +28,7 @@ class ArenaParameters:
     boxes: int = 0
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be built.
-
-        Raises:
-            InvalidValue: a size out of range.
-        """
+        """Refuse a size out of range (InvalidValue)."""
         within("an arena's length", self.length, 2.0, 60.0)
         within("an arena's width", self.width, 2.0, 60.0)
         within("an arena's number of boxes", self.boxes, 0, 100)

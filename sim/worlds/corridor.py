@@ -34,11 +34,7 @@ class CorridorParameters:
     spacing: float = 2.2
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be built.
-
-        Raises:
-            InvalidValue: a size out of range.
-        """
+        """Refuse a size out of range (InvalidValue)."""
         within("a corridor's breadth", self.breadth, 1.2, 5.0)
         within("a corridor's length", self.length, 4.0, 100.0)
         within("a corridor's width", self.width, 4.0, 100.0)

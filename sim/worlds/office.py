@@ -28,11 +28,7 @@ class OfficeParameters:
     furniture: bool = True
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be built.
-
-        Raises:
-            InvalidValue: a number of rooms out of range.
-        """
+        """Refuse a number of rooms out of range (InvalidValue)."""
         within("an office's number of rooms", self.rooms, 1, 32)
 
 

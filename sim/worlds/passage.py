@@ -29,11 +29,7 @@ class PassageParameters:
     depth: float = 1.4
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be built.
-
-        Raises:
-            InvalidValue: a size out of range.
-        """
+        """Refuse a size out of range (InvalidValue)."""
         within("a passage's length", self.length, 5.0, 60.0)
         within("a passage's breadth", self.breadth, 1.0, 5.0)
         within("a passage's niche", self.niche, 0.7, 20.0)

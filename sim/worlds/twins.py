@@ -35,11 +35,7 @@ class TwinsParameters:
     width: float = 4.4
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be built.
-
-        Raises:
-            InvalidValue: a size out of range.
-        """
+        """Refuse a size out of range (InvalidValue)."""
         within("a twin room's length", self.length, 2.5, 30.0)
         within("a twin room's width", self.width, 2.5, 30.0)
 

@@ -51,11 +51,7 @@ class WarehouseParameters:
     stacks: int = 3
 
     def __post_init__(self) -> None:
-        """Refuse what cannot be built.
-
-        Raises:
-            InvalidValue: a number out of range.
-        """
+        """Refuse a number out of range (InvalidValue)."""
         within("a warehouse's number of rows", self.rows, 1, 20)
         within("a warehouse's number of bays", self.bays, 1, 30)
         within("a warehouse's number of stacks", self.stacks, 0, 20)
