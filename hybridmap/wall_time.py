@@ -63,7 +63,8 @@ def read_time(text: str, now_ns: int, zone: tzinfo | None = None) -> int:
 
     def shown_next() -> datetime:
         today = now.replace(hour=int(clock[1]), minute=int(clock[2]), second=0, microsecond=0, tzinfo=None)
-        return next(time for days in (0, 1) if (time := in_zone(today + timedelta(days))) > now or days)
+        time = in_zone(today)
+        return time if time > now else in_zone(today + timedelta(days=1))
 
     return _stamp(text, shown_next)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from datetime import UTC, datetime, timedelta, timezone
 
 import pytest
@@ -48,6 +49,21 @@ def test_what_is_no_time_is_refused(text) -> None:
 def test_a_time_is_written_in_both_zones() -> None:
     assert utc_words(NOW_NS) == "2026-03-01 13:30 UTC"
     assert local_words(NOW_NS, EAST) == "2026-03-01 15:30 +0200"
+
+
+def test_a_clock_is_set_forward_or_back_until_then(monkeypatch: pytest.MonkeyPatch) -> None:
+    """In the evening before, 14:00 was the 14:00 of a clock that was not changed."""
+    try:
+        with monkeypatch.context() as patch:
+            patch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+            time.tzset()
+            for evening, afternoon in (("2026-03-28 22:00", 12), ("2026-10-24 22:00", 13)):
+                now = datetime.fromisoformat(evening).astimezone()
+                expected = datetime.combine(now.date() + timedelta(1), datetime.min.time(), UTC)
+                read = read_time("14:00", round(now.timestamp()) * 10**9)
+                assert read == round((expected + timedelta(hours=afternoon)).timestamp()) * 10**9
+    finally:
+        time.tzset()
 
 
 def test_a_long_text_is_refused_at_once() -> None:
