@@ -340,7 +340,10 @@ class Estimator:
         depths = np.array([i.inverse_depths for i in self.informations if i.tracks > 5])
         if len(depths):
             mean, spread = np.median(depths, axis=0)
-            self._depth = (float(mean), float(max(spread, 0.5 * mean)))
+            spread = max(spread, 0.5 * mean)
+            if spread > 0.0:
+                # Where wheels and image go opposite ways, no point has a depth.
+                self._depth = (float(mean), float(spread))
             scatter = float(np.median([i.scatter for i in self.informations if i.tracks > 5]))
             self._sigma = float(np.clip(scatter, LEAST_SIGMA * self._most_sigma, self._most_sigma))
 

@@ -139,6 +139,13 @@ def test_a_robot_that_stands_learns_nothing():
     assert not online.causes
 
 
+def test_wheels_that_count_backward_are_survived() -> None:
+    """No point has a depth by them: the image moves the other way."""
+    run = drive(np.random.default_rng(1), TRUE, 20.0, "turning")
+    run.wheels.way[:] *= -3.0
+    assert watched(run, TRUE, 1, sigma=0.05).estimate is not None
+
+
 def test_a_clock_that_goes_back_is_survived():
     true = DriveGeometry(forward=0.1, height=0.3)
     online = watched(drive(np.random.default_rng(1), true, 20.0), true, 1)
