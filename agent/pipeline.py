@@ -32,8 +32,8 @@ from mapweave.agent.navigation.portal_crossing import PortalCrossing
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.robots_in_view import RobotsInView, nodes_around
+from mapweave.agent.sensor_health.odometry_convention import OdometryConvention
 from mapweave.agent.sensor_health.sensor_monitor import Fault, SensorMonitor
-from mapweave.agent.sensor_health.turn_convention import TurnConvention
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
@@ -101,7 +101,7 @@ class Pipeline:
             description = replace(description, distortion=NO_DISTORTION)
         self._map_id = map_id
         self._settings = settings or AgentSettings()
-        self._convention = TurnConvention(description.camera)
+        self._convention = OdometryConvention(description.camera)
         calibration = calibration or OnlineCalibration(description)
         self._map_making = MapMaking(map_id, calibration, self._settings, contents, next_number, released)
         description = self._map_making.description
@@ -126,8 +126,7 @@ class Pipeline:
     @property
     def complaints(self) -> list[str]:
         """What was found to be wrong with the odometry and with the declared geometry, a line each."""
-        lines = [self._convention.complaint, *map(str, self.calibration.causes)]
-        return [line for line in lines if line]
+        return [*self._convention.complaints, *map(str, self.calibration.causes)]
 
     @property
     def map(self) -> HybridMap:

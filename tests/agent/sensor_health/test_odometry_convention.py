@@ -1,4 +1,4 @@
-"""Unit and sign of the turns that wheels report, held against the image."""
+"""Unit and signs of odometry, held against the image."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import pytest
 from mapweave.agent.mission import Carried
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.pipeline import Pipeline
-from mapweave.agent.sensor_health.turn_convention import TurnConvention
+from mapweave.agent.sensor_health.odometry_convention import OdometryConvention
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from tests.agent.conftest import CAMERA, DESCRIPTION, PhotoWalls
@@ -19,9 +19,9 @@ from tests.agent.conftest import CAMERA, DESCRIPTION, PhotoWalls
 REVERSED, DEGREES = "the other way", "in degrees"
 
 
-def drive(walls: PhotoWalls, times: float, every: int = 1) -> list[Observation]:
+def drive(walls: PhotoWalls, times: float, every: int = 1, step: float = 0.01) -> list[Observation]:
     """Swings to both sides and drives ahead; wheels that report so many times the turn."""
-    poses = [Pose2(0.01 * k, 0.0, 0.25 * math.sin(0.15 * k)) for k in range(0, 90, every)]
+    poses = [Pose2(step * k, 0.0, 0.25 * math.sin(0.15 * k)) for k in range(0, 90, every)]
     seen, before = [], poses[0]
     for k, pose in enumerate(poses):
         moved = before.inverse() @ pose
@@ -32,10 +32,10 @@ def drive(walls: PhotoWalls, times: float, every: int = 1) -> list[Observation]:
 
 
 def complaint(seen: list[Observation]) -> str:
-    convention = TurnConvention(CAMERA)
+    convention = OdometryConvention(CAMERA)
     for observation in seen:
         convention.see(observation)
-    return convention.complaint
+    return "; ".join(convention.complaints)
 
 
 @pytest.mark.parametrize("every", [1, 4])
@@ -79,6 +79,24 @@ def test_images_that_lack_and_a_robot_that_does_not_turn_say_nothing_wrong(walls
     # The wheels turn and the image does not: they spin.
     spinning = [replace(one, odometry=Odometry(0.0, 0.05), image=walls.render(Pose2())) for one in lacking]
     assert not complaint(spinning)
+
+
+@pytest.mark.parametrize("direction", [1.0, -1.0], ids=["ahead", "back"])
+@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["right", "reversed"])
+def test_ways_with_the_wrong_sign_are_named(walls: PhotoWalls, direction: float, sign: float) -> None:
+    """A robot may drive back; then the image moves back, too."""
+    seen = drive(walls, 1.0, step=0.014)
+    steps = [0.0, *(one.odometry.forward for one in seen[1:])]
+    images = [one.image for one in seen]
+    if direction < 0.0:
+        images, steps = images[::-1], [0.0, *(-step for step in steps[:0:-1])]
+    turns = [0.0, *(direction * one.odometry.turn for one in (seen[1:] if direction > 0.0 else seen[:0:-1]))]
+    played = [
+        replace(one, image=image, odometry=Odometry(sign * step, turn))
+        for one, image, step, turn in zip(seen, images, steps, turns, strict=True)
+    ]
+    line = complaint(played)
+    assert ("positive forward" in line) is (sign < 0.0) and REVERSED not in line
 
 
 @pytest.mark.parametrize(("times", "word"), [(1.0, ""), (-1.0, REVERSED), (math.degrees(1.0), DEGREES)])
