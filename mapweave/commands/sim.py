@@ -161,19 +161,11 @@ def run_one(arguments: argparse.Namespace) -> int:
     scenario = _scenario(arguments)
     seed = scenario.seed if arguments.seed is None else arguments.seed
     out = arguments.out or Path("out/sim") / f"{scenario.name}-{seed}"
-    trial = run_trial(
-        scenario,
-        TrialOptions(
-            seed=seed,
-            out=out,
-            processes=not arguments.one_process,
-            settings=settings.agent,
-            settings_file=arguments.settings,
-            film_every=0.0 if arguments.no_film else 1.0,
-            view=arguments.view,
-            rerun=arguments.rerun,
-        ),
-    )
+    options = TrialOptions(
+        seed, out, not arguments.one_process, settings.agent, arguments.settings,
+        film_every=0.0 if arguments.no_film else 1.0, view=arguments.view, rerun=arguments.rerun,
+    )  # fmt: skip
+    trial = run_trial(scenario, options)
     if arguments.json:
         print(json.dumps(trial.as_dict()))
     else:
@@ -190,20 +182,17 @@ def run_batch(arguments: argparse.Namespace) -> int:
     need(*TRIAL)
     from mapweave.output_folder import check_output
     from mapweave.scenarios.batch import BatchOptions, run_batch_of_trials
+    from mapweave.scenarios.run import TrialOptions
 
     settings = settings_of(arguments)
     scenario = _scenario(arguments)
     first = scenario.seed if arguments.first is None else arguments.first
-    options = BatchOptions(
-        first=first,
-        seeds=arguments.seeds,
-        out=check_output(arguments.out or Path("out/sim") / scenario.name),
-        processes=not arguments.one_process,
-        settings=settings.agent,
-        settings_file=arguments.settings,
-        film=arguments.film,
-        json=arguments.json,
-    )
+    out = check_output(arguments.out or Path("out/sim") / scenario.name)
+    trial = TrialOptions(
+        first, out, not arguments.one_process, settings.agent, arguments.settings,
+        film_every=1.0 if arguments.film else 0.0,
+    )  # fmt: skip
+    options = BatchOptions(trial, arguments.seeds, arguments.json)
     return DONE if run_batch_of_trials(scenario, options) else NO
 
 
