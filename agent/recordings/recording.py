@@ -12,6 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.recordings.heading_check import contradiction
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array
@@ -217,6 +218,8 @@ def assembled(
             inside, increments = increments_between(odometry, stamps)
         except DeviceError as error:
             raise DeviceError(f"{path}: {error}") from None
+        if wrong := contradiction(odometry.poses):
+            raise DeviceError(f"{path}: poses of the odometry: {wrong}")
         damage = (*damage, odometry.damage) if odometry.damage else damage
         notes = (*notes, *odometry.notes)
         if not inside.all():

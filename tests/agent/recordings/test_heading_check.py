@@ -1,0 +1,76 @@
+"""Headings of poses, held against the way."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.observation import Odometry
+from mapweave.agent.recordings.heading_check import contradiction
+from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.pose import Array, Pose2
+
+
+def driven(seed: int, step: float = 0.02) -> Array:
+    """(600, 3) poses of a drive with turns to both sides, stops, turns on the spot and stretches back."""
+    rng = np.random.default_rng(seed)
+    pose, poses = Pose2(1.0, 2.0, rng.uniform(-3.0, 3.0)), list[Array]()
+    for _ in range(30):
+        forward, turn = step * rng.choice([1.0, 1.0, 1.0, 0.0, -1.0]), rng.uniform(-0.08, 0.08)
+        for _ in range(20):
+            pose = pose @ Odometry(forward * rng.normal(1.0, 0.02), turn * rng.normal(1.0, 0.02)).motion()
+            poses.append(pose.vector)
+    return np.array(poses)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_right_headings_are_right(seed: int) -> None:
+    poses = driven(seed)
+    assert not contradiction(poses)
+    assert not contradiction(poses + np.array([0.0, 0.0, math.pi])), "a robot may drive back all the time"
+    assert not contradiction(poses + np.random.default_rng(seed).normal(0.0, [0.01, 0.01, 0.05], poses.shape))
+    assert not contradiction(poses[:40]) and not contradiction(poses[:1])
+    assert not contradiction(np.tile(poses[:1], (50, 1)))
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(
+    ("spoil", "words"),
+    [
+        (np.degrees, "in degrees"),
+        (lambda heading: -heading, "positive to the left"),
+        (lambda heading: math.pi / 2 - heading, "x and y are exchanged"),
+        (lambda heading: heading - math.pi / 2, "90 degrees off"),
+        (lambda heading: 3.0 * np.sin(np.arange(600)), ""),
+    ],
+    ids=["degrees", "reversed", "compass", "sideways", "held in the hand"],
+)
+def test_wrong_headings_are_named(seed: int, spoil: Callable[[Array], Array], words: str) -> None:
+    poses = driven(seed)
+    said = contradiction(np.column_stack([poses[:, :2], spoil(poses[:, 2])]))
+    assert words in said and bool(said) is bool(words)
+
+
+def test_a_recording_with_headings_in_degrees_is_refused(tmp_path: Path) -> None:
+    poses, folder = driven(0), tmp_path / "walk"
+    (folder / "images").mkdir(parents=True)
+    (folder / "camera.toml").write_text(
+        "width = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 32\ncy = 24\nheight_m = 0.3\n"
+    )
+    for k in range(3):
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), np.zeros((48, 64), np.uint8))
+    for times, refused in ((1.0, False), (math.degrees(1.0), True)):
+        rows = [f"{0.1 * k},{x},{y},{times * heading}" for k, (x, y, heading) in enumerate(poses)]
+        text = "\n".join(["stamp_s,x_m,y_m,heading_rad", *rows, ""])
+        (folder / "odometry.csv").write_text(text)
+        if not refused:
+            Replay(folder)
+            continue
+        with pytest.raises(DeviceError, match=r"walk: poses of the odometry: headings are in degrees"):
+            Replay(folder)
