@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import argparse
+import hashlib
 import json
 import time
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
@@ -92,7 +94,7 @@ def run_close(arguments: argparse.Namespace) -> int:
                 times[field] = stamp_ns = read_time(text, now_ns)
             print(f"{word} {local_words(stamp_ns)} ({utc_words(stamp_ns)})")
     with record_of(arguments) as record:
-        name, fields = _meant(arguments, record)
+        name, fields = _meant(arguments, "closure", record)
         print(record.annotate("closure", name, arguments.because, **fields, **times))
     return 0
 
@@ -109,7 +111,7 @@ def run_prefer(arguments: argparse.Namespace) -> int:
     if arguments.undo:
         return _withdraw(arguments, "preference")
     with record_of(arguments) as record:
-        name, fields = _meant(arguments, record)
+        name, fields = _meant(arguments, "preference", record)
         print(record.annotate("preference", name, arguments.because, factor=arguments.factor, **fields))
     return 0
 
@@ -136,18 +138,36 @@ def run_list(arguments: argparse.Namespace) -> int:
 
 
 def _withdraw(arguments: argparse.Namespace, kind: str) -> int:
-    name = getattr(arguments, "name", None) or " ".join(arguments.where)
     with record_of(arguments) as record:
-        names = {entry.name for entry in record.annotations().made if entry.kind == kind}
-        # An edge has no direction.
-        other = " ".join(reversed(arguments.where))
-        name = other if name not in names and other in names else name
-        print(record.withdraw(kind, name, arguments.because))
+        for name in _names(arguments, kind, record):
+            print(record.withdraw(kind, name, arguments.because))
     return 0
 
 
-def _meant(arguments: argparse.Namespace, record: Fleet | OfflineAnnotations) -> tuple[str, dict[str, Any]]:
-    """Name and fields of what WHERE means.
+def _names(arguments: argparse.Namespace, kind: str, record: Fleet | OfflineAnnotations) -> list[str]:
+    """The name that is given, or those of what is meant: an edge may have one for each direction."""
+    if getattr(arguments, "name", None):
+        return [arguments.name]
+    where = arguments.where or getattr(arguments, "corners", None) or []
+    names = [_name(where), *([_name(where[::-1])] if len(where) == 2 else [])]
+    said = record.annotations()
+    return [name for name in names if said.last(kind, name) is not None] or names[:1]
+
+
+def _name(where: Sequence[str]) -> str:
+    """What is meant, as a name; of a longer one the beginning, and a number that no other has."""
+    from mapweave.hybridmap.annotation import MAX_NAME
+
+    name = " ".join(where)
+    if len(name) <= MAX_NAME:
+        return name
+    return f"{name[: MAX_NAME - 9]} {hashlib.sha256(name.encode()).hexdigest()[:8]}"
+
+
+def _meant(
+    arguments: argparse.Namespace, kind: str, record: Fleet | OfflineAnnotations
+) -> tuple[str, dict[str, Any]]:
+    """Name and fields of what WHERE means; the name is that of the entry which it replaces, if there is one.
 
     Raises:
         UsageError: nothing, or too much, is given.
@@ -166,4 +186,4 @@ def _meant(arguments: argparse.Namespace, record: Fleet | OfflineAnnotations) ->
     elif where:
         fields["node"] = where[0]
         fields.setdefault("radius", AROUND)
-    return arguments.name or " ".join(where or arguments.corners)[:64], fields
+    return _names(arguments, kind, record)[0], fields

@@ -1,0 +1,50 @@
+"""`mapweave close` and `reopen` of a map file: which entry of the record is meant."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from mapweave.cli import main
+from mapweave.exit_status import NO
+from mapweave.hybridmap.annotation import Annotations, Closure
+from mapweave.hybridmap.ids import MapId
+from mapweave.storage.map_file import read_map_file
+from synthetic.maps import looked_around, write_store
+
+
+def map_of(robot: str, folder: Path) -> Path:
+    store, path = (
+        write_store(folder / "s0.sqlite", looked_around([MapId(robot, 1)], seed=8)),
+        folder / "a.mapweave",
+    )
+    assert main(["map", "merge", str(store), "-o", str(path)]) == 0
+    return path
+
+
+def closed(path: Path) -> int:
+    return len(Annotations(read_map_file(path).annotations).in_force(Closure))
+
+
+def test_a_second_way_of_a_long_named_robot_reopens_no_first(tmp_path: Path) -> None:
+    """Names of two nodes were cut to the 64 characters of a name, and were one."""
+    robot = "a-robot-with-a-very-long-name-32"
+    path = map_of(robot, tmp_path)
+    first, second, third = (f"{robot}.1.{number}" for number in (1, 3, 5))
+    assert main(["close", first, second, "--map", str(path)]) == 0
+    assert main(["close", first, third, "--map", str(path)]) == 0
+    assert closed(path) == 2
+    assert main(["reopen", second, first, "--map", str(path)]) == 0
+    assert main(["reopen", second, first, "--map", str(path)]) == NO
+    assert closed(path) == 1
+
+
+def test_a_way_is_open_when_it_was_reopened_whichever_end_was_named_first(tmp_path: Path) -> None:
+    path, ends = map_of("r0", tmp_path), ["r0.1.1", "r0.1.3"]
+    for there in (ends, ends[::-1]):
+        assert main(["close", *there, "--map", str(path)]) == 0
+        assert main(["reopen", *ends, "--map", str(path)]) == 0
+        assert closed(path) == 0
+    assert main(["close", *ends, "--map", str(path)]) == 0
+    assert main(["close", *ends[::-1], "--map", str(path), "--name", " ".join(ends[::-1])]) == 0
+    assert main(["reopen", *ends, "--map", str(path)]) == 0
+    assert closed(path) == 0
