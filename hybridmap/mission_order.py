@@ -25,7 +25,8 @@ MAX_VIA = 16
 MOST_APART_NS = 86_400_000_000_000
 """By which the stamps of two orders differ at most if both clocks are right: none is under way for a day."""
 
-Text = Annotated[str, Meta(max_length=64)]
+MAX_TEXT = 64
+Text = Annotated[str, Meta(max_length=MAX_TEXT)]
 """A goal as it was written, or a person's name."""
 
 
@@ -100,7 +101,10 @@ class MissionRequest:
     via: Annotated[tuple[Text, ...], Meta(max_length=MAX_VIA)] = ()
 
     def __post_init__(self) -> None:
-        """Refuse a goal too many or too few (InvalidValue)."""
+        """Refuse a goal too many or too few, or one that is too long (InvalidValue)."""
+        if long := [word for word in (self.goal, *self.via) if len(word) > MAX_TEXT]:
+            words = f"{long[0][:MAX_TEXT]!r}... is longer than {MAX_TEXT} characters"
+            raise InvalidValue(f"mission {self.kind}: {words}")
         if self.via and self.kind is not MissionKind.GO:
             raise InvalidValue(f"mission {self.kind}: takes no places on the way")
         if (self.kind is MissionKind.GO) != bool(self.goal):

@@ -150,7 +150,7 @@ class MissionRelay:
         """A mission that is given now, and is newer than the one that holds the robot.
 
         Raises:
-            InvalidValue: the goal is missing, or there is one too many; a name is none.
+            InvalidValue: the goal is missing or too long, or there is one too many; a name is none.
         """
         status = None if self.roster is None else self.roster.status(robot)
         report = None if status is None else status.mission
@@ -158,7 +158,7 @@ class MissionRelay:
         mission_id = check_name(mission_id) if mission_id else new_id()
         if len(via) > MAX_VIA:
             raise InvalidValue(f"a mission passes at most {MAX_VIA} places, not {len(via)}")
-        return MissionRequest(mission_id, check_name(robot), kind, stamp_ns, by[:64], goal[:64], via)
+        return MissionRequest(mission_id, check_name(robot), kind, stamp_ns, by[:64], goal, via)
 
     def hear(self, status: AgentStatus) -> None:
         """Take note of what a robot reports of its mission."""

@@ -46,6 +46,20 @@ def test_robots_are_sent_stopped_and_seen(house: House) -> None:
     link.close()
 
 
+def test_a_long_goal_is_refused_and_not_cut(house: House) -> None:
+    """Of the position 0,99 with many zeros the second number was cut to 0, and the robot drove."""
+    link, control = house.robot()
+    far = f"0.{'0' * 59},0099"
+    with Web(("127.0.0.1", 0), house.server) as web:
+        for query in (f"goal={far}", f"goal={THERE}&via={far}"):
+            status, answer = ask(web, "POST", f"/robots/r0/go?{query}")
+            assert status == 400 and "is longer than 64 characters" in answer["error"]
+    with pytest.raises(InvalidValue, match="is longer than 64 characters"):
+        house.person.go("r0", far)
+    assert control.report is None
+    link.close()
+
+
 def test_a_robot_at_a_portal_takes_it_from_any_client_that_it_was_taken_through(house: House) -> None:
     link, control = house.robot()
     asking = Status(
