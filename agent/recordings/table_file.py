@@ -90,7 +90,7 @@ def rows_of(path: Path, lines: Sequence[str], columns: Sequence[str]) -> TableRo
     Raises:
         DeviceError: it lacks a column, or something else separates the columns.
     """
-    reader = TableRows(lines)
+    reader = TableRows(lines, skipinitialspace=True)
     try:
         lacking = [name for name in columns if name not in (reader.fieldnames or ())]
     except csv.Error as error:

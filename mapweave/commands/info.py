@@ -78,6 +78,7 @@ def _described(recording: Recording, camera_lacks: bool, odometry: bool) -> dict
     import numpy as np
 
     from mapweave.agent.recordings.incomplete import first_image
+    from mapweave.doctor.camera_model import recorded_faults
 
     camera, stamps = recording.camera, recording.stamps_ns
     _, unreadable = first_image(len(recording), recording.read)
@@ -91,7 +92,9 @@ def _described(recording: Recording, camera_lacks: bool, odometry: bool) -> dict
         "width": camera.width,
         "height": camera.height,
     }
+    notes = list(recording.notes)
     if not camera_lacks:
+        notes += recorded_faults(recording)
         out |= {
             "focal_px": round(camera.fx, 1),
             "camera_height_m": round(camera.mount_height, 3),
@@ -100,7 +103,7 @@ def _described(recording: Recording, camera_lacks: bool, odometry: bool) -> dict
     if odometry:
         out |= {"driven_m": round(float(way), 2), "turned_rad": round(float(turn), 2)}
     damage = [*recording.damage, *([unreadable] if unreadable else [])]
-    return {**out, "notes": list(recording.notes), "damage": damage}
+    return {**out, "notes": notes, "damage": damage}
 
 
 def _print(facts: dict[str, Any]) -> None:

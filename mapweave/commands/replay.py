@@ -99,12 +99,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Play the recording to its end."""
     from mapweave.agent.drivers.replay import Replay
     from mapweave.agent.recordings.incomplete import NoOdometry
+    from mapweave.doctor.camera_model import recorded_faults
 
     try:
         robot = Replay(arguments.recording, arguments.robot, options=options_of(arguments))
     except NoOdometry as missing:
         return _map_images(arguments, missing.recording)
-    for note in robot.recording.notes:
+    for note in (*robot.recording.notes, *recorded_faults(robot.recording)):
         print(note)
     name = name_of(arguments)
     settings, calibration = settings_of(arguments), calibration_of(arguments, name)

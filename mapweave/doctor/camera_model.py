@@ -10,6 +10,8 @@ from mapweave.doctor.finding import Finding, good, warning, wrong
 
 if TYPE_CHECKING:
     from mapweave.agent.observation import RobotDescription
+    from mapweave.agent.recordings.recording import Recording
+    from mapweave.hybridmap.camera import Camera
 
 SUBJECT = "calibration"
 CALIBRATE = "mapweave calibrate camera"
@@ -32,27 +34,12 @@ def examine(description: RobotDescription) -> Iterator[Finding]:
     from mapweave.vision.lens import NO_DISTORTION
 
     camera = description.camera
-    view = 2.0 * math.atan(camera.width / (2.0 * camera.fx))
-    faults = []
-    if not NARROWEST <= view <= WIDEST:
-        faults.append(f"fx = {camera.fx:g} px makes the field of view {math.degrees(view):.0f} degrees")
-    if abs(camera.fx / camera.fy - 1.0) > SQUARE:
-        faults.append(f"fx = {camera.fx:g} and fy = {camera.fy:g} px are not the same")
-    for name, centre, size in (("cx", camera.cx, camera.width), ("cy", camera.cy, camera.height)):
-        if abs(centre - size / 2.0) > CENTRED * size:
-            faults.append(f"{name} = {centre:g} is far from the middle of {size} px")
-    radius = folding_radius(description)
-    if radius is not None:
-        faults.append(f"the distortion folds the image back at {radius:.0f} px from its middle")
-    if not 0.01 <= camera.mount_height <= HIGHEST:
-        faults.append(f"height_m = {camera.mount_height:g} is not the height of a robot's camera")
-    if abs(camera.mount_forward) > FARTHEST_FORWARD:
-        faults.append(f"forward_m = {camera.mount_forward:g} is farther from the axle than a robot is long")
-    if faults:
-        yield wrong(SUBJECT, "; ".join(faults), f"measure them, or: {CALIBRATE}")
+    found = faults(description)
+    if found:
+        yield wrong(SUBJECT, "; ".join(found), f"measure them, or: {CALIBRATE}")
         return
     words = (
-        f"{camera.width}x{camera.height} px, {math.degrees(view):.0f} degrees wide, lens "
+        f"{camera.width}x{camera.height} px, {math.degrees(_view(camera)):.0f} degrees wide, lens "
         f"{camera.mount_height:g} m high and {camera.mount_forward:g} m ahead of the axle"
     )
     if description.distortion == NO_DISTORTION:
@@ -61,7 +48,39 @@ def examine(description: RobotDescription) -> Iterator[Finding]:
         yield good(SUBJECT, words)
 
 
-def folding_radius(description: RobotDescription) -> float | None:
+def faults(description: RobotDescription | Recording) -> list[str]:
+    """What of a camera can hardly be right."""
+    camera = description.camera
+    view = _view(camera)
+    found = []
+    if not NARROWEST <= view <= WIDEST:
+        found.append(f"fx = {camera.fx:g} px makes the field of view {math.degrees(view):.0f} degrees")
+    if abs(camera.fx / camera.fy - 1.0) > SQUARE:
+        found.append(f"fx = {camera.fx:g} and fy = {camera.fy:g} px are not the same")
+    for name, centre, size in (("cx", camera.cx, camera.width), ("cy", camera.cy, camera.height)):
+        if abs(centre - size / 2.0) > CENTRED * size:
+            found.append(f"{name} = {centre:g} is far from the middle of {size} px")
+    radius = folding_radius(description)
+    if radius is not None:
+        found.append(f"the distortion folds the image back at {radius:.0f} px from its middle")
+    if not 0.01 <= camera.mount_height <= HIGHEST:
+        found.append(f"height_m = {camera.mount_height:g} is not the height of a robot's camera")
+    if abs(camera.mount_forward) > FARTHEST_FORWARD:
+        found.append(f"forward_m = {camera.mount_forward:g} is farther from the axle than a robot is long")
+    return found
+
+
+def recorded_faults(recording: Recording) -> list[str]:
+    """The same of a recording's camera, a line each with what to do."""
+    return [f"camera: {fault}: measure it, or: {CALIBRATE}" for fault in faults(recording)]
+
+
+def _view(camera: Camera) -> float:
+    """Horizontal field of view, rad."""
+    return 2.0 * math.atan(camera.width / (2.0 * camera.fx))
+
+
+def folding_radius(description: RobotDescription | Recording) -> float | None:
     """Where the radial distortion turns back within the image, px from the principal point; None if nowhere.
 
     r (1 + k1 r^2 + k2 r^4 + k3 r^6) must grow with r up to the corner.

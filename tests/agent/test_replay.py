@@ -465,3 +465,8 @@ def test_values_without_a_column_are_left_out_where_they_are_empty(folder):
     """As a comma at the end of each line leaves them."""
     (folder / "odometry.csv").write_text("forward_m,turn_rad\n" + "0.02,0.01,\n" * COUNT)
     assert open_recording(folder).increments[1:] == pytest.approx(np.array([[0.02, 0.01]] * (COUNT - 1)))
+
+
+def test_spaces_behind_commas_belong_to_no_name_and_no_number(folder):
+    (folder / "odometry.csv").write_text("forward_m, turn_rad\n" + "0.02, 0.01\n" * COUNT)
+    assert open_recording(folder).increments[1:] == pytest.approx(np.array([[0.02, 0.01]] * (COUNT - 1)))

@@ -66,3 +66,16 @@ def test_a_bag_without_images_is_described_by_its_topics(tmp_path: Path, capfd) 
     assert (facts["images"], facts["seconds"]) == (0, 3.0)
     assert facts["topics"] == [{"name": "/tick", "type": kind, "count": 4}]
     assert "no images" in facts["missing"][0] and "--odometry FILE" in facts["missing"][1]
+
+
+def test_a_camera_that_can_hardly_be_right_is_named(recording: Path, tmp_path: Path, capfd) -> None:
+    assert not facts_of(capfd, recording)["notes"]
+    camera = recording / "camera.toml"
+    right = camera.read_text()
+    for line, words in (("cx = 310", "cx = 310 is far from the middle"), ("fx = 0.6", "field of view 178")):
+        key = line.split()[0]
+        kept = [one for one in right.splitlines() if not one.startswith(key)]
+        camera.write_text("\n".join([*kept, line, ""]))
+        assert words in " ".join(facts_of(capfd, recording)["notes"])
+        assert main(["replay", str(recording), "--offline", "--data", str(tmp_path / "maps")]) == 0
+        assert f"camera: {line.split(' =')[0]} = " in capfd.readouterr().out
