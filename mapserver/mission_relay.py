@@ -84,10 +84,14 @@ class MissionRelay:
         self.roster: Roster | None = None
         self._turn = threading.RLock()
         self._reports: dict[_Key, MissionReport] = {}
+        self._overwritten = False
         self.reload()
 
     def reload(self) -> None:
-        """Read the record, to which other servers may have added."""
+        """Read the record, to which other servers may have added.
+
+        What another server has written over, since it did not know of it yet, `retry` writes again.
+        """
         try:
             kept = self._store.result(KEPT)
             missions = Missions() if kept is None else decode(kept, Missions)
@@ -99,6 +103,12 @@ class MissionRelay:
                 before = self._reports.get(_key(report.order))
                 if before is None or report.supersedes(before):
                     self._reports[_key(report.order)] = report
+            stored = {_key(report.order): report for report in missions.reports}
+            self._overwritten = any(
+                (held := stored.get(_key(report.order))) is None
+                or (report.state is not held.state and report.supersedes(held))
+                for report in self.missions().reports
+            )
 
     def missions(self) -> Missions:
         """All that are known, oldest first."""
@@ -170,8 +180,10 @@ class MissionRelay:
         self._replace_older(report.order)
 
     def retry(self) -> None:
-        """Try to hand on what robots could not be reached for."""
+        """Try to hand on what robots could not be reached for, and write what is not in the record."""
         with self._turn:
+            if self._overwritten:
+                self._keep()
             waiting = [report for report in self._reports.values() if report.state is MissionState.SENT]
         orders: list[MissionOrder] = []
         for report in waiting:
@@ -259,11 +271,15 @@ class MissionRelay:
             self._reports[_key(report.order)] = report
             if before is not None and before.state is report.state:
                 return report
-            kept = Missions.newest(list(self._reports.values()))
-            if len(self._reports) > MAX_KEPT:
-                self._reports = {_key(report.order): report for report in kept.reports}
-            try:
-                self._store.put_result(KEPT, encode(kept))
-            except InvalidFile as error:
-                log.warning("mission %s is not on the disk: %s", report.order.id, error)
+            self._keep()
             return report
+
+    def _keep(self) -> None:
+        """Write the record, with the turn."""
+        kept, self._overwritten = self.missions(), False
+        if len(self._reports) > MAX_KEPT:
+            self._reports = {_key(report.order): report for report in kept.reports}
+        try:
+            self._store.put_result(KEPT, encode(kept))
+        except InvalidFile as error:
+            log.warning("the record of missions is not on the disk: %s", error)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import replace
+from typing import Any
 
 import pytest
 
@@ -25,6 +26,8 @@ from mapweave.hybridmap.mission_order import (
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver import mission_relay
 from mapweave.mapserver.http.web import Web
+from mapweave.mapserver.mission_relay import MissionRelay
+from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import encode
 from tests.mapserver.house import KEYS, House, ask
 from tests.waiting import eventually
@@ -148,6 +151,38 @@ def test_a_robot_that_is_away_gets_its_newest_mission_when_it_is_back(house: Hou
     assert control.report == MissionReport(second.order, MissionState.RUNNING)
     eventually(lambda: house.person.missions()[-1].state is MissionState.RUNNING)
     link.close()
+
+
+class SharedRecord:
+    """The results of a store of two servers, one of which writes before it has heard of the other's."""
+
+    def __init__(self) -> None:
+        self.value: bytes | None = None
+        self.writes = 0
+
+    def result(self, _: str) -> bytes | None:
+        return self.value
+
+    def put_result(self, _: str, value: bytes) -> None:
+        self.value, self.writes = value, self.writes + 1
+
+
+def test_two_servers_that_write_at_once_lose_no_mission_of_each_other() -> None:
+    record: Any = SharedRecord()
+
+    def relay() -> MissionRelay:
+        return MissionRelay(MemoryBus(MemoryHub()), KEYS, record, pytest.fail, time.time_ns)
+
+    first, second = relay(), relay()
+    for one, robot in ((first, "r1"), (second, "r2")):
+        report = MissionReport(MissionOrder.new(robot, MissionKind.EXPLORE, "anna"), MissionState.RUNNING)
+        status = Status("standing", "", 0, 0, Pose2(), False)
+        one.hear(AgentStatus(status, 1, robot, 1, mission=report))
+    for one in (first, second) * 2:
+        one.reload()
+        one.retry()
+    assert record.writes == 3, "once each, and again what the second wrote over"
+    assert [report.order.robot for report in relay().missions().reports] == ["r1", "r2"]
 
 
 def test_a_mission_for_a_robot_that_stays_away_expires(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
