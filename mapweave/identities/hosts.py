@@ -14,7 +14,9 @@ HOST_NAME = re.compile(r"[A-Za-z0-9]([A-Za-z0-9.-]{0,251}[A-Za-z0-9])?")
 def check_hosts(hosts: Iterable[str]) -> None:
     """Refuse what is no name and no address (InvalidValue)."""
     for host in hosts:
-        if not (HOST_NAME.fullmatch(host) or _is_ipv6(host)):
+        # What ends in a number is an address: no such name exists.
+        is_name = HOST_NAME.fullmatch(host) and not host.rpartition(".")[2].isdigit()
+        if not (is_name or _is(ipaddress.IPv4Address, host) or _is(ipaddress.IPv6Address, host)):
             raise InvalidValue(
                 f"--at {host!r}: write a name or an address without a port, such as 192.168.1.10"
             )
@@ -25,9 +27,9 @@ def endpoints_of(hosts: Iterable[str], scheme: str, port: int) -> tuple[str, ...
     return tuple(f"{scheme}/{f'[{host}]' if ':' in host else host}:{port}" for host in hosts)
 
 
-def _is_ipv6(host: str) -> bool:
+def _is(address: type[ipaddress.IPv4Address | ipaddress.IPv6Address], host: str) -> bool:
     try:
-        ipaddress.IPv6Address(host)
+        address(host)
     except ValueError:
         return False
     return "%" not in host

@@ -261,7 +261,10 @@ def test_a_disk_that_is_really_full_is_one_line(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("host", ["127.0.0.1:7447", "10.0.0.5/24", "fe80::1%eth0", "-x", "a b"])
+@pytest.mark.parametrize(
+    "host",
+    ["127.0.0.1:7447", "10.0.0.5/24", "fe80::1%eth0", "-x", "a b", "192.168.1.300", "192.168.1"],
+)
 def test_a_host_is_a_name_or_an_address_without_a_port(
     host: str, capfd: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
