@@ -19,6 +19,7 @@ from mapweave.agent.replication import journal
 from mapweave.agent.replication.salvage import salvage as salvage_journal
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.change import EdgePut
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
@@ -280,6 +281,6 @@ def _lost(path: Path | str, salvaged: Salvage, unread: int) -> str:
     lost = salvaged.damaged + unread
     if salvaged.whole and not lost:
         return ""
-    damaged = f"{lost} damaged changes" if lost else "no damaged change"
+    damaged = counted(lost, "damaged change") if lost else "no damaged change"
     pages = "" if salvaged.whole else f", and {UNREAD}"
     return f"{path} had {damaged}{pages}"

@@ -9,6 +9,7 @@ from typing import Any
 
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.commands.plan import add_plan_option
+from mapweave.hybridmap.counted import counted
 
 FORMATS = ("g2o", "tum", "graphml", "geojson")
 
@@ -53,7 +54,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(path)
     left = len(merged.poses) - len(part.nodes)
     if left:
-        words = f"component {part.component} of {len(merged.components)}: {left} nodes of others are left out"
+        others = f"{counted(left, 'node')} of others {'is' if left == 1 else 'are'} left out"
+        words = f"component {part.component} of {len(merged.components)}: {others}"
         print(
             f"mapweave: {words}; they have frames of their own, choose one with --component", file=sys.stderr
         )

@@ -10,6 +10,7 @@ from typing import Any
 
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.exit_status import DONE, FAILED, NO
+from mapweave.hybridmap.counted import counted
 
 
 def add_to(actions: Any) -> None:
@@ -47,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
     else:
         for extracted in maps:
             content = (
-                f"{extracted.nodes} nodes, {extracted.edges} edges"
+                f"{counted(extracted.nodes, 'node')}, {counted(extracted.edges, 'edge')}"
                 if extracted.path
                 else "empty, not written"
             )

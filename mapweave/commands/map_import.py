@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands.usage import UsageError
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile
 
 
@@ -61,7 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
         print(json.dumps(outcome))
     else:
         print(
-            f"{arguments.out}: {len(poses)} vertices, {len(graph.edges)} edges, "
+            f"{arguments.out}: {len(poses)} vertices, {counted(len(graph.edges), 'edge')}, "
             f"chi-square {outcome['chi2_before']:.6g} before, {outcome['chi2']:.6g} now"
         )
     return 0

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.refusals import check_component
 
@@ -118,7 +119,7 @@ def run(arguments: argparse.Namespace) -> int:
         if len(poses) < len(hybrid.nodes):
             which = f"component {arguments.component}" if len(sizes) > 1 else "what is in use"
             title += f"\ndrawn: {which}, {len(poses)} of {len(hybrid.nodes)} nodes"
-            summary["drawn"] = f"{which}, {len(poses)} nodes"
+            summary["drawn"] = f"{which}, {counted(len(poses), 'node')}"
         edges, places = list(hybrid.edges.values()), _places(content, poses)
         try:
             draw_map(MapPicture(title, poses, edges, landmarks=points, places=places), out)

@@ -20,6 +20,7 @@ from mapweave.commands.network import (
     warn_without_router,
 )
 from mapweave.exit_status import INTERRUPTED
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import DeviceError
 
 if TYPE_CHECKING:
@@ -182,7 +183,7 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
             trajectory_path(data, map_id).write_text(
                 "".join(tum_line(node.stamp_ns, node.map_from_robot.mean) for node in nodes)
             )
-            say(f"{name}: {len(nodes)} nodes in {map_path(data, map_id)}; its scale is unknown")
+            say(f"{name}: {counted(len(nodes), 'node')} in {map_path(data, map_id)}; its scale is unknown")
             if not arguments.offline:
                 sent = send_map(changes, map_id, path, bus, keys, network.server, arguments.timeout)
                 say(f"{name}: server {network.server} has {'' if sent else 'not taken '}it all")

@@ -29,6 +29,7 @@ from mapweave.agent.runner import Runner
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import FreeRunning, Synchronization
 from mapweave.agent.teleoperation import Teleoperation
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind
@@ -211,7 +212,7 @@ class Agent:
         )  # fmt: skip
         self.journal.open_map(map_id.epoch)
         nodes = len(pipeline.map.nodes)
-        self._say(f"takes up map {map_id} with {nodes} nodes")
+        self._say(f"takes up map {map_id} with {counted(nodes, 'node')}")
         if kept.complaint:
             self._say(kept.complaint)
             self._set_aside(map_id)

@@ -45,7 +45,7 @@ def test_maps_of_a_journal_are_extracted_and_no_file_is_written_over(tmp_path, c
     source = journal_with(tmp_path / "r0.sqlite", 1, 4, 9)
     assert main(["map", "extract", str(source), "-o", str(tmp_path / "out")]) == 0
     output = capfd.readouterr().out
-    assert f"{tmp_path / 'out' / 'r0.4.mapweave'}: 1 nodes, 0 edges" in output
+    assert f"{tmp_path / 'out' / 'r0.4.mapweave'}: 1 node, 0 edges" in output
     assert "r0.9: empty, not written" in output
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["r0.1.mapweave", "r0.4.mapweave"]
     (tmp_path / "out" / "r0.1.mapweave").unlink()

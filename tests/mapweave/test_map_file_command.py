@@ -101,7 +101,7 @@ def test_the_summary_of_a_merged_map(merged_file, capfd, tmp_path):
     assert (tmp_path / "pictures" / "m.png").stat().st_size > 5000
     assert values["drawn"] == f"component 0, {2 * len(TOUR) - 1} nodes"
     values = summary(capfd, merged_file, "--out", tmp_path / "other.png", "--component", 1)
-    assert values["drawn"] == "component 1, 1 nodes"
+    assert values["drawn"] == "component 1, 1 node"
     assert (tmp_path / "other.png").read_bytes() != (tmp_path / "pictures" / "m.png").read_bytes()
     assert main(["map", "show", str(merged_file), "--component", "2"]) == 4
     assert "has no component 2; it has 0 to 1" in capfd.readouterr().err
