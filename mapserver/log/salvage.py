@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sqlite3
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,6 +49,12 @@ def salvage(path: Path) -> Salvage:
         InvalidFile: nothing in it can be read, or a server uses it.
     """
     with reading(path, "map store") as connection:
+        try:
+            connection.execute("SELECT 1 FROM sqlite_master").fetchone()
+        except sqlite3.Error:
+            # The description of one table is damaged: with this SQLite reads the others all the same.
+            connection.execute("PRAGMA writable_schema=ON")
+            return replace(_read(connection, path), whole=False)
         return _read(connection, path)
 
 

@@ -353,6 +353,22 @@ def test_a_store_with_broken_pages_is_extracted(
     assert fleet.served() == maps
 
 
+@pytest.mark.parametrize("table", ["refused", "result", "damaged"])
+def test_a_store_whose_description_of_a_table_is_damaged_is_extracted(
+    whole: Path, fleet: Fleet, capfd: pytest.CaptureFixture[str], table: str
+) -> None:
+    """SQLite reads nothing of it by itself, also no other table."""
+    _, maps = truth(whole)
+    data = fleet.path.read_bytes()
+    assert data.count(f"CREATE TABLE {table}".encode()) == 1
+    fleet.path.write_bytes(data.replace(f"CREATE TABLE {table}".encode(), f"CREATE TABLF {table}".encode()))
+    assert main(["map", "extract", str(fleet.path), "-o", str(fleet.folder / "out")]) == 1
+    assert "pages that cannot be read" in capfd.readouterr().err
+    for one, changes in maps.items():
+        content = read_map_file(fleet.folder / "out" / f"{one}.mapweave")
+        assert sorted(map(encode_body, content.changes)) == changes
+
+
 def test_a_whole_store_is_extracted_whole(
     whole: Path, fleet: Fleet, capfd: pytest.CaptureFixture[str]
 ) -> None:
