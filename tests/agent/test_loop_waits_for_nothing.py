@@ -11,6 +11,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mapweave.agent.fleet_client import FleetClient
@@ -251,3 +252,27 @@ def test_a_recording_waits_for_the_loop(description, caplog) -> None:
     with caplog.at_level(logging.WARNING):
         assert runner.run(robot, threading.Event()) == 3
     assert runner.skipped == 0 and not caplog.messages
+
+
+def test_a_driver_may_reuse_the_memory_of_its_image_and_count_stamps_with_numpy(description) -> None:
+    """Else the last image becomes the next one: the camera is taken for frozen."""
+    image = np.zeros((4, 4), np.uint8)
+
+    class Reusing(Player):
+        def sense(self) -> Observation | None:
+            image[:] += 1
+            return super().sense()
+
+    class Keeping(Slow):
+        def step(self, observation: Observation, answers: object, driven: object) -> Step:
+            kept.append(observation)
+            return super().step(observation, answers, driven)
+
+    kept = list[Observation]()
+    stamps = np.arange(1, 4) * 10**8
+    robot = Reusing(description, [Observation(stamp, Odometry(0.0, 0.0), image) for stamp in stamps])
+    slow, fleet = Keeping([0.02] * 3), Fleet()
+    runner = Runner(slow, fleet, fleet, MissionControl("r0"), MappingMonitor(description), clock=slow.clock)
+    assert runner.run(robot, threading.Event()) == 3
+    assert [int(seen.image[0, 0]) for seen in kept if seen.image is not None] == [1, 2, 3]
+    assert all(type(seen.stamp_ns) is int for seen in kept)
