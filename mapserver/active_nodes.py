@@ -83,13 +83,20 @@ class ActiveNodes:
 
 
 def doubted(merged: MergedMap) -> list[NodeId]:
-    """Nodes of components of which each map is implausible or has wrong geometry.
+    """Nodes of implausible maps, of maps with wrong geometry, and of robots that have little else.
 
     They are no second place where a robot could be: where other maps give a certain answer without them, they
     make it neither ambiguous nor another one. Where no other map does they answer.
     """
+    maps = {map_id: one for map_id, one in merged.maps.items() if map_id not in merged.constraints.retired}
     odd = merged.wrong.keys() | merged.implausible.keys()
-    return [node for graph in merged.graphs if odd and graph.maps <= odd for node in graph.nodes]
+    unreliable = unreliable_robots(maps, odd, merged.pruned.maps)
+    return [
+        node
+        for map_id, one in maps.items()
+        if map_id in odd or map_id.agent in unreliable
+        for node in one.nodes
+    ]
 
 
 def _misplaced(merged: MergedMap) -> Iterator[NodeId]:

@@ -1,23 +1,49 @@
 """Optimises in two stages: implausible maps behind the others, so that what they measured bears on no others.
 
 Such a map is joined where its links support it, since an honest robot may have a clock that runs backwards.
-But the others are where they are without it, and as certain: they are solved first, and then held.
+But the others are where they are without it, as certain, and in the same components: they are solved first,
+and then held. Where it alone would join others it stays with those to which most links tie it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Set
+from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.pose import Array
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component import Component, pieces
 from mapweave.merge.pose_graph.factors import Factors, Rows
+from mapweave.merge.pose_graph.links import RefusedLink, refuse, refuse_edge
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.optimization import optimized
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.registration.pose_arrays import compose_poses, inverse_poses
+
+ALONE = "is implausible, and what it alone would join is not joined"
+"""Reason of a refusal, after the name of the map."""
+
+
+class Staged(NamedTuple):
+    """What has become of a component in which some maps are implausible.
+
+    Attributes:
+        before: the component.
+        odd: these maps.
+        graphs: the components that it consists of.
+        parted: nodes between which a link does not hold.
+    """
+
+    before: PoseGraph
+    odd: Set[MapId]
+    graphs: Sequence[PoseGraph]
+    parted: Set[Pair]
 
 
 class StagedOptimization:
@@ -25,49 +51,127 @@ class StagedOptimization:
 
     def __init__(self) -> None:
         """Nothing is solved yet."""
-        self._solved: dict[int, tuple[PoseGraph, Set[MapId], PoseGraph]] = {}
+        self._solved: dict[int, Staged] = {}
 
     def solved(self, merged: MergedMap, implausible: Set[MapId]) -> MergedMap:
-        """A merged map whose plausible maps are where they are without the others.
+        """A merged map whose plausible maps are where they are without the others, and joined as without.
 
         Args:
             merged: as all measurements together have it.
-            implausible: maps of it.
+            implausible: maps of it. Where one of them joins others by a link by hand, it does.
         """
-        kept = {}
-        graphs = []
+        by_hand = {(min(pair), max(pair)) for pair in merged.constraints.links}
+        kept: dict[int, Staged] = {}
         for graph in merged.graphs:
             odd = graph.maps & implausible
             if odd and odd < graph.maps:
                 known = self._solved.get(id(graph))
-                if known is None or known[1] != odd:
-                    known = graph, odd, _in_two_stages(graph, odd)
+                if known is None or known.odd != odd or known.parted & by_hand:
+                    known = _in_two_stages(graph, odd, merged.maps, by_hand)
                 kept[id(graph)] = known
-                graph = known[2]
-            graphs.append(graph)
         self._solved = kept
         if not kept:
             return merged
-        return replace(merged, graphs=tuple(graphs), poses=Poses(graphs))
+        graphs = [one for g in merged.graphs for one in (kept[id(g)].graphs if id(g) in kept else (g,))]
+        if len(graphs) == len(merged.graphs):
+            return replace(merged, graphs=tuple(graphs), poses=Poses(graphs))
+        graphs.sort(key=lambda graph: (-len(graph.nodes), graph.anchor))
+        parted = set[Pair]().union(*(known.parted for known in kept.values()))
+        refused = sorted(
+            (*merged.refused, *_refused(merged, implausible, parted, Poses(graphs))), key=lambda one: one.pair
+        )
+        return replace(
+            merged,
+            links=tuple(link for link in merged.links if link.key not in parted),
+            refused=tuple(refused),
+            components=tuple(frozenset(graph.nodes) for graph in graphs),
+            poses=Poses(graphs),
+            graphs=tuple(graphs),
+        )
 
 
-def _in_two_stages(graph: PoseGraph, odd: Set[MapId]) -> PoseGraph:
-    """A component in which some maps move no others; as it is if they alone join the others."""
+def _refused(merged: MergedMap, odd: Set[MapId], parted: Set[Pair], poses: Poses) -> Iterator[RefusedLink]:
+    """The links between what is not joined, and the drives."""
+    for link in merged.links:
+        if link.key in parted:
+            which = next(end.map for end in link.key if end.map in odd)
+            yield refuse(link, f"map {which} {ALONE}")
+    before = {refusal.edge for refusal in merged.refused}
+    for hybrid_map in merged.maps.values():
+        for edge in hybrid_map.edges.values():
+            if not edge.within and edge.id not in before and poses.number(edge.a) != poses.number(edge.b):
+                yield refuse_edge(edge, "a drive joins maps that nothing else joins")
+
+
+def _in_two_stages(
+    graph: PoseGraph, odd: Set[MapId], maps: Mapping[MapId, HybridMap], by_hand: Collection[Pair]
+) -> Staged:
+    """A component in which some maps move and join no others; as it is if a person has joined by them."""
     assert isinstance(graph, Component), "the solver's"
-    is_odd = np.array([node.map in odd for node in graph.nodes])
-    sound, factors = np.flatnonzero(~is_odd), graph.factors
+    nodes, factors = graph.nodes, graph.factors
+    is_odd = np.array([node.map in odd for node in nodes])
+    ends_odd = is_odd[factors.a].astype(np.int64) + is_odd[factors.b]
+    piece = pieces(factors.take(ends_odd != 1), len(nodes))
+    across = np.flatnonzero(ends_odd == 1)
+    stays = across[_stays(factors.take(across), piece, is_odd)]
+    part = pieces(Factors.together([factors.take(ends_odd != 1), factors.take(stays)]), len(nodes))
+    ends = part[factors.a] != part[factors.b]
+    rows_parted = np.stack([factors.a[ends], factors.b[ends]], axis=1)
+    # Rows are in the order of ids.
+    parted = {(nodes[a], nodes[b]) for a, b in np.sort(rows_parted, axis=1).tolist()}
+    if not parted.isdisjoint(by_hand):
+        return Staged(graph, odd, (graph,), set())
+    graphs = []
+    for label in np.unique(part).tolist():
+        rows = np.flatnonzero(part == label)
+        row_of = np.zeros(len(nodes), np.int64)
+        row_of[rows] = np.arange(len(rows))
+        own = factors.take((part[factors.a] == label) & ~ends, row_of)
+        some = tuple(nodes[row] for row in rows.tolist())
+        means = graph.means[rows]
+        if graph.anchor not in some:
+            # Its frame is that of the robot of its smallest node, as it is without the implausible map.
+            wanted = maps[some[0].map].nodes[some[0]].map_from_robot.mean.vector[None]
+            means = compose_poses(compose_poses(wanted, inverse_poses(means[:1])), means)
+            means[0] = wanted[0]
+        graphs.append(_part_in_two_stages(some, means, own, is_odd[rows], graph.unsettled))
+    return Staged(graph, odd, graphs, parted)
+
+
+def _stays(across: Factors, piece: Rows, is_odd: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """(N,) which measurements tie a piece of odd maps to the one piece of others that it stays with.
+
+    Args:
+        across: (N,) measurements between odd maps and others.
+        piece: of which connected piece of odd maps, or of others, each node is.
+        is_odd: of each node.
+    """
+    at_odd = is_odd[across.a]
+    own = piece[np.where(at_odd, across.a, across.b)]
+    other = piece[np.where(at_odd, across.b, across.a)]
+    pairs, which, counts = np.unique(np.stack([own, other]), axis=1, return_inverse=True, return_counts=True)
+    sizes = np.bincount(piece)
+    # Most links, then most nodes, then the smallest id.
+    order = np.lexsort([pairs[1], -sizes[pairs[1]], -counts, pairs[0]])
+    best = order[np.unique(pairs[0][order], return_index=True)[1]]
+    out: NDArray[np.bool_] = np.isin(which.ravel(), best)
+    return out
+
+
+def _part_in_two_stages(
+    nodes: Sequence[NodeId], means: Array, factors: Factors, is_odd: NDArray[np.bool_], unsettled: int
+) -> Component:
+    """A component whose others hang together without the odd maps; its first node is held."""
     ends_odd = is_odd[factors.a].astype(np.int64) + is_odd[factors.b]
     between = factors.take(ends_odd == 0)
-    if len(np.unique(pieces(between, len(graph.nodes))[sound])) > 1:
-        return graph
-    anchor = graph.rows[graph.anchor]
-    held = sound[:1] if is_odd[anchor] else np.array([anchor])
-    means = optimized(between, graph.means, sound, held)
+    sound = np.flatnonzero(~is_odd)
+    held = sound[:1] if is_odd[0] else np.zeros(1, np.int64)
+    means = optimized(between, means, sound, held)
     means = optimized(factors, means, np.flatnonzero(is_odd), sound[:0])
     attached = Factors.together(
         [between, factors.take(ends_odd == 2), _attachments(factors, is_odd, ends_odd)]
     )
-    return Component(graph.anchor, graph.nodes, means, attached, graph.unsettled)
+    return Component(nodes[0], tuple(nodes), means, attached, unsettled)
 
 
 def _attachments(factors: Factors, is_odd: NDArray[np.bool_], ends_odd: Rows) -> Factors:

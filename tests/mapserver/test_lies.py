@@ -28,11 +28,12 @@ from mapweave.mapserver.plausibility import MOST_FRAGMENTS, implausible, unrelia
 from mapweave.merge.constraint_checks import check_manual_constraint
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.staged_optimization import ALONE
 from mapweave.scenarios.liar.lies import altered
 from mapweave.wire.codec import decode_change
 from mapweave.wire.log_messages import Head
 from mapweave.wire.messages import encode
-from synthetic.world import take_map
+from synthetic.world import room, take_map
 from tests.mapserver.test_set_apart import (
     KEYS,
     TOUR,
@@ -224,6 +225,57 @@ def test_a_map_with_a_clock_that_runs_backwards_is_joined_and_moves_no_other(clo
         for node in component
     )
     assert moved < 1e-6 if clock else moved > 1e-3
+
+
+@pytest.mark.parametrize("lies", [False, True], ids=["honest", "its clock runs backwards"])
+def test_an_implausible_map_does_not_join_what_nothing_else_joins(lies: bool) -> None:
+    """Two robots in two rooms have no node in common, and a third one has been in both."""
+    other = Pose2(20.0, 0.0, 0.0)
+    world = WORLD + room(20, 0, 5, 4, 600, np.random.default_rng(2))
+    tours = {MapId("b", 1): TOUR, MapId("r", 1): [other @ pose for pose in TOUR[:3]]}
+    alone, beside = Merger(), Merger()
+    for number, (map_id, tour) in enumerate(tours.items()):
+        nodes, edges = take_map(world, map_id, tour, np.random.default_rng(number))
+        contents: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
+        for k, body in enumerate(contents, start=1):
+            alone.on_change(Change(map_id, k, 0, body))
+            beside.on_change(Change(map_id, k, 0, body))
+    before = alone.merged()
+    assert len(before.components) == 2
+    way = [*tours[MapId("b", 1)], *tours[MapId("r", 1)]]
+    nodes = take_map(world, LAST, way, np.random.default_rng(8))[0]
+    log = driven(LAST, nodes, [a.inverse() @ b for a, b in pairwise(way)])
+    end = next(iter(before.components[0]))
+    last = NodeId(*LAST, 2 * len(nodes) - 1)
+    drive = Edge(NodeId(*LAST, 900), last, end, PoseGaussian(Pose2(), STEP), EdgeKind.DRIVEN)
+    for number, body in enumerate([*log, EdgePut(drive)], start=1):
+        if isinstance(body, NodePut) and lies:
+            body = NodePut(replace(body.node, stamp_ns=10**12 - body.node.stamp_ns, clock="utc"))
+        beside.on_change(Change(LAST, number, 0, body))
+    after = beside.merged()
+    first, second = tours
+    assert after.joined(first, second) is not lies
+    if not lies:
+        return
+    # It stays where most links tie it, and the page says why the others do not hold.
+    assert after.implausible.keys() == {LAST}
+    assert after.joined(first, LAST) and not after.joined(second, LAST)
+    refused = [one for one in after.refused if one.reason == f"map {LAST} {ALONE}"]
+    assert refused and all({end.map for end in one.pair} == {second, LAST} for one in refused)
+    assert drive.id in {one.edge for one in after.refused}
+    for component in before.components:
+        for node in component:
+            assert before.pose(node).distance(after.pose(node)) < 1e-6
+    assert after.components == tuple(frozenset(graph.nodes) for graph in after.graphs)
+    assert {node for graph in after.graphs for node in graph.nodes} == set(after.poses)
+    assert beside.merged() is after
+    # A person who links the two by hand vouches for it.
+    link = refused[0].link
+    assert link is not None
+    spread = link.a_from_b.covariance[np.triu_indices(3)]
+    by_hand = Linked(*link.pair, link.a_from_b.mean, tuple(spread.tolist()))
+    beside.constrain(ManualConstraints([ManualConstraint(by_hand, True, "bob", 0)]))
+    assert beside.merged().joined(first, second)
 
 
 def test_a_map_of_which_a_change_was_refused_is_joined_by_a_person_alone() -> None:

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.pose_graph.component import Component, solve_graph
 from mapweave.merge.pose_graph.factors import Measurement
 from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
 from mapweave.merge.pose_graph.staged_optimization import StagedOptimization
+from synthetic.world import room, take_map
 
 ODD = MapId("m", 1)
 SIGMAS = 0.05, 0.02
@@ -44,6 +48,14 @@ def drawn(seed: int, names: tuple[str, str, str], links: tuple[tuple[int, int], 
 def solved(measurements: list[Measurement]) -> Component:
     anchor = min(node for m in measurements for node in (m.a, m.b))
     return solve_graph(anchor, Pose2(), measurements)
+
+
+def map_with(node_id: NodeId, pose: Pose2) -> HybridMap:
+    rng = np.random.default_rng(0)
+    nodes, _ = take_map(room(0, 0, 5, 4, 50, rng), node_id.map, [pose], rng)
+    out = HybridMap()
+    out.apply(NodePut(replace(nodes[0], id=node_id, map_from_robot=PoseGaussian(pose, np.zeros((3, 3))))))
+    return out
 
 
 def merged_map(graph: Component) -> MergedMap:
@@ -98,9 +110,34 @@ def test_the_others_are_where_they_are_without_it(seed: int, names: tuple[str, s
         assert error(moved) > error(means)
 
 
-def test_where_it_alone_joins_the_others_it_does() -> None:
-    merged = merged_map(solved(drawn(1, ("a", "b", "m"), ((0, 2), (1, 2)))))
-    assert StagedOptimization().solved(merged, {ODD}).graphs[0] is merged.graphs[0]
+@pytest.mark.parametrize("names", [("a", "b", "m"), ("n", "o", "m")], ids=["behind", "first of all"])
+def test_what_it_alone_would_join_is_not_joined(names: tuple[str, str, str]) -> None:
+    measurements = drawn(1, names, ((0, 2), (1, 2)))
+    # One link more to the second.
+    rng = np.random.default_rng(3)
+    second, odd = NodeId(names[1], 1, 2), NodeId(*ODD, 2)
+    measurements.append(measured(second, odd, {second: Pose2(1.0), odd: Pose2()}, rng))
+    graph = solved(measurements)
+    merged = merged_map(graph)
+    frames = {node: Pose2(3.0, -1.0, 0.7) for node in (NodeId(names[0], 1, 1), NodeId(names[1], 1, 1))}
+    maps = {node.map: map_with(node, frame) for node, frame in frames.items()}
+    last = StagedOptimization()
+    parted = last.solved(replace(merged, maps=maps), {ODD})
+    assert [{node.agent for node in component} for component in parted.components] == [
+        {names[1], "m"},
+        {names[0]},
+    ]
+    for name in names[:2]:
+        own = [m for m in measurements if m.a.agent == m.b.agent == name]
+        alone, first = solved(own), NodeId(name, 1, 1)
+        for node in alone.nodes:
+            way = parted.pose(first).inverse() @ parted.pose(node)
+            assert way.distance(alone.pose(first).inverse() @ alone.pose(node)) < 1e-6
+    # What leaves the frame of its component's smallest node has the frame of its own smallest.
+    moved = next(graph for graph in parted.graphs if solved(measurements).anchor not in graph.nodes)
+    if moved.anchor in frames:
+        assert moved.pose(moved.anchor).distance(frames[moved.anchor]) < 1e-12
+    assert last.solved(replace(merged, maps=maps), {ODD}).graphs == parted.graphs
 
 
 def test_what_did_not_change_is_the_same_object() -> None:
