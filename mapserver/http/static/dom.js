@@ -1,5 +1,7 @@
 // Elements, numbers in words, and questions to the server.
 export const byId = id => document.getElementById(id);
+// The noun is in the singular.
+export const counted = (count, noun) => `${count} ${noun}${count === 1 ? "" : "s"}`;
 const SVG = "http://www.w3.org/2000/svg";
 
 export function add(parent, name, text, kind) {

@@ -1,8 +1,8 @@
 // The tab Edit: what is selected, a form for each kind of edit, what the server says it would do, and then does. Forms
 // stay as they are when the kind, the tab or the selection changes, so nothing that was typed is lost.
-import { add, button, byId } from "./dom.js";
+import { add, button, byId, counted } from "./dom.js";
 import { change, callMe, onPermission, permission } from "./changes.js";
-import { EDITORS, plural } from "./editors.js";
+import { EDITORS } from "./editors.js";
 import { placeNamed } from "./annotations.js";
 import { nodeNamed, wordsOf } from "./names.js";
 
@@ -127,7 +127,7 @@ export class EditPanel {
       const [a, b] = names.map(name => model.nodes.component[model.rowOf(name)]);
       if (a !== undefined && b !== undefined)
         words += a === b ? ` Both are in component ${a} already.`
-          : ` It joins component ${a} (${plural(model.members[a].length, "node")}) and component ${b} (${plural(model.members[b].length, "node")}).`;
+          : ` It joins component ${a} (${counted(model.members[a].length, "node")}) and component ${b} (${counted(model.members[b].length, "node")}).`;
     }
     // A status that has not changed is not read out again.
     if (byId("edit-counts").textContent !== words) byId("edit-counts").textContent = words;

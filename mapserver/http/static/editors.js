@@ -1,12 +1,13 @@
 // What can be changed by a form: each kind of edit with its fields, and the request that it makes of the selection.
 // A further kind is one more entry.
+import { counted } from "./dom.js";
+
 const lacks = words => { throw new Error(words); };
-export const plural = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
 
 function nodes({ names, area }, count, what) {
   if (area) lacks(`${what} is about nodes: select them on the map or type them above, not an area.`);
   if (count ? names.length !== count : !names.length)
-    lacks(`${what} is about ${count ? plural(count, "node") : "nodes"}: ${names.length} selected.`);
+    lacks(`${what} is about ${count ? counted(count, "node") : "nodes"}: ${names.length} selected.`);
   return names;
 }
 // A node with some floor around, a way between two nodes, or an area.

@@ -1,5 +1,5 @@
 // Why two nodes or maps are one, or are not, and why a route leads as it does: GET /explain and GET /route.
-import { add, ask, button, byId, degrees, draw, metres, percent } from "./dom.js";
+import { add, ask, button, byId, counted, degrees, draw, metres, percent } from "./dom.js";
 import { drawView } from "./views.js";
 
 const BAD_PX = 10;
@@ -16,7 +16,7 @@ function colour(px) {
 function picture(parent, pair) {
   const nodes = [pair.a, pair.b], [above, below] = nodes.map(node => node.image);
   const wide = Math.max(above[0], below[0]), px = wide / 320, shift = [0, above[1] + 22 * px];
-  const agreement = `${pair.shared.length} landmarks of ${pair.a.id} and ${pair.b.id} agree`;
+  const agreement = `${counted(pair.shared.length, "landmark")} of ${pair.a.id} and ${pair.b.id} agree`;
   const svg = draw(parent, "svg", { role: "img", class: "picture",
     "aria-label": agreement,
     viewBox: [-2 * px, -18 * px, wide + 4 * px, shift[1] + below[1] + 20 * px].join(" ") });
@@ -97,7 +97,7 @@ function showTwo(one) {
   const box = add(result, "section", "", one.joined ? "box good" : "box");
   add(box, "p", one.reason);
   if (!one.joined)
-    add(box, "p", `${one.refused} links refused, ${one.unverified} candidate pairs without a common pose.`);
+    add(box, "p", `${counted(one.refused, "link")} refused, ${counted(one.unverified, "candidate pair")} without a common pose.`);
   if (one.nearest.length) add(box, "p", one.joined ? "Weakest links:" : "Nearest to a link:");
   const list = add(box, "ul");
   for (const n of one.nearest) {

@@ -1,5 +1,5 @@
 // One node: GET /nodes/NODE.
-import { add, ask, button, byId, draw, facts, when } from "./dom.js";
+import { add, ask, button, byId, counted, draw, facts, when } from "./dom.js";
 import { drawView } from "./views.js";
 
 const box = byId("selected");
@@ -13,11 +13,11 @@ function pose({ mean, sigma }) {
 function picture(parent, node) {
   const { image: [width, height], pixels } = node.node, faded = new Set(node.faded);
   const svg = draw(parent, "svg", { class: "picture", role: "img", viewBox: `-1 -1 ${width + 2} ${height + 2}`,
-    "aria-label": `${pixels.length} landmarks in the image of ${node.node.id}` });
+    "aria-label": `${counted(pixels.length, "landmark")} in the image of ${node.node.id}` });
   const red = faded.size ? "; red: faded" : "";
   const words = add(parent, "small", `The landmarks in its image, ${width} x ${height} px${red}`);
   drawView(svg, node.node, 0, node.no_view, () => {
-    svg.setAttribute("aria-label", `The view of ${node.node.id} with its ${pixels.length} landmarks`);
+    svg.setAttribute("aria-label", `The view of ${node.node.id} with its ${counted(pixels.length, "landmark")}`);
     words.textContent = `Its view with the landmarks${red}`;
   }, why => words.append(`. No view: ${why}.`));
   draw(svg, "rect", { x: 0, y: 0, width, height, class: "frame" });
@@ -40,7 +40,7 @@ export async function showNode(name, { select, why, send, edit }) {
     ["landmarks", `${node.landmarks}, ${node.with_depth} with a depth, ${node.faded.length} faded`],
     ["on the wire", `${node.bytes} bytes`],
     ["taken", node.stamp_ns > 1e18 ? when(node.stamp_ns) : `${(node.stamp_ns / 1e9).toFixed(1)} s`],
-    ["superseded", fate ? `by ${fate.by}, ${fate.distance.toFixed(2)} m off, ${fate.found} landmarks found again` : "no"],
+    ["superseded", fate ? `by ${fate.by}, ${fate.distance.toFixed(2)} m off, ${counted(fate.found, "landmark")} found again` : "no"],
   ]);
   const actions = add(box, "div", "", "actions");
   if (fate) button(actions, `Show ${fate.by}`, () => select(fate.by));
@@ -52,7 +52,7 @@ export async function showNode(name, { select, why, send, edit }) {
   for (const { node: other, kind, shared } of node.neighbours) {
     const item = add(list, "li");
     button(item, other, () => select(other));
-    item.append(` ${kind}` + (shared ? `, ${shared} landmarks ` : " "));
+    item.append(` ${kind}` + (shared ? `, ${counted(shared, "landmark")} ` : " "));
     button(item, "why", () => why(name, other)).setAttribute("aria-label", `Why ${name} and ${other} are joined`);
   }
 }

@@ -1,5 +1,5 @@
 // The page: what comes over the WebSocket goes to the map and the panels, what is chosen on one shows on all.
-import { add, button, byId, draw } from "./dom.js";
+import { add, button, byId, counted, draw } from "./dom.js";
 import { colours, edgeColour, followTheme, hue } from "./colours.js";
 import { drawAnnotations, loadAnnotations } from "./annotations.js";
 import { permit } from "./changes.js";
@@ -137,7 +137,7 @@ function listComponents() {
     add(item, "span", "", "swatch").style.background = hue(anchor);
     button(item, `component ${k}`, () => { viewport.fit(model.bounds(model.members[k])); painter.ask(); });
     const some = maps.length > 6 ? `${maps.slice(0, 6).join(", ")} and ${maps.length - 6} more` : maps.join(", ");
-    item.append(` ${floor ? `floor ${floor}, ` : ""}${nodes} node${nodes === 1 ? "" : "s"} of ${some}`);
+    item.append(` ${floor ? `floor ${floor}, ` : ""}${counted(nodes, "node")} of ${some}`);
   });
 }
 function listNames() {

@@ -1,5 +1,5 @@
 // Robots: the list of all, and one with its missions. POST /robots/...
-import { add, ask, button, byId, degrees, facts, percent, seconds } from "./dom.js";
+import { add, ask, button, byId, counted, degrees, facts, percent, seconds } from "./dom.js";
 import { wordsOf } from "./names.js";
 
 const QUIET = 5; // s without a status
@@ -97,7 +97,7 @@ export function updateRobot(robots) {
     ["last node on the server", robot.newest],
     ["links with other maps", robot.newest && robot.links],
     ["not merged", robot.apart, "warn"],
-    ["not yet on the server", status && `${status.unsent} changes${robot.lag ? ", one for " + seconds(robot.lag) : ""}`],
+    ["not yet on the server", status && `${counted(status.unsent, "change")}${robot.lag ? ", one for " + seconds(robot.lag) : ""}`],
     ["images skipped", status && status.skipped],
     ["battery", status?.battery != null ? percent(status.battery) : ""],
     ["sees the server", status && (status.linked ? "yes" : "no")],

@@ -1,6 +1,7 @@
 // What an edit is about: some nodes, or an area. An area hangs on a node, as on the server, so that it moves with the
 // map.
 import { colours } from "./colours.js";
+import { counted } from "./dom.js";
 
 export const within = (corners, x, y) => {
   let odd = false;
@@ -10,7 +11,6 @@ export const within = (corners, x, y) => {
   });
   return odd;
 };
-const counted = (count, what) => `${count} ${what}${count === 1 ? "" : "s"}`;
 const listed = names => names.length > 4 ? `${names.slice(0, 4).join(", ")} and ${names.length - 4} more` : names.join(", ");
 
 export class Selection {
