@@ -221,7 +221,7 @@ def test_a_plan_of_a_server_is_drawn(
     assert house.server.settle(20.0)
     house.person.put_plan_image(PNG.png)
     house.person.annotate("plan", "flat", **fields())
-    monkeypatch.setattr("mapweave.commands.missions.fleet_of", lambda _: nullcontext(house.person))
+    monkeypatch.setattr("mapweave.commands.annotating.fleet_of", lambda _: nullcontext(house.person))
     picture = tmp_path / "plan.png"
     assert main(["plan", "show", "flat", "-o", str(picture)]) == 0
     assert capsys.readouterr().out.endswith(f"{picture}\n")
