@@ -9,6 +9,8 @@ import re
 from collections.abc import Mapping
 from types import MappingProxyType
 
+from mapweave.hybridmap.counted import counted
+
 TYPES = {
     "int": "a whole number",
     "float": "a number",
@@ -61,8 +63,9 @@ def _expected(found: re.Match[str]) -> str:
     wanted = ", or ".join(TYPES[name] for name in found["types"].split(" | ") if name in TYPES)
     limit = found["limit"].replace(">=", "at least").replace("<=", "at most").strip()
     if limit.startswith("of length"):
-        of = "elements" if found["types"].startswith("array") else "characters"
-        wanted += f" of {limit.removeprefix('of length').strip()} {of}"
+        of = "element" if found["types"].startswith("array") else "character"
+        words, _, count = limit.removeprefix("of length").strip().rpartition(" ")
+        wanted += " of " + f"{words} {counted(int(count), of)}".strip()
     elif limit:
         wanted += f", {limit}"
     given = found["count"] or NOT.get(found["got"] or "")

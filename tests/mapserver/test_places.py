@@ -178,7 +178,7 @@ def test_places_over_http(house: House) -> None:
             ),
             (
                 b'{"name": "r0.1", "body": {"kind": "floor", "node": "r0.1.3", "label": ""}}',
-                "`label`: give text of at least 1 characters; for example",
+                "`label`: give text of at least 1 character; for example",
             ),
             (
                 b'{"name": "x", "body": {"kind": "portal", "a": "r0.1.1", "b": "r0.1.3", "means": "rope"}}',
