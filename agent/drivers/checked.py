@@ -53,6 +53,7 @@ class CheckedRobot:
         self._stamp_ns: int | None = None
         self._good = self._moved = 0
         self._waiting_since: float | None = None
+        self._closed = False
 
     def describe(self) -> RobotDescription:
         """Description of the robot.
@@ -81,8 +82,9 @@ class CheckedRobot:
         """
         description = self.describe()
         self._waiting_since = time.monotonic()
+        seen = None
         try:
-            with _driver_code():
+            with _driver_code(), self._until_closed():
                 seen = self._robot.sense()
         finally:
             self._waiting_since = None
@@ -104,7 +106,8 @@ class CheckedRobot:
         Raises:
             DeviceError: the driver returns no command, or has failed.
         """
-        with _driver_code():
+        applied = Command()
+        with _driver_code(), self._until_closed():
             applied = self._robot.act(command)
         if not isinstance(applied, Command):
             raise mistake("act()", f"must return the Command that is applied, not {kind_of(applied)}")
@@ -114,11 +117,23 @@ class CheckedRobot:
 
     def close(self) -> None:
         """Stop the wheels and release the robot. A driver that fails at that is logged: the map is kept."""
+        self._closed = True
         try:
             with _driver_code():
                 self._robot.close()
         except DeviceError as error:
             log.error("%s", error)
+
+    @contextmanager
+    def _until_closed(self) -> Iterator[None]:
+        """What a driver's own code raises because it was closed meanwhile is no failure."""
+        try:
+            yield
+        except MapweaveError:
+            raise
+        except Exception:
+            if not self._closed:
+                raise
 
     def _check_unit(self, stamp_ns: int) -> None:
         """Of the first stamp alone: a clock since the start comes by such numbers later."""

@@ -254,6 +254,26 @@ def test_act_without_an_answer(applied: Any, words: str) -> None:
         checked(applied=applied).act(Command())
 
 
+class ClosedMeanwhile(Scripted):
+    """A stop signal closes it while it reads, or before it is commanded."""
+
+    def sense(self) -> Any:
+        self.robot.close()
+        raise OSError(9, "Bad file descriptor")
+
+    def act(self, command: Command) -> Any:
+        raise OSError(9, "Bad file descriptor")
+
+
+def test_a_driver_that_fails_as_it_is_closed_has_ended() -> None:
+    driver = ClosedMeanwhile()
+    driver.robot = CheckedRobot(driver)
+    with pytest.raises(DeviceError, match="Bad file descriptor"):
+        driver.robot.act(Command())
+    assert driver.robot.sense() is None
+    assert driver.robot.act(Command(0.1, 0.0)) == Command()
+
+
 def test_a_good_robot_passes_through() -> None:
     blind = good(stamp_ns=NOW_NS + 100_000_000, image=None, proximity=np.zeros(0))
     later = good(stamp_ns=np.int64(NOW_NS + 200_000_000), proximity=np.full(5, np.nan))
