@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.network import add_author, add_network, network_of, settings_of
-from mapweave.commands.usage import UsageError, arguments_read
+from mapweave.commands.usage import UsageError
 from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
@@ -35,7 +35,7 @@ def add_to(commands: Any) -> None:
         "goal that does not exist is refused; one that cannot be reached is given up, with the reason. "
         f"{STATUS}",
     )
-    go.add_argument("robot", help="the robot's name, for example r0")
+    go.add_argument("robot", type=values.name, help="the robot's name, for example r0")
     go.add_argument(
         "goal",
         type=values.goal,
@@ -58,7 +58,7 @@ def add_to(commands: Any) -> None:
         help="let a robot explore",
         description="Let a robot map all floor that it can reach: `mapweave explore r0`. " + STATUS,
     )
-    explore.add_argument("robot", help="the robot's name, for example r0")
+    explore.add_argument("robot", type=values.name, help="the robot's name, for example r0")
     _add_common(explore, 3600.0)
     explore.set_defaults(run=lambda arguments: run(arguments, lambda f: f.explore(arguments.robot)))
 
@@ -70,7 +70,7 @@ def add_to(commands: Any) -> None:
         f"{NOT_TAKEN}",
     )
     which = stop.add_mutually_exclusive_group(required=True)
-    which.add_argument("robot", nargs="?", help="the robot's name, for example r0")
+    which.add_argument("robot", nargs="?", type=values.name, help="the robot's name, for example r0")
     which.add_argument("--all", action="store_true", help="every robot of the fleet")
     _add_common(stop, None)
     stop.set_defaults(run=run_stop)
@@ -81,7 +81,7 @@ def add_to(commands: Any) -> None:
         description="List the newest missions that the map server keeps, oldest first: robot, goal, state, "
         "reason.",
     )
-    missions.add_argument("robot", nargs="?", default="", help="of this robot alone, for example r0")
+    missions.add_argument("robot", nargs="?", type=values.name, help="of this robot alone, for example r0")
     missions.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(missions)
     missions.set_defaults(run=run_missions)
@@ -111,7 +111,6 @@ def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -
     """Give a mission, and wait for its end if that is wanted."""
     if arguments.wait and not arguments.timeout > 0.0:
         raise UsageError(f"--timeout {arguments.timeout:g}: give seconds")
-    _robot(arguments)
     with fleet_of(arguments) as fleet:
         report = give(fleet)
         if arguments.wait and report.open:
@@ -125,9 +124,8 @@ def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -
 
 def run_stop(arguments: argparse.Namespace) -> int:
     """Stop robots."""
-    robot = _robot(arguments)
     with fleet_of(arguments) as fleet:
-        reports = list(fleet.stop(robot))
+        reports = list(fleet.stop(arguments.robot or ""))
     if not reports and not arguments.json:
         print("no robot is there")
     _print(reports, arguments.json)
@@ -136,21 +134,12 @@ def run_stop(arguments: argparse.Namespace) -> int:
 
 def run_missions(arguments: argparse.Namespace) -> int:
     """List missions."""
-    robot = _robot(arguments)
     with fleet_of(arguments) as fleet:
-        reports = list(fleet.missions(robot))
+        reports = list(fleet.missions(arguments.robot or ""))
     if not reports and not arguments.json:
         print("no missions yet")
     _print(reports, arguments.json)
     return DONE
-
-
-def _robot(arguments: argparse.Namespace) -> str:
-    """The robot that is named, or none."""
-    from mapweave.hybridmap.ids import check_name
-
-    with arguments_read():
-        return check_name(arguments.robot) if arguments.robot else ""
 
 
 def words(report: MissionReport) -> str:

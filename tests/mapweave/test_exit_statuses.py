@@ -52,13 +52,19 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (FAILED, "--connect {at}"),
     ],
     "go": [
-        (USAGE, "R0 r0.1.1"), (USAGE, "r0 '' --connect {at}"), (USAGE, "r0 r0.1 --connect {at}"), (USAGE,
+        (USAGE, "R0 r0.1.1"), (USAGE, "'' r0.1.1 --connect {at}"),
+        (USAGE, "r0 '' --connect {at}"), (USAGE, "r0 r0.1 --connect {at}"), (USAGE,
         "r0 r0.1.1 --wait --timeout 0"),
         (FAILED, "r0 home --connect {at}"),
     ],
-    "explore": [(USAGE, "R0"), (USAGE, "r0 --timeout x"), (FAILED, "r0 --connect {at}")],
-    "stop": [(USAGE, ""), (USAGE, "r0 --all"), (USAGE, "R0"), (FAILED, "r0 --connect {at}")],
-    "missions": [(USAGE, "R0"), (FAILED, "--connect {at}")],
+    "explore": [
+        (USAGE, "R0"), (USAGE, "'' --connect {at}"), (USAGE, "r0 --timeout x"), (FAILED, "r0 --connect {at}"),
+    ],
+    "stop": [
+        (USAGE, ""), (USAGE, "r0 --all"), (USAGE, "R0"), (USAGE, "'' --connect {at}"),
+        (FAILED, "r0 --connect {at}"),
+    ],
+    "missions": [(USAGE, "R0"), (USAGE, "'' --connect {at}"), (FAILED, "--connect {at}")],
     "place list": [(FAILED, "--map {tmp}/none.mapweave")],
     "place add": [
         (USAGE, "kitchen"), (USAGE, "kitchen r0.1.1 --radius -3 --map {map}"),
