@@ -181,6 +181,18 @@ class EncoderMonitor:
                     f"{math.degrees(seen.turn):.0f}: one of them runs away, or a wheel spins"
                 )
         way = float(counted.mean())
+        if (np.abs(wanted) >= LEAST_COMMAND).all():
+            against = -counted / wanted
+            if ((against >= OBEYS[0]) & (against <= OBEYS[1])).all():
+                turns = abs(turn) >= TURNS_APART[0]
+                if (seen.turn * turn if turns else seen.expansion * way) > 0.0:
+                    part = (
+                        "left and right motor, or the sign of turns" if turns else "the sign of both motors"
+                    )
+                    return (
+                        "the wheels go the other way than they are commanded, and the image agrees: "
+                        f"exchange {part}"
+                    )
         stands = seen.stands and self._looks_still()
         if (stands and self._counts(counted)) or (
             abs(way) >= COUNTS[0] and math.copysign(seen.expansion, way * seen.expansion) < STILL[1]

@@ -214,6 +214,20 @@ def test_no_false_alarm(drive, case):
     assert first_fault(images, wheels, commands)[1] == ""
 
 
+def test_motors_that_go_the_other_way_than_commanded_are_named(drive, walls):
+    """Encoders and image agree on it: before, the robot drove on against each of its commands."""
+    reversed_commands = [Command(-command.forward, -command.turn) for command in COMMANDS]
+    when, said = first_fault(drive, lambda ways, tick: ways, reversed_commands)
+    assert "exchange the sign of both motors" in said and when <= 1.5
+    for sign, words in ((-1.0, "exchange left and right motor"), (1.0, "")):
+        monitor, pose = EncoderMonitor(BODY), Pose2(0.3, 0.3, -0.4)
+        for tick in range(15):
+            moved = Odometry(0.0, 0.06)
+            pose = pose @ moved.motion()
+            monitor.see(Observation(tick * 100_000_000, moved, walls.render(pose)), Command(0.0, sign * 0.6))
+        assert words in monitor.fault and bool(monitor.fault) is bool(words)
+
+
 def test_encoders_are_believed_again_once_they_count_what_was_commanded(drive):
     monitor = EncoderMonitor(BODY)
     monitor.see(Observation(0, Odometry(1.0, 0.0), drive[0]), Command(0.2))
