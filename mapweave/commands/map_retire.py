@@ -6,6 +6,7 @@ import argparse
 import time
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.map_constraint import add_constraint_options, constrain
 from mapweave.commands.usage import UsageError, arguments_read
 
@@ -35,9 +36,9 @@ def add_to(actions: Any) -> None:
         "--area", nargs=2, metavar=("NODE|PLACE", "CORNERS"),
         help='what lies in a polygon in the frame of a node, m: --area r0.1.17 "0,-1 2,-1 2,1 0,1"',
     )  # fmt: skip
-    parser.add_argument("--from", dest="begin", default="", metavar="TIME",
+    parser.add_argument("--from", dest="begin", type=values.given, metavar="TIME",
                         help="nodes of the map from then on: 2026-03-01T12:00, or ns")  # fmt: skip
-    parser.add_argument("--until", dest="end", default="", metavar="TIME", help="until then")
+    parser.add_argument("--until", dest="end", type=values.given, metavar="TIME", help="until then")
     add_constraint_options(parser)
     parser.set_defaults(run=run)
 
@@ -69,5 +70,5 @@ def _subject(arguments: argparse.Namespace) -> Subject:
                 end = read_window(which, "", arguments.end, now, None).end_ns
                 if begin > end:
                     raise UsageError(f"--until {arguments.end} is before --from {arguments.begin}")
-            return read_window(which, arguments.begin, arguments.end, now, None)
+            return read_window(which, arguments.begin or "", arguments.end or "", now, None)
         return retired_of(arguments.which, *names_of(arguments))

@@ -55,7 +55,7 @@ def add_network(parser: argparse.ArgumentParser, listens: bool = False) -> None:
             "(default: tcp/127.0.0.1:7447, or as the key says)",
         )  # fmt: skip
     what = "folder of `mapweave keys init`" if listens else "key file of `mapweave keys add`"
-    group.add_argument("--keys", metavar="FOLDER" if listens else "FILE", help=what)
+    group.add_argument("--keys", type=values.given, metavar="FOLDER" if listens else "FILE", help=what)
     parser.set_defaults(listens=listens)
     parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML; the command line overrides it")
 

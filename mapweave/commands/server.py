@@ -73,7 +73,7 @@ def add_to(commands: Any) -> None:
         "--lockstep", action="store_true", help="answer only what is merged already: repeatable simulation"
     )
     parser.add_argument(
-        "--http", metavar="[HOST:]PORT",
+        "--http", type=values.given, metavar="[HOST:]PORT",
         help="answer people over HTTP as well, for example 8080; with --keys people log in, over HTTPS, and "
         "0.0.0.0:8080 serves other machines, too (default: off)",
     )  # fmt: skip

@@ -23,6 +23,13 @@ def name(text: str) -> str:
         raise UsageError(str(error).rpartition(": ")[2]) from None
 
 
+def given(text: str) -> str:
+    """What may not be empty, as a variable is that a script has not set: that would pass for left out."""
+    if not text.strip():
+        raise UsageError("give a value, or leave it out")
+    return text
+
+
 def endpoint(text: str) -> str:
     """A Zenoh endpoint."""
     from mapweave.wire.bus_settings import DEFAULT_ENDPOINT, ENDPOINT

@@ -34,7 +34,8 @@ CASES: dict[str, list[tuple[int, str]]] = {
     "server": [
         (USAGE, "--listen nowhere"), (USAGE, "--name S0"), (USAGE, "--fleet a/b"), (USAGE, "--http x"),
         (USAGE, "--http 0.0.0.0:8080"), (USAGE, "--demo --data {tmp}"), (USAGE, "--store x"),
-        (USAGE, "--lockstep --ray auto"), (FAILED, "--keys {tmp}/none"),
+        (USAGE, "--lockstep --ray auto"), (FAILED, "--keys {tmp}/none"), (USAGE, "--keys '' --listen {free}"),
+        (USAGE, "--http '' --listen {free}"),
         (FAILED, "--map {tmp}/none.mapweave --data {tmp}/server --listen {free}"),
     ],
     "router": [(USAGE, "--listen nowhere"), (USAGE, "--fleet a/b"), (FAILED, "--keys {tmp}/none")],
@@ -173,6 +174,7 @@ CASES: dict[str, list[tuple[int, str]]] = {
     ],
     "map retire": [
         (USAGE, "--map {map}"), (USAGE, "r0.1 --because {long} --map {map}"),
+        (USAGE, "r0.1 --from '' --map {map} -o {out}"), (USAGE, "r0.1 --until ' ' --map {map} -o {out}"),
         (NO, "r9.1 --map {map} -o {out}"),
     ],
     "map undo": [(USAGE, "x"), (NO, "7 --map {map} -o {out}")],
