@@ -12,9 +12,11 @@ from mapweave.commands import values
 from mapweave.commands.agent import add_calibration, bus_of, calibration_of, close_on, open_robot
 from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 from mapweave.commands.replay import add_recording, name_of, options_of
-from mapweave.exit_status import NO
+from mapweave.exit_status import INTERRUPTED, NO
 
 if TYPE_CHECKING:
+    import threading
+
     from mapweave.agent.calibration.estimate import Estimate
     from mapweave.agent.calibration.recorded_drive import DriveCalibration
     from mapweave.agent.observation import Observation, RobotDescription
@@ -67,7 +69,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.agent.calibration.recorded_drive import calibrate
     from mapweave.agent.recordings.geometry_file import write_geometry
     from mapweave.commands.usage import UsageError
-    from mapweave.hybridmap.errors import InvalidValue
+    from mapweave.hybridmap.errors import DeviceError, InvalidValue
     from mapweave.processes.agent import measured
     from mapweave.terminal import plain_or_terminal
 
@@ -77,13 +79,19 @@ def run(arguments: argparse.Namespace) -> int:
     name = name_of(arguments)
     file = calibration_of(arguments, name)
     console = plain_or_terminal(stderr=arguments.json)
-    drive = _recorded if arguments.recording is not None else _live
-    description, observations = drive(arguments, name, console)
+    stop = None if arguments.recording is not None else stop_on_signals()
     try:
+        description, observations = (
+            _recorded(arguments, name) if stop is None else _live(arguments, name, console, stop)
+        )
         found = calibrate(measured(description, file), observations, arguments.keep_wheels)
-    except InvalidValue as error:
+    except (InvalidValue, DeviceError) as error:
+        # A drive that was cut short is no answer, and neither is a robot that was closed before its first.
+        interrupted = stop is not None and stop.is_set()
+        if isinstance(error, DeviceError) and not interrupted:
+            raise
         print(f"mapweave: {arguments.recording or name}: {error}", file=sys.stderr)
-        return NO
+        return INTERRUPTED if interrupted else NO
     notes = _print(console, found)
     worse = found.estimated_px > found.declared_px
     if worse:
@@ -96,9 +104,7 @@ def run(arguments: argparse.Namespace) -> int:
     return NO if worse else 0
 
 
-def _recorded(
-    arguments: argparse.Namespace, name: str, console: Any
-) -> tuple[RobotDescription, Iterator[Observation]]:
+def _recorded(arguments: argparse.Namespace, name: str) -> tuple[RobotDescription, Iterator[Observation]]:
     """A recording."""
     from mapweave.agent.drivers.replay import Replay
     from mapweave.terminal import plain_or_terminal, tracked
@@ -109,9 +115,9 @@ def _recorded(
 
 
 def _live(
-    arguments: argparse.Namespace, name: str, console: Any
+    arguments: argparse.Namespace, name: str, console: Any, stop: threading.Event
 ) -> tuple[RobotDescription, Iterator[Observation]]:
-    """What a robot senses from now on, for some seconds.
+    """What a robot senses from now on, for some seconds, or until it is stopped.
 
     The iterator raises DeviceError when a sensor fails: a base that does not answer would count as one that
     stands.
@@ -124,7 +130,6 @@ def _live(
 
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
-    stop = stop_on_signals()
     bus = bus_of(arguments, settings.robot, network)
     robot, _ = open_robot(arguments, settings.robot, bus, network.fleet, name)
     threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()

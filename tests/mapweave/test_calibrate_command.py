@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import shutil
+import threading
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,7 @@ from mapweave.agent.calibration import recorded_drive
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.cli import main
-from mapweave.exit_status import NO, USAGE
+from mapweave.exit_status import INTERRUPTED, NO, USAGE
 from synthetic.room_drive import CAMERA, drive, write
 from tests.mapweave.command_line import complaint
 
@@ -175,5 +176,21 @@ def test_a_robot_that_fails_while_it_is_calibrated_is_closed_and_named(
     # As the guide has it, with the driver of the settings.
     Path("r0.toml").write_text('[robot]\ndriver = "live.py:Live"\n')
     assert complaint(capfd, "calibrate", "drive", "--settings", "r0.toml", "--name", "r0") == said
+    assert Path("closed").exists()
+    assert not Path("out").exists()
+
+
+@pytest.mark.parametrize("silent", [True, False])
+def test_ctrl_c_before_the_drive_suffices_is_an_interruption_and_no_answer(
+    silent: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    Path("live.py").write_text(f"SILENT = {silent}\n{LIVE}")
+    pressed = threading.Event()
+    pressed.set()
+    monkeypatch.setattr("mapweave.commands.calibrate_drive.stop_on_signals", lambda: pressed)
+    command = ["calibrate", "drive", "--robot", "live.py:Live", "--name", "r0"]
+    said = complaint(capfd, *command, status=INTERRUPTED)
+    assert ("no answer" if silent else "too short") in said
     assert Path("closed").exists()
     assert not Path("out").exists()
