@@ -24,7 +24,6 @@ from mapweave.hybridmap.manual_constraint import (
     ConstraintRequest,
     ManualConstraint,
     ManualConstraints,
-    event_words,
 )
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.query import ExplainRequest
@@ -216,17 +215,17 @@ class Explainer:
             InvalidFile: the disk does not take it.
         """
         with self._turn:
-            constraint, effects = check_manual_constraint(
+            checked = check_manual_constraint(
                 self._answers().merged,
                 self._record.constraints.with_floors(self._annotations().floors),
                 request.constraint,
                 self._record.maps(),
                 self._settings,
             )
-            words = f"{event_words(constraint)}{f'; {effects}' if effects else ''}"
+            words = checked.words
             if request.check:
                 return f"only checked, nothing is changed: {words}"
-            self._record.add(constraint)
+            self._record.add(checked.constraint)
             self._constrain(self._record.constraints)
         log.warning("%s", words)
         return words

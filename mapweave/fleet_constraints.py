@@ -87,13 +87,15 @@ class FleetConstraints(FleetAnnotations):
             check: only say what it would do.
         """
         about: Subject
+        # The number 0 is a time.
+        in_time = begin != "" or end != ""
         if area is not None:
-            if which or begin or end:
+            if which or in_time:
                 raise InvalidValue("an area goes with neither maps, nodes nor times")
             about = RetiredArea(area)
         else:
             about = retired_of(which, self.annotations, self.resolve)
-            if begin or end:
+            if in_time:
                 if not isinstance(about, RetiredMap):
                     raise InvalidValue("a time window is of one map")
                 about = read_window(about.map, begin, end, time.time_ns())

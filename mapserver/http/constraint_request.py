@@ -127,5 +127,11 @@ def _subject(asked: _Body, now_ns: int, annotations: Record, resolve: Resolve) -
         which = read_retired([asked.window.map])
         if not isinstance(which, RetiredMap):
             raise InvalidValue(f"{asked.window.map} is no map")
+        if asked.window.begin == asked.window.end == "" and asked.undo is False:
+            # As a script sends it whose times are missing; what was kept so can be taken back.
+            raise InvalidValue(
+                f'a time window begins or ends: give "begin", "end" or both; {{"retire": ["{which.map}"]}} '
+                "retires the whole map"
+            )
         return read_window(which.map, asked.window.begin, asked.window.end, now_ns)
     return retired_of(asked.retire or (), annotations, resolve)

@@ -113,7 +113,7 @@ def _settled(arguments: argparse.Namespace) -> None:
 
 def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
     from mapweave.hybridmap.annotation import Annotations
-    from mapweave.hybridmap.manual_constraint import ManualConstraints, event_words
+    from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.mapserver.map_files import map_file_of
     from mapweave.mapserver.map_history import between
     from mapweave.merge.constraint_checks import check_manual_constraint
@@ -140,8 +140,8 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     said = Annotations(content.annotations)
     earlier = ManualConstraints(content.constraints, floors=said.floors)
     with refusals():
-        constraint, effects = check_manual_constraint(before, earlier, constraint, settings=settings)
-    words = f"{event_words(constraint)}{f'; {effects}' if effects else ''}"
+        checked = check_manual_constraint(before, earlier, constraint, settings=settings)
+    constraint, words = checked.constraint, checked.words
     if arguments.check:
         print(f"only checked, nothing is changed: {words}")
         return

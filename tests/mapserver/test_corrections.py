@@ -18,7 +18,7 @@ from mapweave.cli import main
 from mapweave.exit_status import NO, USAGE
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import ChangeBody
-from mapweave.hybridmap.constraint_subject import Linked, RetiredArea, RetiredNodes
+from mapweave.hybridmap.constraint_subject import Linked, RetiredArea, RetiredNodes, RetiredWindow
 from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
@@ -180,6 +180,9 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
         ({"area": {"anchor": "a.1.1", "corners": [[0, 0], [1, 1]]}}, "3 to 64 corners"),
         ({"window": {"map": "a.1", "begin": 5, "end": 4}}, "ends after it begins"),
         ({"window": {"map": "a.1", "begin": "noon"}}, "'noon' is no time"),
+        ({"window": {"map": "a.1"}}, 'a time window begins or ends: give "begin", "end" or both'),
+        ({"window": {"map": "a.1", "begin": "", "end": ""}}, '{"retire": ["a.1"]} retires the whole map'),
+        ({"window": {"map": "a.1", "end": 0}}, "map a.1 until 1970-01-01 00:00:00 UTC: no node lies in it"),
         ({"undo": 1}, "there is no constraint 1"),
         ({"retired": ["a.1"]}, "`retired`: there is no such field; send link, unmerge"),
         ({"link": "a.1.1"}, '`link`: give a list, not text; for example ["r0.1.17", "r1.1.5"]'),
@@ -327,6 +330,39 @@ def test_a_time_window_that_ends_before_it_begins_is_refused_with_times_that_peo
     assert words in answer["error"]
     with pytest.raises(InvalidValue, match=re.escape(words)):
         small.fleet.retire("a.1", begin=begin, end=end)
+
+
+def test_a_time_of_zero_is_a_time(small: Asking) -> None:
+    with pytest.raises(InvalidValue, match="until 1970-01-01 00:00:00 UTC: no node lies in it"):
+        small.fleet.retire("a.1", end=0)
+
+
+def test_what_is_taken_back_says_what_another_correction_still_excludes(
+    path: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    with serving(path) as asking:
+        fleet = asking.fleet
+        fleet.retire("b.1.5", because="a mirror")
+        asking.merged()
+        status, answer = asking.http("POST", {"retire": ["b.1"], "by": "bob", "because": "another day"})
+        assert status == 200, answer
+        asking.merged()
+        path = tmp_path / "both.mapweave"
+        fleet.save(path)
+        still = 'but node b.1.5 stays out of use: map b.1 is retired by bob on .*: "another day"$'
+        assert re.search(f"^node b.1.5: taken back by anna on .*, {still}", fleet.undo(1))
+        capfd.readouterr()
+        assert main(["map", "undo", "1", "--by", "anna", "--map", str(path)]) == 0
+        assert re.search(
+            f"^node b.1.5: taken back by anna on .*, {still}", capfd.readouterr().out, re.MULTILINE
+        )
+        # A window of all times, as servers took it before, can be taken back.
+        fleet.undo(2)
+        asking.merged()
+        fleet.retire("a.1", begin=0)
+        assert isinstance(fleet.constraints()[-1].about, RetiredWindow)
+        status, answer = asking.http("POST", {"window": {"map": "a.1"}, "undo": True})
+        assert status == 200 and "map a.1 is in use again" in answer["said"]
 
 
 @pytest.fixture(scope="module")

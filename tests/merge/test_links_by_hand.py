@@ -9,8 +9,17 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
+from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
-from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredMap, RetiredNodes
+from mapweave.hybridmap.constraint_subject import (
+    Apart,
+    Linked,
+    RetiredArea,
+    RetiredMap,
+    RetiredNodes,
+    RetiredWindow,
+    Subject,
+)
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
@@ -116,6 +125,32 @@ def test_a_link_stays_when_the_robot_maps_on_and_an_undone_one_waits(seam: Scene
         seam.ask(Linked(LAST, FIRST, Pose2()))
     seam.ask(Apart((LAST, FIRST)), holds=False)
     assert same(seam.merger.merged(), joined)
+
+
+@pytest.mark.parametrize(
+    ("about", "words"),
+    [
+        (RetiredNodes((LAST,)), f"node {LAST}"),
+        (RetiredWindow(A, 0, 10**18), f"map {A} until"),
+        (RetiredArea(Area(node(A, 1), ((-5, -5), (5, -5), (5, 5), (-5, 5)))), "the area of 4 corners"),
+    ],
+)
+def test_a_link_at_a_node_that_is_retired_a_moment_before_is_refused(
+    seam: Scene, about: Subject, words: str
+) -> None:
+    """Before the merge with the retirement it was taken, and had no effect."""
+    before = seam.merger.merged()
+    retired = ManualConstraint(about, True, "anna", 1, "a mirror")
+    linked = ManualConstraint(Linked(LAST, FIRST), True, "bob", 2)
+    with pytest.raises(InvalidValue, match=rf'cannot be linked: {words}.* retired by anna .*: "a mirror"; '):
+        check_manual_constraint(before, ManualConstraints([retired]), linked)
+    # Taken back, and merged neither.
+    seam.merger.constrain(ManualConstraints([retired]))
+    taken_back = ManualConstraints([retired, replace(retired, holds=False)])
+    with pytest.raises(InvalidValue, match=f"{LAST} is in use again with the next merge: say it again then"):
+        check_manual_constraint(seam.merger.merged(), taken_back, linked)
+    seam.merger.constrain(taken_back)
+    assert check_manual_constraint(seam.merger.merged(), taken_back, linked).constraint.holds
 
 
 def test_images_that_do_not_agree_are_refused_unless_a_person_knows_better(seam: Scene) -> None:

@@ -10,7 +10,14 @@ import pytest
 
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import EdgePut, NodePut
-from mapweave.hybridmap.constraint_subject import RetiredArea, RetiredNodes, RetiredWindow, Subject
+from mapweave.hybridmap.constraint_subject import (
+    Apart,
+    RetiredArea,
+    RetiredMap,
+    RetiredNodes,
+    RetiredWindow,
+    Subject,
+)
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
@@ -199,3 +206,54 @@ def test_a_map_that_only_loops_hold_together_falls_apart_and_that_is_said_before
         wanted = ManualConstraint(about, True, "bob", 9)
         with pytest.raises(InvalidValue, match=words):
             check_manual_constraint(merger.merged(), ManualConstraints([asked]), wanted)
+
+
+def test_a_retirement_that_is_taken_back_says_what_others_still_retire(merger: Merger) -> None:
+    seconds = 10**9
+    (corner,) = ids(B, 1)
+    first, second, third, window, whole, area = (
+        ManualConstraint(about, True, "anna", k, f"reason {k}")
+        for k, about in enumerate(
+            (
+                RetiredNodes(ids(A, 7, 15)),
+                RetiredNodes(ids(A, 7)),
+                RetiredNodes(ids(B, 11)),
+                RetiredWindow(A, 15 * seconds, 30 * seconds),
+                RetiredMap(B),
+                RetiredArea(Area(corner, ((1.6, -0.5), (2.25, -0.5), (2.25, 0.5), (1.6, 0.5)))),
+            )
+        )
+    )
+
+    def said(taken_back: ManualConstraint, *made: ManualConstraint) -> str:
+        merger.constrain(ManualConstraints(made))
+        by_bob = replace(taken_back, holds=False, who="bob", stamp_ns=99)
+        return check_manual_constraint(merger.merged(), ManualConstraints(made), by_bob).words
+
+    by = 'retired by anna on 1970-01-01 00:00 UTC: "reason'
+    how = "taken back by bob on 1970-01-01 00:00 UTC"
+    assert said(first, first) == (
+        'nodes a.1.7 and a.1.15 are in use again, by bob on 1970-01-01 00:00 UTC: "reason 0"'
+    )
+    assert said(first, first, second, window).removeprefix("nodes a.1.7 and a.1.15: ") == (
+        f'{how}: "reason 0", but node a.1.7 stays out of use: node a.1.7 is {by} 1"; '
+        f'node a.1.15 stays out of use: map a.1 {window.about.__str__().removeprefix("map a.1 ")} is {by} 3"'
+    )
+    assert "; but" not in said(window, window, second), "these are other nodes"
+    assert f"node b.1.11 stays out of use: map b.1 is {by} 4" in said(third, third, whole)
+    assert f"but node b.1.11 stays out of use: node b.1.11 is {by} 2" in said(whole, third, whole)
+    assert f"but node b.1.11 stays out of use: the area of 4 corners at b.1.1 is {by} 5" in said(
+        third, third, area
+    )
+    assert f"but node b.1.11 stays out of use: node b.1.11 is {by} 2" in said(area, third, area)
+
+
+def test_two_nodes_that_may_be_linked_again_stay_apart_while_their_maps_do(merger: Merger) -> None:
+    pair = ManualConstraint(Apart(ids(A, 7) + ids(B, 7)), True, "anna", 1)
+    maps = ManualConstraint(Apart((A, B)), True, "anna", 2, "two halls")
+    asked = check_manual_constraint(
+        merger.merged(), ManualConstraints([pair, maps]), replace(pair, holds=False)
+    )
+    assert "but they stay apart: undone with all links between a.1 and b.1 by anna on" in asked.words
+    alone = check_manual_constraint(merger.merged(), ManualConstraints([pair]), replace(pair, holds=False))
+    assert "may be linked again" in alone.words
