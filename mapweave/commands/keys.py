@@ -200,6 +200,15 @@ def _bundle(arguments: argparse.Namespace) -> int:
     folder = KeyFolder(arguments.keys)
     with refusals():
         file = folder.key_file(arguments.name)
+    identity = folder.find(arguments.name)
+    if identity is None or identity.state != "good":
+        # A command that was killed half-way leaves such a file.
+        state = "is not in the list of identities" if identity is None else f"is {identity.state}"
+        role = f" --role {ROLES[0] if identity is None else identity.role}"
+        raise Refused(
+            f"the key of {arguments.name} {state}: no router lets it in; `mapweave keys add "
+            f"{arguments.name}{role}` makes a new one"
+        )
     write_key_file(arguments.out, read_key_file(file))
     print(f"{arguments.out}: the key of {arguments.name}")
     return 0

@@ -20,7 +20,7 @@ from mapweave.cli import main
 from mapweave.connection import no_server
 from mapweave.exit_status import NO, USAGE
 from mapweave.identities.key_file import read_key_file
-from mapweave.identities.key_folder import KeyFolder
+from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.identities.logins import Logins
 from mapweave.wire.credentials import Role
 from tests.mapweave.command_line import complaint
@@ -171,6 +171,28 @@ def test_a_copy_is_the_same_key(keys: Path, tmp_path: Path) -> None:
     assert main(["keys", "bundle", "r0", "-o", str(copy), "--keys", str(keys)]) == 0
     assert read_key_file(copy) == read_key_file(keys / "r0.key.toml")
     assert stat.S_IMODE(copy.stat().st_mode) == 0o600
+
+
+def test_no_copy_is_made_of_a_key_that_lets_no_one_in(
+    keys: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """What is left in the folder by commands that were killed half-way, and what has expired."""
+    copy, left = tmp_path / "copy.key.toml", (keys / "r0.key.toml").read_bytes()
+    folder = KeyFolder(keys)
+    folder.revoke("r0", "stolen")
+    folder.add("r1", Role.ROBOT, days=1e-9)
+    for name in ("r0", "r9"):
+        (keys / f"{name}.key.toml").write_bytes(left)
+        (keys / f"{name}.key.toml").chmod(0o600)
+    expected = {"r0": "revoked 20", "r9": "not in the list of identities"}
+    if folder.profile is Profile.PRODUCTION:
+        expected["r1"] = "expired"
+    for name, words in expected.items():
+        assert main(["keys", "bundle", name, "-o", str(copy), "--keys", str(keys)]) == NO
+        error = capsys.readouterr().err
+        assert error.startswith(f"mapweave: the key of {name} is {words}")
+        assert f"`mapweave keys add {name} --role robot` makes a new one" in error
+        assert not copy.exists()
 
 
 def test_certificates_are_what_they_say(tmp_path: Path) -> None:
