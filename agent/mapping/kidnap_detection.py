@@ -8,7 +8,6 @@ wall faded. After a kidnapping it was at most 8 %, or 30 % where the same wall w
 
 from __future__ import annotations
 
-import math
 from enum import Enum, auto
 
 import cv2
@@ -50,15 +49,7 @@ BORDER_PX = 12.0
 ASTRAY_PX = 20.0
 """A point found further than this from where it is expected is another one."""
 FEW_POINTS = 30
-"""With fewer points than this, corners and the whole image are compared as well."""
-COARSE = 8
-"""Side of the squares over which images are averaged before they are compared as a whole, px."""
-ALIKE = 0.95
-"""Averaged images are the same if they correlate by more than this,"""
-LEAST_SPREAD = 8.0
-"""vary by more than this, grey levels (all blank walls are alike),"""
-SAME_LIGHT = 10.0
-"""and are equally bright on average to within this, grey levels."""
+"""With fewer points than this, corners are compared as well."""
 
 
 class KidnapDetector:
@@ -104,7 +95,7 @@ class KidnapDetector:
             corners = self._corners_agree(before, now, turn, FEWEST)
             if corners is None and not clipped:
                 corners = self._corners_agree(now, before, -turn) is not False
-            if corners or self._alike(before, now, turn):
+            if corners:
                 return FrameOverlap.SAME
         blank = clipped or len(strongest_corners(now)) < LEAST_CORNERS
         return FrameOverlap.BLANK if blank else FrameOverlap.STRANGE
@@ -116,24 +107,6 @@ class KidnapDetector:
             return None
         near = lengths(followed[inside] - expected[inside]) <= ASTRAY_PX
         return bool(near.mean() >= SHARE)
-
-    def _alike(self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float) -> bool:
-        """Whether the images are the same by and large, where smooth shapes leave little to be tracked."""
-        height, width = before.shape
-        aside = round(self._camera.fx * math.tan(turn))
-        if abs(aside) > width // 2:
-            return False
-        # A turn to the left moves all to the right.
-        first = before[:, max(-aside, 0) : width - max(aside, 0)]
-        second = now[:, max(aside, 0) : width - max(-aside, 0)]
-        size = (first.shape[1] // COARSE, height // COARSE)
-        a = cv2.resize(first, size, interpolation=cv2.INTER_AREA).astype(np.float64)
-        b = cv2.resize(second, size, interpolation=cv2.INTER_AREA).astype(np.float64)
-        if abs(float(a.mean() - b.mean())) > SAME_LIGHT:
-            return False
-        a, b = a - a.mean(), b - b.mean()
-        spread = float(a.std() * b.std())
-        return spread > LEAST_SPREAD**2 and float((a * b).mean()) > ALIKE * spread
 
     def _corners_agree(
         self, before: NDArray[np.uint8], now: NDArray[np.uint8], turn: float, least: int = LEAST

@@ -228,7 +228,7 @@ def test_a_robot_that_drives_on_blindly_is_not_taken_for_carried_off(mapper, els
     assert mapper.anchor_from_robot.x == pytest.approx(30 * 0.08, abs=0.2)
 
 
-def test_a_few_tracks_that_are_lost_at_once_leave_it_to_the_whole_image(walls, continuity, elsewhere):
+def test_a_few_tracks_that_are_lost_at_once_leave_it_to_the_corners(walls, continuity, elsewhere):
     """A robot near a smooth wall lost ten of twelve tracks in one frame, and took itself for carried off."""
     seen, on = walls.render(HERE), walls.render(HERE @ Pose2(0.02, 0.0, 0.01))
     expected = np.random.default_rng(0).uniform([20, 20], [300, 220], (12, 2))
