@@ -26,7 +26,6 @@ from mapweave.merge.settings import MergeSettings
 from mapweave.opened_map import MapSource, open_map
 from mapweave.refusals import refusals
 from mapweave.storage.atomic_file import check_place
-from mapweave.storage.map_file import write_map_file
 from mapweave.storage.plan_image import check_plan_png
 
 
@@ -141,5 +140,5 @@ class OfflineAnnotations:
         content = self._opened.file(self.merged)
         if isinstance(body, Pin) and content.poses:
             content = replace(content, poses=dict(self.merged.poses))
-        write_map_file(self._out, content)
+        self._opened = self._opened.written(self._out, content)
         return words

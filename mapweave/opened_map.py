@@ -9,7 +9,7 @@ from __future__ import annotations
 import sqlite3
 from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import closing
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from enum import StrEnum
 from functools import partial
 from pathlib import Path
@@ -29,9 +29,10 @@ from mapweave.mapserver.log.salvage import Salvage, all_of, salvage
 from mapweave.mapserver.log.store import HISTORY, PRUNING
 from mapweave.mapserver.own_maps import maps_of, marginal_links
 from mapweave.mapserver.plan_images import kept_images, recorded_images
+from mapweave.storage.atomic_file import State, state_of, unchanged_since
 from mapweave.storage.database_reader import MAGIC as SQLITE
 from mapweave.storage.database_reader import reading
-from mapweave.storage.map_file import MAGIC, MapFile, read_map_file
+from mapweave.storage.map_file import MAGIC, MapFile, read_map_file, write_map_file
 from mapweave.wire.messages import KeptHistory, KeptPruning, decode
 
 if TYPE_CHECKING:
@@ -68,6 +69,7 @@ class OpenedMap:
         maps: the robots' maps in it, also those of a journal that are empty.
         complaints: what of each map could not be read, in one line each; key None: what belongs to no map.
         standing: verified links that a store's server no longer decides again, by their nodes.
+        state: of a map file, when it was read.
     """
 
     path: Path | str
@@ -76,6 +78,7 @@ class OpenedMap:
     maps: tuple[MapId, ...]
     complaints: Mapping[MapId | None, str]
     standing: frozenset[tuple[NodeId, NodeId]] = frozenset()
+    state: State | None = None
 
     @property
     def name(self) -> str:
@@ -142,6 +145,19 @@ class OpenedMap:
         said = Annotations(self.content.annotations)
         return map_file_of(merged, self.content.history, said, self.content.images)
 
+    def written(self, out: Path, content: MapFile) -> OpenedMap:
+        """This, once a map file that was made of it is written; over its own if that is as it was.
+
+        Raises:
+            InvalidFile: another process has written its own file since; or the disk does not take it.
+        """
+        if self.source is MapSource.FILE and out.exists() and out.samefile(self.path):
+            with unchanged_since(out, self.state):
+                write_map_file(out, content)
+                return replace(self, state=state_of(out))
+        write_map_file(out, content)
+        return self
+
 
 def open_map(path: Path | str) -> OpenedMap:
     """Open a map file, a server's store or an agent's journal, whatever its name. Nothing is written.
@@ -157,8 +173,8 @@ def open_map(path: Path | str) -> OpenedMap:
     path = Path(path)
     source = source_of(path)
     if source is MapSource.FILE:
-        content = read_map_file(path)
-        return OpenedMap(path, source, content, tuple(sorted(maps_of(content))), {})
+        state, content = state_of(path), read_map_file(path)
+        return OpenedMap(path, source, content, tuple(sorted(maps_of(content))), {}, state=state)
     return _of_journal(path) if source is MapSource.JOURNAL else _of_store(path)
 
 

@@ -6,6 +6,7 @@ Only regular files are read: a device or a pipe may have no end.
 from __future__ import annotations
 
 import errno
+import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
@@ -56,6 +57,42 @@ def replacing(path: Path) -> Iterator[Path]:
         # Interrupted: remove the temporary file.
         _remove(beside)
         raise
+
+
+State = tuple[int, int, int]
+"""Of a file: differs once it was replaced."""
+
+
+def state_of(path: Path) -> State | None:
+    """The state of a file; None if there is none."""
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return found.st_ino, found.st_mtime_ns, found.st_size
+
+
+@contextmanager
+def unchanged_since(path: Path, state: State | None) -> Iterator[None]:
+    """Within it a file can be replaced by what was made of its content in that state.
+
+    Raises:
+        InvalidFile: the file is another one since, or its folder cannot be locked.
+    """
+    try:
+        # The kernel releases the lock of a process that dies.
+        handle = os.open(path.resolve().parent, os.O_RDONLY | os.O_DIRECTORY)
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX)
+            if state_of(path) != state:
+                raise InvalidFile(
+                    f"{path}: another command has written it meanwhile, and it is kept: say it again"
+                )
+            yield
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise unwritable(path, reason_of(error)) from None
 
 
 def read_whole(path: Path) -> bytes:

@@ -120,7 +120,6 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     from mapweave.opened_map import MapSource
     from mapweave.refusals import refusals
     from mapweave.storage.atomic_file import check_place
-    from mapweave.storage.map_file import write_map_file
 
     settings = settings_of(arguments).merge
     one = opened(arguments.map)
@@ -145,11 +144,11 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     if arguments.check:
         print(f"only checked, nothing is changed: {words}")
         return
-    print(words)
     assert out is not None
     changed = replace(one, content=replace(content, constraints=(*content.constraints, constraint)))
     with merge_progress() as report:
         merged = changed.merged_again(settings, report)
     history = (*content.history, *between(before, merged, constraint.stamp_ns))
-    write_map_file(out, map_file_of(merged, history, said, content.images))
+    changed.written(out, map_file_of(merged, history, said, content.images))
+    print(words)
     print(f"{out}: {merged.summary()}")

@@ -16,10 +16,11 @@ import numpy as np
 import pytest
 
 from mapweave.cli import main
-from mapweave.exit_status import NO, USAGE
+from mapweave.exit_status import FAILED, NO, USAGE
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.map_files import merged_of
+from mapweave.opened_map import OpenedMap
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
 from mapweave.wire.bus_settings import BusSettings
@@ -439,3 +440,44 @@ def said_or_refused(text: Said, *arguments: object) -> str:
         return text(*arguments)
     except AssertionError:
         return "known are: none"
+
+
+@pytest.mark.parametrize("late", ["retire", "place"])
+def test_two_commands_on_one_file_at_once_lose_nothing_of_each_other(
+    files: list[Path],
+    tmp_path: Path,
+    said: Said,
+    capfd: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    late: str,
+) -> None:
+    """The second one reads the file before the first one has written it."""
+    path = tmp_path / "both.mapweave"
+    path.write_bytes(files[-1].read_bytes())
+    first, *others = sorted(merged_of(read_map_file(path)).poses)
+    second = {
+        "retire": ["map", "retire", str(first), "--map", str(path)],
+        "place": ["place", "add", "sink", str(first), "--map", str(path)],
+    }[late]
+
+    def meanwhile(merge: Callable[..., Any]) -> Callable[..., Any]:
+        def merged(*arguments: Any, **options: Any) -> Any:
+            monkeypatch.undo()
+            said("place", "add", "door", others[0], "--map", path)
+            return merge(*arguments, **options)
+
+        return merged
+
+    for name in ("merged", "merged_again"):
+        monkeypatch.setattr(OpenedMap, name, meanwhile(getattr(OpenedMap, name)))
+    assert main(second) == FAILED
+    output = capfd.readouterr()
+    assert output.err == (
+        f"mapweave: {path}: another command has written it meanwhile, and it is kept: say it again\n"
+    )
+    assert not output.out
+    assert said(*second)
+    kept = read_map_file(path)
+    names = [annotation.name for annotation in kept.annotations]
+    assert names == ["door", "sink"] if late == "place" else names == ["door"] and len(kept.constraints) == 1
+    assert [one.name for one in tmp_path.iterdir()] == [path.name]
