@@ -45,7 +45,7 @@ class WheelOdometry:
         """
         state = self._state(kind, message)
         if not all(map(math.isfinite, state)):
-            raise DeviceError("odometry is not finite")
+            raise DeviceError("odometry is not finite, or its quaternion is all zeros")
         if self._last is not None and self._last[0] == kind:
             left, right = self._step(kind, self._last[1], state)
             longest = FASTEST * abs(stamp_ns - self._last[2]) / 1e9 + COASTING

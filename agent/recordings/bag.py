@@ -31,6 +31,7 @@ from mapweave.agent.ros_messages.values import (
     pose_of,
     stamp_of,
 )
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, MapweaveError
 from mapweave.vision.lens import lens_of
 
@@ -42,6 +43,8 @@ POSE_TYPES = (
 )
 TRUTH = ("truth", "gt", "amcl", "mocap", "vicon")
 """Parts of names of topics that are never taken for odometry."""
+DEPTH = "depth"
+"""Part of names of topics whose images show distances: taken only where there are no others."""
 
 
 class Bag:
@@ -219,14 +222,14 @@ def bag(path: Path, options: RecordingOptions) -> Recording:
         message = f"{path}: {lacks}; it has {names_of(opened.topics)}"
         raise Incomplete(message, None, (lacks,), has_odometry, opened.contents)
     image = _chosen(opened, options.image_topic, IMAGE_TYPES, "images")
-    stamps = [stamp for stamp, _ in opened.messages(image.name)]
-    if not stamps:
+    stamped = [(stamp, bool(stamp_of(message))) for stamp, message in opened.messages(image.name)]
+    if not stamped:
         raise DeviceError((opened.damage or [f"{path}: {image.name} has no images"])[-1])
-    notes = [f"images from {image.name}"]
-    if (np.diff(np.array(stamps)) <= 0).any():
-        raise DeviceError(f"{path}: the stamps of {image.name} do not ascend")
+    stamps, kept, left_out = _in_order(stamped, "image", image.name)
+    notes = [f"images from {image.name}", *left_out]
     given = _camera(opened, image.name, options, notes)
-    images = Images(np.array(stamps, np.int64), _sequential(opened, image.name))
+    read, numbers = _sequential(opened, image.name), np.flatnonzero(kept)
+    images = Images(stamps[kept], lambda k: read(int(numbers[k])))
     kind = f"bag ({path.suffix.lstrip('.') or 'folder'})"
     odometry = None
     if options.odometry is not None:
@@ -251,7 +254,9 @@ def _of(opened: Bag, kinds: Sequence[str]) -> list[Topic]:
 def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str) -> Topic:
     """The topic that is wanted, else the one of the right type with most messages; there must be one."""
     fitting = _of(opened, kinds)
-    if wanted is not None:
+    if wanted is None:
+        fitting = [topic for topic in fitting if DEPTH not in topic.name.lower()] or fitting
+    else:
         for topic in opened.topics:
             if topic.name == wanted:
                 if topic not in fitting:
@@ -276,22 +281,48 @@ def _odometry_topic(opened: Bag, options: RecordingOptions) -> Topic | None:
 
 
 def _poses(opened: Bag, topic: str) -> StampedPoses:
-    rows = [(stamp, *pose_of(message)) for stamp, message in opened.messages(topic)]
-    stamps = np.array([row[0] for row in rows], np.int64)
-    poses = np.array([row[1:] for row in rows]).reshape(-1, 3)
+    rows = [(stamp, bool(stamp_of(message)), pose_of(message)) for stamp, message in opened.messages(topic)]
+    poses = np.array([row[2] for row in rows]).reshape(-1, 3)
     good = np.isfinite(poses).all(axis=1)
     if not good.all():
         first = int(good.argmin())
-        opened.damaged(f"{opened.path}: pose {first} of {topic} is not finite; what comes before is used")
-        stamps, poses = stamps[:first], poses[:first]
-    # A stamp that lies ahead by damage hides what follows it; nothing goes back in time.
-    kept = np.append(True, stamps[1:] > np.maximum.accumulate(stamps)[:-1])[: len(stamps)]
+        wrong = "has no orientation" if np.isfinite(poses[first, :2]).all() else "is not finite"
+        opened.damaged(f"{opened.path}: pose {first} of {topic} {wrong}; what comes before is used")
+        rows, poses = rows[:first], poses[:first]
+    stamps, kept, notes = _in_order([row[:2] for row in rows], "pose", topic)
     if kept.sum() < 2:
         why = f" ({opened.damage[-1]})" if opened.damage else ""
         raise DeviceError(f"{opened.path}: {topic} has {int(kept.sum())} poses; there must be two{why}")
-    left_out = int((~kept).sum())
-    notes = (f"{left_out} poses of {topic} go back in time or repeat a stamp: left out",) if left_out else ()
     return StampedPoses(stamps[kept], poses[kept], notes=notes)
+
+
+def _in_order(
+    stamped: list[tuple[int, bool]], what: str, topic: str
+) -> tuple[NDArray[np.int64], NDArray[np.bool_], tuple[str, ...]]:
+    """Which messages follow all before them.
+
+    Args:
+        stamped: stamps, ns, and whether it is the message's own; else it is when the message was recorded.
+        what: one of them is.
+        topic: of them.
+
+    Returns:
+        (N,) stamps, (N,) which are kept, and what is left out, in a line; none if nothing is.
+    """
+    stamps = np.array([stamp for stamp, _ in stamped], np.int64)
+    own = np.array([own for _, own in stamped], np.bool_)
+    # A simulator's first messages may have none: the others' clock is not the recorder's.
+    kept = own if own.any() else ~own
+    # A stamp that lies ahead by damage hides what follows it; nothing goes back in time.
+    known = np.where(kept, stamps, np.iinfo(np.int64).min)
+    kept = kept & np.append(True, known[1:] > np.maximum.accumulate(known)[:-1])[: len(stamps)]
+    without = int((~own).sum()) if own.any() else 0
+    back = int((~kept).sum()) - without
+    goes = "goes back in time or repeats a stamp" if back == 1 else "go back in time or repeat a stamp"
+    has = "has" if without == 1 else "have"
+    lines = [f"{counted(back, what)} of {topic} {goes}: left out"] if back else []
+    lines += [f"{counted(without, what)} of {topic} {has} no stamp: left out"] if without else []
+    return stamps, kept, tuple(lines)
 
 
 def _kidnapped(opened: Bag, stamps_ns: NDArray[np.int64]) -> NDArray[np.bool_]:

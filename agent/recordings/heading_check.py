@@ -48,6 +48,8 @@ def contradiction(poses: Array) -> str:
     def agreement(read: Array) -> float:
         return float(np.cos(2.0 * (directions - read)).mean())
 
+    if np.ptp(poses[:, 2]) == 0.0 and abs(np.exp(2j * directions).mean()) < AGREES:
+        return "headings are all the same while the way turns: the odometry must have them"
     if agreement(headings) > CONTRADICTS:
         return ""
     return next((words for words, read in READINGS if agreement(read(headings)) > AGREES), "")

@@ -67,6 +67,8 @@ def _tum(path: Path, text: str) -> tuple[Array, str]:
             continue
         try:
             stamp, x, y, _, qx, qy, qz, qw = _finite(list(map(float, words)))
+            if not any((qx, qy, qz, qw)):
+                return np.array(rows).reshape(-1, 4), f"{path}: line {number}: a quaternion of zeros is none"
         except ValueError as error:
             why = error if "finite" in str(error) else "a pose is `stamp x y z qx qy qz qw`"
             return np.array(rows).reshape(-1, 4), f"{path}: line {number}: {why}"

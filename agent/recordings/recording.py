@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from numpy.typing import NDArray
 from mapweave.agent.recordings.heading_check import contradiction
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
-from mapweave.hybridmap.pose import Array
+from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.vision.equidistant import Equidistant
 from mapweave.vision.lens import NO_DISTORTION, Distortion, Lens
 
@@ -27,6 +28,11 @@ FASTEST = 100.0
 """m/s, half of the time or more: no robot or car drives so fast, so the odometry is in another unit."""
 LARGEST = 1e4
 """m or rad between two images; a larger motion is no measurement, and covariances overflow."""
+ZERO, NEAR_ZERO = 1e-6, 0.1
+"""m and rad: below the first a pose is that of a base that has just started; below the second, near it."""
+LONG_GAP, SLOWEST = 10.0, 1e-3
+"""s between two images, and m/s, half of the time or more: what 10 ms and 1 m/s seem to be where milliseconds
+are taken for seconds. No robot's camera is quicker, and a robot that is so slow needs no image so rarely."""
 MOST_WIDTH = 800
 """px; wider images are reduced. SIFT takes time in proportion to the area."""
 
@@ -172,6 +178,29 @@ def increments_between(odometry: StampedPoses, stamps_ns: Stamps) -> tuple[NDArr
     return inside, chords(poses)
 
 
+def continued(odometry: StampedPoses) -> StampedPoses:
+    """Poses that go on where a base that was started again has begun at zero again.
+
+    Such a pose is zero, and the one before it is not near: no robot drives there. How it moved meanwhile is
+    not known; it counts as standing.
+    """
+    poses = odometry.poses
+    far = np.abs(poses[:-1]).sum(axis=1) > NEAR_ZERO
+    resets = 1 + np.flatnonzero(far & (np.abs(poses[1:]).max(axis=1) < ZERO))
+    if not len(resets):
+        return odometry
+    whole = poses.copy()
+    for first, end in pairwise([*resets.tolist(), len(poses)]):
+        base = Pose2(*whole[first - 1])
+        whole[first:end] = [(base @ Pose2(*pose)).vector for pose in poses[first:end]]
+    at = 1e-9 * float(odometry.stamps_ns[resets[0]] - odometry.stamps_ns[0])
+    often = "once" if len(resets) == 1 else f"{len(resets)} times"
+    note = (
+        f"the odometry is set back to zero {often}, first {at:.1f} s after its first pose: it goes on there"
+    )
+    return replace(odometry, poses=whole, notes=(*odometry.notes, note))
+
+
 def chords(poses: Array) -> Array:
     """(N, 3) poses to (N, 2) forward, m, and turn, rad, since the pose before; see `Odometry.motion`."""
     steps = np.diff(poses, axis=0)
@@ -214,6 +243,7 @@ def assembled(
         first = int((np.diff(stamps) <= 0).argmax()) + 1
         raise DeviceError(f"{path}: the images' stamps do not ascend: see image {first}, counted from 0")
     if isinstance(odometry, StampedPoses):
+        odometry = continued(odometry)
         try:
             inside, increments = increments_between(odometry, stamps)
         except DeviceError as error:
@@ -241,6 +271,7 @@ def assembled(
     if wrong:
         damage = (*damage, f"{path}: {wrong}; what comes before is used")
         stamps, increments = stamps[:whole_count], increments[:whole_count]
+    notes = (*notes, *_milliseconds(increments, stamps))
     factor = math.ceil(camera.width / MOST_WIDTH)
     if factor > 1:
         notes = (*notes, f"images are reduced {factor} times")
@@ -300,6 +331,21 @@ def _silence(stamps_ns: Stamps, odometry_ns: Stamps) -> list[str]:
         return []
     begin = (stamps_ns[longest] - stamps_ns[0]) / 1e9
     return [f"the camera is silent for {gaps[longest] / 1e9:.1f} s, {begin:.1f} s after its first image"]
+
+
+def _milliseconds(increments: Array, stamps_ns: Stamps) -> list[str]:
+    """A line if the times seem to be in milliseconds."""
+    gaps, ways = np.diff(stamps_ns) * 1e-9, np.abs(increments[1:, 0])
+    moves = ways > 0.0
+    if not moves.any():
+        return []
+    gap, speed = float(np.median(gaps)), float(np.median(ways[moves] / gaps[moves]))
+    if gap < LONG_GAP or speed > SLOWEST:
+        return []
+    return [
+        f"the robot drives {1e3 * speed:.2g} mm/s, with an image every {gap:.3g} s: times must be in "
+        "seconds; are these milliseconds?"
+    ]
 
 
 def names_of(topics: Iterable[Topic]) -> str:

@@ -59,10 +59,14 @@ def heading_of(qx: float, qy: float, qz: float, qw: float) -> float:
 
 
 def pose_of(message: Any) -> tuple[float, float, float]:
-    """X m, y m and heading rad of an Odometry, PoseStamped or PoseWithCovarianceStamped."""
+    """X m, y m and heading rad of an Odometry, PoseStamped or PoseWithCovarianceStamped.
+
+    The heading is not a number if the quaternion is all zeros: the sender has left it empty.
+    """
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
     q = pose.orientation
-    return pose.position.x, pose.position.y, heading_of(q.x, q.y, q.z, q.w)
+    heading = heading_of(q.x, q.y, q.z, q.w) if any((q.x, q.y, q.z, q.w)) else math.nan
+    return pose.position.x, pose.position.y, heading
 
 
 def camera_of(message: Any, rectified: bool = False) -> tuple[Camera, LensModel, tuple[float, ...]]:

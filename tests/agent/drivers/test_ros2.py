@@ -8,6 +8,7 @@ import re
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -15,9 +16,11 @@ import pytest
 
 from mapweave.agent.drivers.checked import CheckedRobot
 from mapweave.agent.drivers.ros2 import Ros2
+from mapweave.agent.drivers.ros2_odometry import WheelOdometry
 from mapweave.agent.drivers.ros2_ranges import Ranger
 from mapweave.agent.drivers.settings import CameraSettings, Geometry, RobotSettings
 from mapweave.agent.observation import Command, Observation
+from mapweave.agent.ros_messages.values import ODOMETRY_TYPE
 from mapweave.hybridmap.errors import DeviceError, SettingsError
 from mapweave.vision.equidistant import Equidistant
 from mapweave.wire.ros2.messages import decode
@@ -249,6 +252,14 @@ def test_what_is_wrong_is_said_in_one_line(
         return re.search(line, str(error.value)) is not None
 
     until(said, 10.0)
+
+
+def test_odometry_without_orientation_is_refused() -> None:
+    """Its heading was taken for 0."""
+    zeros = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=0.0)
+    message = SimpleNamespace(pose=SimpleNamespace(pose=SimpleNamespace(position=zeros, orientation=zeros)))
+    with pytest.raises(DeviceError, match="its quaternion is all zeros"):
+        WheelOdometry(0.25, None, ("left", "right")).update(ODOMETRY_TYPE, message, 0)
 
 
 def test_settings_are_checked_before_anything_moves(start: Start) -> None:

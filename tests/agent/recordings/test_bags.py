@@ -267,6 +267,69 @@ def test_poses_that_go_back_in_time_are_left_out_and_said(
     assert recording.increments == pytest.approx(drive.increments)
 
 
+@pytest.mark.parametrize("late", [0, 5])
+def test_images_that_go_back_in_time_are_left_out_and_said(
+    late: int, drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The whole bag was refused for one of them. The first of a simulator may have no stamp at all."""
+    write_bag(tmp_path / "drive", drive)
+    messages = bag.Bag.messages
+
+    def spoilt(self: bag.Bag, topic: str) -> Iterator[tuple[int, Any]]:
+        for k, (stamp, message) in enumerate(messages(self, topic)):
+            if topic == "/cam/image_raw" and k == late:
+                message.header.stamp.sec, message.header.stamp.nanosec = 0, 0
+                if late:
+                    message.header.stamp.sec = 1
+                yield (10**9 if late else stamp + 10**15), message
+            else:
+                yield stamp, message
+
+    monkeypatch.setattr(bag.Bag, "messages", spoilt)
+    replay = Replay(tmp_path / "drive", options=OPTIONS)
+    why = "goes back in time or repeats a stamp" if late else "has no stamp"
+    assert f"1 image of /cam/image_raw {why}: left out" in replay.recording.notes
+    left = [k for k in range(COUNT) if k != late]
+    for k, observation in zip(left, iter(replay.sense, None), strict=True):
+        assert observation.stamp_ns == drive.stamps_ns[k]
+        assert np.array_equal(observation.image, drive.images[k])
+    # The way across it is kept.
+    assert replay.recording.increments[1:].sum(axis=0) == pytest.approx(
+        drive.increments[left[0] + 1 :].sum(axis=0), abs=1e-4
+    )
+
+
+def test_images_of_distances_are_not_taken_where_there_are_others(drive: Drive, tmp_path: Path) -> None:
+    opened = SimpleNamespace(
+        path=tmp_path,
+        topics=[
+            bag.Topic("/camera/aligned_depth_to_color/image_raw", bag.IMAGE_TYPES[1], 90),
+            bag.Topic("/camera/color/image_raw", bag.IMAGE_TYPES[1], 80),
+        ],
+    )
+    assert bag._chosen(opened, None, bag.IMAGE_TYPES, "images").name == "/camera/color/image_raw"
+    del opened.topics[1]
+    assert "depth" in bag._chosen(opened, None, bag.IMAGE_TYPES, "images").name
+
+
+def test_odometry_without_orientation_is_refused(
+    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its heading was taken for 0 all the way, and the map was wrong."""
+    write_bag(tmp_path / "drive", drive)
+    messages = bag.Bag.messages
+
+    def empty(self: bag.Bag, topic: str) -> Iterator[tuple[int, Any]]:
+        for stamp, message in messages(self, topic):
+            if topic == "/odom":
+                message.pose.pose.orientation.z = message.pose.pose.orientation.w = 0.0
+            yield stamp, message
+
+    monkeypatch.setattr(bag.Bag, "messages", empty)
+    with pytest.raises(DeviceError, match="pose 0 of /odom has no orientation"):
+        open_recording(tmp_path / "drive", OPTIONS)
+
+
 def test_a_pose_that_is_no_number_ends_the_odometry(drive: Drive, tmp_path: Path) -> None:
     spoiled = [*drive.poses[:6], *(Pose2(0.0, 0.0, 0.0) for _ in drive.poses[6:])]
     object.__setattr__(spoiled[6], "x", math.nan)

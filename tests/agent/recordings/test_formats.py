@@ -230,6 +230,38 @@ def test_a_camera_that_stops_is_named(drive: Drive, poses_file: Path, tmp_path: 
     assert recording.notes == ("the camera is silent for 7.0 s, 1.6 s after its first image",)
 
 
+def test_odometry_that_begins_again_at_zero_goes_on(drive: Drive, tmp_path: Path) -> None:
+    """A base that is started again counts from zero: the way back was taken for driven, and tore the map."""
+    folder_with_poses(drive, tmp_path)
+    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
+    again = [*drive.poses[:5], *(drive.poses[5].inverse() @ pose for pose in drive.poses[5:])]
+    rows = zip(drive.stamps_ns, again, strict=True)
+    (tmp_path / "odometry.csv").write_text(
+        "stamp_s,x_m,y_m,heading_rad\n"
+        + "".join(f"{s // 10**9}.{s % 10**9:09d},{p.x!r},{p.y!r},{p.heading!r}\n" for s, p in rows)
+    )
+    recording = open_recording(tmp_path)
+    assert "set back to zero once, first 1.0 s after its first pose" in " ".join(recording.notes)
+    assert recording.increments[5] == pytest.approx((0.0, 0.0))
+    others = [k for k in range(COUNT) if k != 5]
+    assert recording.increments[others] == pytest.approx(drive.increments[others], abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("scale", "way", "words"),
+    [(1e3, 0.02, "every 100 s: times must be in seconds"), (1.0, 0.02, ""), (1e3, 2.0, ""), (1e3, 0.0, "")],
+)
+def test_times_in_milliseconds_are_named(
+    scale: float, way: float, words: str, drive: Drive, tmp_path: Path
+) -> None:
+    folder_with_poses(drive, tmp_path)
+    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
+    (tmp_path / "times.txt").write_text("".join(f"{scale * 0.1 * k:g}\n" for k in range(COUNT)))
+    (tmp_path / "odometry.csv").write_text("forward_m,turn_rad\n" + f"{way:g},0\n" * COUNT)
+    notes = " ".join(open_recording(tmp_path).notes)
+    assert words in notes and bool(notes) is bool(words)
+
+
 def test_odometry_of_another_clock_is_refused(drive: Drive, poses_file: Path, tmp_path: Path) -> None:
     kitti(drive, tmp_path)
     with pytest.raises(DeviceError, match="do not overlap: they must be of one clock"):
@@ -259,6 +291,7 @@ def test_a_large_image_is_reduced_with_its_camera(drive: Drive) -> None:
         ("1 2 3\n", "line 1: a pose is `stamp x y z qx qy qz qw`"),
         ("", "0 poses; there must be two or more"),
         ("1 0 0 0 0 0 0 1\n2 nan 0 0 0 0 0 1\n", "line 2: all numbers must be finite"),
+        ("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n", "line 2: a quaternion of zeros is none"),
         ("1 0 0 0 0 0 0 1\n1e10 0 0 0 0 0 0 1\n", "times are seconds since 1970 or since the start"),
         ("# only a comment\n1 0 0 0 0 0 0 1\n", "1 poses"),
     ],

@@ -57,6 +57,15 @@ def test_wrong_headings_are_named(seed: int, spoil: Callable[[Array], Array], wo
     assert words in said and bool(said) is bool(words)
 
 
+@pytest.mark.parametrize("seed", range(5))
+def test_headings_that_were_never_filled_in_are_named(seed: int) -> None:
+    poses = driven(seed)
+    empty = np.column_stack([poses[:, :2], np.zeros(len(poses))])
+    assert "all the same while the way turns" in contradiction(empty)
+    straight = np.column_stack([np.arange(600) * 0.01, np.zeros(600), np.zeros(600)])
+    assert not contradiction(straight)
+
+
 def test_a_recording_with_headings_in_degrees_is_refused(tmp_path: Path) -> None:
     poses, folder = driven(0), tmp_path / "walk"
     (folder / "images").mkdir(parents=True)
