@@ -83,6 +83,11 @@ class MapHistory:
         """Maps that were set apart by the last merge that was followed, also of another process."""
         return self._kept.set_apart
 
+    @property
+    def disbelieved(self) -> tuple[tuple[MapId, str], ...]:
+        """Maps of which something said was not believed at that merge, and why."""
+        return self._kept.disbelieved
+
     def follow(self, merged: MergedMap) -> None:
         """Take note of what has changed with a merge, and keep it."""
         if not merged.maps and not merged.set_apart:
@@ -146,8 +151,9 @@ class MapHistory:
         apart_pairs = frozenset(still | set(new))
         self._links = merged.links
         after = KeptHistory(
-            (), now, apart_pairs, frozenset(bad), frozenset(against_hand), frozenset(frames), frozenset(odd)
-        )
+            (), now, apart_pairs, frozenset(bad), frozenset(against_hand), frozenset(frames), frozenset(odd),
+            tuple(sorted(merged.disbelieved.items())),
+        )  # fmt: skip
         if fresh or replace(after, events=self._kept.events) != self._kept:
             self._keep(fresh, after)
 

@@ -81,6 +81,8 @@ class MergeWorker:
         self._read_all = self._begun = False
         self._problem = ""
         self._merger.suspect(self._history.set_apart)
+        for map_id, reason in self._history.disbelieved:
+            self._merger.note_disbelief(map_id, reason)
         self._waiting: FairQueue[Change] = FairQueue(0, 0)
         self._counting = threading.Lock()
         self._came = self._applied = self._done = 0

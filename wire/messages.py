@@ -64,6 +64,7 @@ class KeptHistory:
         frames: pins that are reported as not holding their component's frame, with the node of the older pin
             that does; a pin whose node is not in the merged map with its own.
         implausible: maps that are reported as implausible.
+        disbelieved: maps of which something said is not believed, and why: no store says it again.
     """
 
     events: tuple[MapEvent, ...] = ()
@@ -73,6 +74,7 @@ class KeptHistory:
     contradicted: frozenset[tuple[NodeId, NodeId]] = frozenset()
     frames: frozenset[tuple[NodeId, NodeId]] = frozenset()
     implausible: frozenset[MapId] = frozenset()
+    disbelieved: tuple[tuple[MapId, str], ...] = ()
 
 
 @dataclass(frozen=True)

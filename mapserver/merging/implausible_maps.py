@@ -22,6 +22,8 @@ class ImplausibleMaps:
 
     refused: dict[MapId, str]
     """Maps of which a change was refused, and why the first one was."""
+    disbelieved: dict[MapId, str]
+    """Maps of which something said is not believed, and why the first such thing is not."""
 
     def __init__(self, consistency: ConsistencySettings) -> None:
         """Nothing is known yet.
@@ -31,7 +33,7 @@ class ImplausibleMaps:
         """
         self._by_itself: dict[MapId, str] = {}
         self.refused = {}
-        self._disbelieved: dict[MapId, str] = {}
+        self.disbelieved = {}
         self._torn = TornMapSearch(consistency)
 
     def changed(self, map_id: MapId, hybrid_map: HybridMap) -> None:
@@ -46,8 +48,8 @@ class ImplausibleMaps:
 
     def note_disbelief(self, map_id: MapId, reason: str) -> bool:
         """Note that something said of a map is not believed; returns whether it is the first that is."""
-        first = map_id not in self._disbelieved
-        self._disbelieved.setdefault(map_id, reason)
+        first = map_id not in self.disbelieved
+        self.disbelieved.setdefault(map_id, reason)
         return first
 
     def of(self, merged: MergedMap, pruned: Container[MapId]) -> dict[MapId, str]:
@@ -59,5 +61,5 @@ class ImplausibleMaps:
         """
         odd = self._torn.torn(merged) | contradict_each_other(merged) | contradict_themselves(merged)
         odd |= {which: reason for which, reason in self._by_itself.items() if reason}
-        odd |= scattered(merged.maps, pruned) | self._disbelieved | self.refused
+        odd |= scattered(merged.maps, pruned) | self.disbelieved | self.refused
         return {which: odd[which] for which in sorted(odd.keys() & merged.maps.keys())}

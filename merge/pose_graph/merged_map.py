@@ -138,6 +138,7 @@ class MergedMap:
         pins: people's pins of components' frames, oldest first.
         refused_changes: maps of which a server refused a change, and why. Their links to other maps are
             refused, unless a person links the two.
+        disbelieved: maps of which something that was said is not believed, and why; they are implausible.
         pruned: superseded nodes that have left the maps. What they measured is in marginal links, see
             mapweave.merge.pose_graph.marginalization.
     """
@@ -158,6 +159,7 @@ class MergedMap:
     contradicted: Mapping[tuple[NodeId, NodeId], str] = field(default_factory=dict)
     pins: tuple[Pin, ...] = ()
     refused_changes: Mapping[MapId, str] = field(default_factory=dict)
+    disbelieved: Mapping[MapId, str] = field(default_factory=dict)
     pruned: PrunedNodes = field(default_factory=PrunedNodes)
 
     @staticmethod

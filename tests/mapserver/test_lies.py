@@ -155,6 +155,11 @@ def test_no_log_is_as_long_as_the_greatest_number(tmp_path: Path, caplog: pytest
         words = f"map {LAST} is implausible: change {MAX_NUMBER} is announced"
         fleet.tell(LAST, messages(LAST, views(LAST, Pose2(), STEP)))
         eventually(lambda: said(fleet, words))
+    # Only the beacon has said it: the log on the disk shows nothing.
+    with serving(tmp_path / "s0.sqlite") as fleet:
+        assert fleet.server.settle(30)
+        assert fleet.server.merged().implausible.keys() == {LAST}
+        assert len(said(fleet, words)) == 1
 
 
 def test_who_shares_landmarks_with_most_has_copied_them_if_nothing_else_tells() -> None:
