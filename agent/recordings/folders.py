@@ -11,15 +11,14 @@ import numpy as np
 
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.image_folder import images_in, images_of, read_increments, read_times
-from mapweave.agent.recordings.incomplete import CameraAndLens, CameraGiven, complete
+from mapweave.agent.recordings.incomplete import CameraAndLens, CameraGiven, complete, first_image
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
 from mapweave.agent.recordings.recording import Images, Recording, Stamps, stamps_of
 from mapweave.agent.recordings.table_file import named_columns, read_text
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
-from mapweave.storage.atomic_file import read_whole
-from mapweave.storage.image_file import image_size, read_grey
+from mapweave.storage.image_file import read_grey
 from mapweave.vision.lens import NO_DISTORTION, LensModel, lens_of
 
 Intrinsics = tuple[float, float, float, float]
@@ -40,7 +39,7 @@ def kitti(folder: Path, options: RecordingOptions) -> Recording:
     if not lines or len(lines[0]) != 12:
         raise DeviceError(f"{folder / 'calib.txt'}: no line {row} with twelve numbers")
     p = _numbers(folder / "calib.txt", lines[0])
-    given = _camera(paths[0], (p[0], p[5], p[2], p[6])), NO_DISTORTION
+    given = _camera(paths, (p[0], p[5], p[2], p[6])), NO_DISTORTION
     return _folder(folder, "KITTI odometry", paths, stamps, given, options)
 
 
@@ -72,7 +71,7 @@ def euroc(folder: Path, options: RecordingOptions) -> Recording:
     fx, fy, cx, cy = intrinsics
     try:
         coefficients = [*lens, 0.0] if name == LensModel.RADIAL_TANGENTIAL else lens
-        given = lens_of(_camera(paths[0], (fx, fy, cx, cy)), LensModel(name), coefficients)
+        given = lens_of(_camera(paths, (fx, fy, cx, cy)), LensModel(name), coefficients)
     except InvalidValue as error:
         raise DeviceError(f"{cam / 'sensor.yaml'}: {error}") from None
     return _folder(folder, "EuRoC", paths, stamps, given, options)
@@ -167,12 +166,18 @@ def _images(paths: Sequence[Path], stamps_ns: Stamps, camera: Camera | None = No
     return Images(stamps_ns, lambda k: read_grey(paths[k], camera, "camera.toml"))
 
 
-def _camera(image: Path, intrinsics: Intrinsics) -> Camera:
+def _camera(images: Sequence[Path], intrinsics: Intrinsics) -> Camera:
+    """The camera of images of the size of the first that can be read.
+
+    Raises:
+        DeviceError: none can be read, or no camera has these intrinsics.
+    """
+    image, _ = first_image(len(images), lambda k: read_grey(images[k]))
+    height, width = image.shape
     try:
-        width, height = image_size(read_whole(image))
         return Camera(width, height, *intrinsics, mount_height=0.0)
-    except (OSError, ValueError) as error:
-        raise DeviceError(f"{image}: {error}") from None
+    except InvalidValue as error:
+        raise DeviceError(f"{images[0].parent}: {error}") from None
 
 
 def _lines(path: Path) -> list[str]:

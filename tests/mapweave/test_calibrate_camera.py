@@ -228,6 +228,17 @@ def test_the_result_is_shown_where_it_is_not_written(frames, capfd, tmp_path: Pa
     assert "nothing is changed" in line
 
 
+def test_images_that_do_not_suffice_or_fit_are_named(frames, capfd, tmp_path: Path) -> None:
+    one = folder_of(frames["pinhole"][:1], tmp_path / "one")
+    assert "1 view of the target; three are" in complaint(
+        capfd, "calibrate", "camera", one, *OPTIONS, status=NO
+    )
+    images = [*frames["pinhole"][:3], cv2.resize(frames["pinhole"][3], (640, 480))]
+    mixed = folder_of(images, tmp_path / "mixed")
+    said = complaint(capfd, "calibrate", "camera", mixed, *OPTIONS)
+    assert "different sizes: 320x240, 640x480; 003.png is 640x480" in said
+
+
 def test_mistakes_are_one_line(frames, capfd, tmp_path: Path) -> None:
     blank = folder_of([np.full((240, 320), 99, np.uint8)] * 2, tmp_path / "blank")
     robot = tmp_path / "r0.toml"

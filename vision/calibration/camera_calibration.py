@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -81,9 +82,14 @@ def calibrate_camera(views: Sequence[BoardView], model: LensModel | None = None)
     Raises:
         InvalidValue: the views are of different sizes or too few, or explain no lens.
     """
-    sizes = sorted({view.image_size for view in views})
-    if len(sizes) > 1:
-        raise InvalidValue(f"images of different sizes: {', '.join(f'{w}x{h}' for w, h in sizes)}")
+    counts = Counter(view.image_size for view in views)
+    if len(counts) > 1:
+        rarest = min(counts, key=lambda size: counts[size])
+        odd = next(view.name for view in views if view.image_size == rarest)
+        which = f"; {odd} is {rarest[0]}x{rarest[1]}" if odd else ""
+        raise InvalidValue(
+            f"images of different sizes: {', '.join(f'{w}x{h}' for w, h in sorted(counts))}{which}"
+        )
     chosen = diverse(views, MOST_VIEWS)
     fits: dict[LensModel, Fit] = {}
     failure: InvalidValue | None = None

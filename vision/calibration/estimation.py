@@ -13,7 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.counted import counted
+from mapweave.hybridmap.errors import InvalidValue, Refused
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.calibration.projection import COEFFICIENTS, FOCAL, Projected, project, rays_of
 from mapweave.vision.calibration.views import FEWEST_CORNERS, BoardView
@@ -72,10 +73,12 @@ def fit(views: Sequence[BoardView], model: LensModel) -> Fit:
     """Estimate from nothing.
 
     Raises:
-        InvalidValue: the views are too few, or explain no lens.
+        Refused: the views are too few.
+        InvalidValue: they explain no lens.
     """
     if len(views) < 3:
-        raise InvalidValue(f"{len(views)} views of the target; three are the least, ten or more are good")
+        seen = counted(len(views), "view")
+        raise Refused(f"{seen} of the target; three are the least, ten or more are good")
     found = _plausible(views, _first(views, model))
     narrow = np.zeros(len(found.intrinsics), np.bool_)
     narrow[[0, 1, FOCAL]] = True

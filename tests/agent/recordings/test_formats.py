@@ -119,6 +119,23 @@ def test_kitti_and_euroc_say_what_camera_it_is_but_not_how_high(
     assert recording.camera == drive.camera
 
 
+def test_a_first_image_that_is_missing_is_left_out_as_any_other(
+    drive: Drive, poses_file: Path, tmp_path: Path
+) -> None:
+    euroc(drive, tmp_path)
+    data = tmp_path / "mav0" / "cam0" / "data"
+    (data / f"{drive.stamps_ns[0]}.png").unlink()
+    replay = Replay(tmp_path, options=RecordingOptions(odometry=poses_file, camera_height=0.3))
+    assert replay.describe().camera == drive.camera
+    assert len(list(iter(replay.sense, None))) == KNOWN - 1
+    (line,) = replay.damage
+    assert f"{drive.stamps_ns[0]}.png: no such file (left out, 1 of {KNOWN} images)" in line
+    for image in data.iterdir():
+        image.unlink()
+    with pytest.raises(DeviceError, match=r"no such file$"):
+        open_recording(tmp_path, RecordingOptions(odometry=poses_file, camera_height=0.3))
+
+
 def test_a_fisheye_of_euroc_becomes_an_ideal_camera(drive: Drive, poses_file: Path, tmp_path: Path) -> None:
     euroc(drive, tmp_path)
     sensor = tmp_path / "mav0" / "cam0" / "sensor.yaml"
