@@ -9,7 +9,7 @@ import os
 import shutil
 import sys
 import threading
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -166,6 +166,15 @@ def run(arguments: argparse.Namespace) -> int:
             prepare(data, path, before)
         if arguments.store is None and path.exists() and path.stat().st_size > LARGE:
             print(stamped(f"reading {path}, {path.stat().st_size / 1e6:.0f} MB ..."), flush=True)
+        if arguments.store is None and not path.exists() and (beside := _stores_beside(path)):
+            # As after a restore under another name, or with another --name than before.
+            print(
+                stamped(
+                    f"{path} is a new store, with nothing in it: a server goes on with that of its own "
+                    f"--name, and not with {', '.join(beside)} beside it"
+                ),
+                flush=True,
+            )
         base = None
         if arguments.map is not None:
             given = opened(arguments.map)
@@ -205,6 +214,18 @@ def run(arguments: argparse.Namespace) -> int:
                 print(stamped(now), flush=True)
                 last_line = now
     return 0
+
+
+def _stores_beside(path: Path) -> list[str]:
+    """Names of other servers' stores in the same folder."""
+    from mapweave.opened_map import MapSource, source_of
+
+    names = []
+    for other in sorted(path.parent.glob("*.sqlite")):
+        with suppress(InvalidFile):
+            if source_of(other, live=True) is MapSource.STORE:
+                names.append(other.name)
+    return names
 
 
 def end_if_stopped_before(stop: threading.Event, temporary: Path | None = None) -> threading.Event:

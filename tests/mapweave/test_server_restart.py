@@ -9,14 +9,17 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import takewhile
 from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
 from websockets.sync.client import connect
 
+from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.http.live import LOADING, NOT_THERE
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.storage.map_file import MapFile, write_map_file
 from synthetic.maps import looked_around
 from tests.waiting import eventually, free_port
@@ -112,3 +115,24 @@ def test_a_server_that_reads_its_store_can_be_stopped(tmp_path: Path) -> None:
             assert running.wait(60) == 0
         finally:
             running.kill()
+
+
+def test_a_server_that_begins_a_store_beside_those_of_others_says_so(tmp_path: Path) -> None:
+    """As after a restore under another name: it began with nothing, and did not say so."""
+    SqliteStore(tmp_path / "monday.sqlite").close()
+    Journal(tmp_path / "r0.sqlite", "r0").close()
+    said = {}
+    for name in ("s1", "monday"):
+        command = [
+            sys.executable, "-c", SLOW_START, "server", "--name", name, "--data", str(tmp_path), "--listen",
+            f"tcp/127.0.0.1:{free_port()}",
+        ]  # fmt: skip
+        with subprocess.Popen(command, stdout=subprocess.PIPE, env=dict(os.environ), text=True) as running:
+            assert running.stdout is not None
+            try:
+                said[name] = "".join(takewhile(lambda line: "reading" not in line, running.stdout))
+            finally:
+                running.kill()
+    assert f"{tmp_path / 's1.sqlite'} is a new store, with nothing in it" in said["s1"]
+    assert "and not with monday.sqlite beside it\n" in said["s1"]
+    assert "a new store" not in said["monday"]
