@@ -14,7 +14,7 @@ from dataclasses import replace
 
 from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
-from mapweave.hybridmap.ids import MapId, NodeId, check_name
+from mapweave.hybridmap.ids import NodeId, check_name
 from mapweave.hybridmap.mission_order import (
     MAX_KEPT,
     MAX_VIA,
@@ -201,12 +201,12 @@ class MissionRelay:
         """The mission as the robot gets it, or refused."""
         robot, node = request.robot, None
         via: tuple[NodeId, ...] = ()
-        status = None if self.roster is None else self.roster.status(robot)
-        if status is None and not (self.roster is not None and self.roster.alive(robot)):
+        # Its last status may be of the map before, and a server that has just begun has none.
+        map_id = None if self.roster is None else self.roster.map_of(robot)
+        if map_id is None:
             heard = () if self.roster is None else tuple(self.roster.presence())
             raise InvalidValue(f"no robot {robot} has been heard of{others_of(robot, heard)}")
         if request.goal:
-            map_id = MapId(robot, 0 if status is None else status.epoch)
             places = self._places()
             node = node_of_goal(request.goal, map_id, places)
             via = tuple(node_of_goal(word, map_id, places, "via point") for word in request.via)

@@ -117,6 +117,13 @@ class Roster:
         with self._turn:
             return self._heard[robot][0] if robot in self._heard else None
 
+    def map_of(self, robot: str) -> MapId | None:
+        """The map that a robot makes: the newest under which it is alive, or that of its last status."""
+        with self._turn:
+            if alive := self._alive.get(robot):
+                return max(alive)
+            return MapId(robot, self._heard[robot][0].epoch) if robot in self._heard else None
+
     def status_period(self) -> float:
         """How much time between two statuses of a robot there should be, s; 0: as they like, 0.5 s.
 

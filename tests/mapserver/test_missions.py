@@ -29,7 +29,7 @@ from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import encode
-from tests.mapserver.house import KEYS, House, ask
+from tests.mapserver.house import KEYS, ROBOT, House, ask
 from tests.waiting import eventually
 
 THERE = NodeId("r0", 1, 3)
@@ -151,6 +151,24 @@ def test_a_robot_that_is_away_gets_its_newest_mission_when_it_is_back(house: Hou
     assert control.report == MissionReport(second.order, MissionState.RUNNING)
     eventually(lambda: house.person.missions()[-1].state is MissionState.RUNNING)
     link.close()
+
+
+def test_a_goal_is_of_the_map_that_a_robot_makes_now(house: House) -> None:
+    """Right after a start of the server its status has not come, and after its own its last one is older."""
+    bus, first = house.bus(), min(house.mapped.truth)
+    alive = bus.announce(KEYS.agent_alive(ROBOT))
+    eventually(lambda: house.entry("r0").alive)
+    assert house.entry("r0").status is None
+    assert house.person.go("r0", "home").order.node == first
+    alive.close()
+    link, _ = house.robot()
+    link.close()
+    eventually(lambda: not house.entry("r0").alive)
+    assert house.person.go("r0", "home").order.node == first
+    bus.announce(KEYS.agent_alive(ROBOT._replace(epoch=2)))
+    eventually(lambda: house.entry("r0").alive)
+    with pytest.raises(InvalidValue, match=r"^the map r0\.2 of r0 has no node yet: it has no home$"):
+        house.person.go("r0", "home")
 
 
 class SharedRecord:
