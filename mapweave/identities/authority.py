@@ -42,7 +42,7 @@ class Authority:
         """Take its certificate and key, PEM.
 
         Raises:
-            SettingsError: they are damaged.
+            SettingsError: they are damaged, or do not belong together.
         """
         try:
             self._certificate = x509.load_pem_x509_certificate(certificate.encode())
@@ -51,6 +51,11 @@ class Authority:
             raise SettingsError(f"the authority's key is damaged: {str(error).splitlines()[0]}") from None
         if not isinstance(key, ec.EllipticCurvePrivateKey):
             raise SettingsError("the authority's key is not one of `mapweave keys init`")
+        if self._certificate.public_key() != key.public_key():
+            # As after a restore of one of the two: no router would let in who gets a certificate of this key.
+            raise SettingsError(
+                "authority.pem and authority.key do not belong together: restore both from one backup"
+            )
         self._key = key
         self.certificate = certificate
 

@@ -18,7 +18,7 @@ from cryptography import x509
 
 from mapweave.cli import main
 from mapweave.connection import no_server
-from mapweave.exit_status import NO, USAGE
+from mapweave.exit_status import FAILED, NO, USAGE
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.identities.logins import Logins
@@ -193,6 +193,24 @@ def test_no_copy_is_made_of_a_key_that_lets_no_one_in(
         assert error.startswith(f"mapweave: the key of {name} is {words}")
         assert f"`mapweave keys add {name} --role robot` makes a new one" in error
         assert not copy.exists()
+
+
+def test_an_authority_signs_nothing_with_the_key_of_another(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The certificate comes from another backup: who got a key by it was let in nowhere."""
+    mine, other = tmp_path / "mine", tmp_path / "other"
+    for folder in (mine, other):
+        assert main(["keys", "init", "--keys", str(folder)]) == 0
+    before = {path.name for path in mine.iterdir()}
+    kept = (mine / "authority.pem").read_bytes()
+    (mine / "authority.pem").write_bytes((other / "authority.pem").read_bytes())
+    capsys.readouterr()
+    assert main(["keys", "add", "r0", "--keys", str(mine)]) == FAILED
+    assert "authority.pem and authority.key do not belong together" in capsys.readouterr().err
+    assert {path.name for path in mine.iterdir()} == before
+    (mine / "authority.pem").write_bytes(kept)
+    assert main(["keys", "add", "r0", "--keys", str(mine)]) == 0
 
 
 def test_certificates_are_what_they_say(tmp_path: Path) -> None:
