@@ -22,8 +22,16 @@ from mapweave.agent.drivers.wheeled import STALE, WheeledRobot
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.ros_messages import making
 from mapweave.agent.ros_messages.images import grey_of
-from mapweave.agent.ros_messages.values import BASE, CAMERA_TYPE, IMAGE_TYPES, KIDNAP_TYPE, camera_of
+from mapweave.agent.ros_messages.values import (
+    BASE,
+    CAMERA_TYPE,
+    IMAGE_TYPES,
+    KIDNAP_TYPE,
+    ODOMETRY_TYPE,
+    camera_of,
+)
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, SettingsError
+from mapweave.wire.ros2.keys import Endpoint, Role
 from mapweave.wire.ros2.messages import encode, make
 from mapweave.wire.ros2.node import Publisher, Ros2Node
 from mapweave.wire.ros2.settings import Ros2Link
@@ -99,6 +107,8 @@ class Ros2Base:
         self._axle, self._radius = given.axle, given.radius
         self._clock = clock = RemoteClock()
         self._odometry = Topic(node, options.odometry, ros2_odometry.KINDS, clock)
+        self._sources = set[str]()
+        node.watch(Role.PUBLISHER, self._odometry.name, self._odometry_source)
         self._wheels = WheelOdometry(given.axle, options.wheel_radius, options.joints)
         self.images = Topic(node, options.image, IMAGE_TYPES, clock)
         beside = options.image.removesuffix("/compressed").rpartition("/")
@@ -196,6 +206,19 @@ class Ros2Base:
         except DeviceError as error:
             raise DeviceError(f"{self._odometry.name}: {error}") from None
         return received.stamp_ns
+
+    def _odometry_source(self, endpoint: Endpoint, token: str, alive: bool) -> None:
+        """A publisher of the odometry comes or goes. Steps between poses of two are no motion."""
+        if endpoint.kind != ODOMETRY_TYPE:
+            return
+        (self._sources.add if alive else self._sources.discard)(token)
+        if alive and len(self._sources) > 1:
+            log.warning(
+                "%s has %d publishers, whose poses are mixed: let only one publish there, or give "
+                "[robot.options] odometry another topic",
+                self._odometry.name,
+                len(self._sources),
+            )
 
     def _check_images(self, end: float) -> None:
         """Find out what camera it is, and whether the images are its."""

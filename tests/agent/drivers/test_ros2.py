@@ -26,8 +26,9 @@ from mapweave.vision.equidistant import Equidistant
 from mapweave.wire.ros2.messages import decode
 from tests import ros2_peer as peer
 from tests.agent.drivers.contract import HEIGHT, WIDTH, RobotContract, drive, drive_until, drive_way, until
-from tests.agent.drivers.ros2_robot import Ros2Robot
+from tests.agent.drivers.ros2_robot import KINDS, Ros2Robot
 from tests.quick import first_quick
+from tests.ros2_peer import RosPeer
 
 Start = Callable[..., CheckedRobot]
 
@@ -278,6 +279,22 @@ def test_without_a_router_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> N
             robot.describe()
     finally:
         robot.close()
+
+
+def test_that_odometry_has_two_publishers_is_said(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+    """The steps between their poses were taken for slip, or the robot for one that stands."""
+    emulator = Ros2Robot()
+    robot = start(emulator)
+    robot.describe()
+    other = RosPeer(emulator.endpoint)
+    try:
+        with caplog.at_level(logging.WARNING):
+            other.publisher("/odom", KINDS["odom"])
+            until(lambda: bool(caplog.records), 10.0)
+    finally:
+        other.close()
+    (line,) = [record.message for record in caplog.records]
+    assert line.startswith("/odom has 2 publishers, whose poses are mixed")
 
 
 def test_that_no_node_listens_is_said_once(start: Start, caplog: pytest.LogCaptureFixture) -> None:
