@@ -11,6 +11,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Annotated, ClassVar, TypeVar
+from unicodedata import normalize
 
 from msgspec import Meta
 
@@ -242,8 +243,18 @@ class Annotations:
 
     def last(self, kind: str, name: str) -> Annotation | None:
         """The entry that holds; None if there is none, or it is withdrawn."""
-        entry = self._last.get((kind, name))
+        entry = self._last.get((kind, self.spelled(kind, name)))
         return None if entry is None or entry.removed else entry
+
+    def spelled(self, kind: str, name: str) -> str:
+        """A name as the record has it, or as it is to be kept.
+
+        Keyboards and systems write a letter with an accent as one character or as two: that is one name.
+        """
+        if (kind, name) in self._last:
+            return name
+        composed = normalize("NFC", name)
+        return self._composed.get((kind, composed), composed)
 
     def in_force(self, body: type[AnyBody]) -> tuple[tuple[Annotation, AnyBody], ...]:
         """Entries of one kind that hold, with their bodies, in the order of their names."""
@@ -267,6 +278,11 @@ class Annotations:
     @cached_property
     def _last(self) -> dict[tuple[str, str], Annotation]:
         return {(entry.kind, entry.name): entry for entry in self.made}
+
+    @cached_property
+    def _composed(self) -> dict[tuple[str, str], str]:
+        """Names as they are in the record, by their composed form."""
+        return {(kind, normalize("NFC", name)): name for kind, name in self._last}
 
 
 def check_place_name(name: str) -> None:

@@ -101,6 +101,39 @@ def link_status():
     return Status("standing", "", 7, 0, Pose2(0.0, 0.1, 0.0), False, "explore", located=True)
 
 
+def test_a_letter_with_an_accent_is_the_same_however_it_is_written(
+    house: House, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """As one character, as most keyboards do, or as a letter with an accent behind it."""
+    one, two = "caf\u00e9", "cafe\u0301"
+    person, (link, _) = house.person, house.robot()
+    path = tmp_path / "room.mapweave"
+    person.save(path)
+    assert person.annotate("place", two, node=str(THERE)).startswith(f"place {one} is node")
+    for name in (one, two):
+        assert person.go("r0", name).order.node == THERE
+        assert person.retire(name, check=True).startswith("only checked")
+        with pytest.raises(InvalidValue, match="that is known already"):
+            person.annotate("place", name, node=str(THERE))
+    person.withdraw("place", two)
+    assert not person.annotations().in_force(Place)
+    with pytest.raises(InvalidValue):
+        person.go("r0", one)
+    link.close()
+    # Likewise in a file.
+    assert main(["place", "add", two, str(THERE), "--map", str(path)]) == 0
+    assert main(["place", "add", one, str(THERE), "--map", str(path)]) == NO
+    assert main(["place", "remove", two, "--map", str(path)]) == 0
+    assert {entry.name for entry in read_map_file(path).annotations} == {one}
+    capsys.readouterr()
+    # What is kept of before as two names stays two.
+    kept = Annotations(tuple(Annotation(name, Place(THERE), False, "anna", 1) for name in (two, one)))
+    assert [kept.spelled("place", name) for name in (one, two)] == [one, two]
+    old = Annotations(kept.made[:1])
+    assert old.spelled("place", one) == two and old.last("place", one) is old.made[0]
+    assert old.spelled("closure", two) == one
+
+
 def test_a_long_reason_is_no_error_of_what_is_kept(house: House) -> None:
     """What an entry says and what the one before has said is more than the answer holds."""
     for note in ("a", "b"):
