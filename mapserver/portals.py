@@ -40,6 +40,11 @@ class Portals:
             for number, (entry, portal) in enumerate(annotations.in_force(Portal))
             if portal.a in merged.poses and portal.b in merged.poses
         }
+        self._without_effect = [
+            (entry, portal.a if portal.a not in merged.poses else portal.b)
+            for entry, portal in annotations.in_force(Portal)
+            if portal.a not in merged.poses or portal.b not in merged.poses
+        ]
         self.edges: Mapping[EdgeId, tuple[NodeId, NodeId]] = {
             edge_id: (portal.a, portal.b) for edge_id, (_, portal) in self._portals.items()
         }
@@ -59,12 +64,19 @@ class Portals:
     def apart(self, start: NodeId, goal: NodeId) -> str:
         """That no way leads between two nodes whose components no portals join, in words."""
         first, second = self.floor(start), self.floor(goal)
+        lost = ""
+        if self._without_effect:
+            entry, node = self._without_effect[0]
+            why = self.merged.why_left_out(node)
+            more = len(self._without_effect) - 1
+            lost = f"; portal {entry.name} has no effect, as {node} is not in the merged map"
+            lost += f"{f' ({why})' if why else ''}{f', and {more} more' if more else ''}"
         if first and second and first != second:
             return (
                 f"{start} is on floor {first} and {goal} on floor {second}, and no portal leads there: "
-                "add the lift, ramp or door between them"
+                f"add the lift, ramp or door between them{lost}"
             )
-        return f"{start} and {goal} are in parts of the map that nothing joins yet"
+        return f"{start} and {goal} are in parts of the map that nothing joins yet{lost}"
 
     def stops(self, nodes: Sequence[NodeId], edges: Sequence[EdgeId]) -> Iterator[tuple[int, PortalStop]]:
         """The portals on a way: the number of the edge, and the portal in the direction of the way."""

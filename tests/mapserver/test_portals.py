@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 from itertools import pairwise
 
@@ -13,9 +14,10 @@ from hypothesis import strategies as st
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Body, Closure, Floor, Preference
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import RetiredNodes
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
-from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.portal import Portal, PortalMeans, PortalStop
 from mapweave.hybridmap.pose import PoseGaussian
@@ -23,6 +25,7 @@ from mapweave.hybridmap.query import RouteAnswer
 from mapweave.hybridmap.route import RouteSettings, edge_cost
 from mapweave.mapserver.annotator import check_annotation
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.portals import Portals
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
 from mapweave.wire.messages import decode, encode
@@ -138,6 +141,23 @@ def test_an_explanation_names_the_portal_and_the_floors(house) -> None:
     assert "a.1.1 is on floor 1 and b.1.2 on floor 2, and no portal leads there" in none.reason
     blocked = house.at(Annotations((*LABELS, lift)), 0).route(at(0, 0), at(1, 1), [(at(1, 0), at(0, 2))])
     assert not blocked.legs and "blocked" in blocked.reason
+
+
+def test_a_portal_at_a_retired_node_is_named_where_it_is_missed(house) -> None:
+    lift = said("east lift", Portal(at(0, 4), at(1, 4), PortalMeans.LIFT))
+    annotations = Annotations((*LABELS, lift))
+    retired = ManualConstraint(RetiredNodes((at(1, 4),)), True, "bob", 1, "a mirror")
+    poses = {node: house.merged.poses[node] for node in house.merged.poses if node != at(1, 4)}
+    constraints = ManualConstraints([retired], {at(1, 4): retired})
+    merged = replace(house.merged, poses=poses, constraints=constraints)
+    assert Portals(house.merged, annotations).lead(at(0, 0), at(1, 0))
+    without = Portals(merged, annotations)
+    assert not without.lead(at(0, 0), at(1, 0))
+    assert re.search(
+        "; portal east lift has no effect, as b.1.5 is not in the merged map "
+        r'\(node b.1.5 is retired by bob on .*: "a mirror"\)$',
+        without.apart(at(0, 0), at(1, 0)),
+    )
 
 
 def test_a_door_is_a_way_within_one_part_that_a_robot_asks_to_be_taken_along(house) -> None:
