@@ -46,15 +46,20 @@ def read_geometry(path: Path) -> dict[str, float]:
         found = {field: _scale(key) * number(values, key) for field, key in KEYS.items() if key in values}
     except ValueError as error:
         raise DeviceError(f"{path}: {error}") from None
-    for field, value in found.items():
+    if wrong := beyond_limits(found):
+        raise DeviceError(f"{path}: {wrong}")
+    return found
+
+
+def beyond_limits(values: Mapping[str, float]) -> str:
+    """The first of some fields of `DriveGeometry` that cannot be right, in words; empty if all can."""
+    for field, value in values.items():
         low, high = LIMITS[field]
         if not low <= value <= high:
             key = KEYS[field]
-            raise DeviceError(
-                f"{path}: {key} is {value / _scale(key):g}; it must be from {low / _scale(key):.4g} "
-                f"to {high / _scale(key):.4g}"
-            )
-    return found
+            scale = _scale(key)
+            return f"{key} is {value / scale:g}; it must be from {low / scale:.4g} to {high / scale:.4g}"
+    return ""
 
 
 def write_geometry(path: Path, geometry: DriveGeometry, notes: Mapping[str, str]) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
     from mapweave.agent.calibration.estimate import Estimate
     from mapweave.agent.calibration.recorded_drive import DriveCalibration
     from mapweave.agent.observation import Observation, RobotDescription
+    from mapweave.agent.sensor_health.odometry_convention import OdometryConvention
 
 
 def add_to(actions: Any) -> None:
@@ -67,7 +68,8 @@ def run(arguments: argparse.Namespace) -> int:
     import cv2
 
     from mapweave.agent.calibration.recorded_drive import calibrate
-    from mapweave.agent.recordings.geometry_file import write_geometry
+    from mapweave.agent.recordings.geometry_file import KEYS, beyond_limits, write_geometry
+    from mapweave.agent.sensor_health.odometry_convention import OdometryConvention
     from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.errors import DeviceError, InvalidValue
     from mapweave.processes.agent import measured
@@ -82,9 +84,11 @@ def run(arguments: argparse.Namespace) -> int:
     stop = None if arguments.recording is not None else stop_on_signals()
     try:
         description, observations = (
-            _recorded(arguments, name) if stop is None else _live(arguments, name, console, stop)
+            _recorded(arguments, name, console) if stop is None else _live(arguments, name, console, stop)
         )
-        found = calibrate(measured(description, file), observations, arguments.keep_wheels)
+        convention = OdometryConvention(description.camera)
+        watched = _watched(observations, convention)
+        found = calibrate(measured(description, file), watched, arguments.keep_wheels)
     except (InvalidValue, DeviceError) as error:
         # A drive that was cut short is no answer, and neither is a robot that was closed before its first.
         interrupted = stop is not None and stop.is_set()
@@ -93,23 +97,39 @@ def run(arguments: argparse.Namespace) -> int:
         print(f"mapweave: {arguments.recording or name}: {error}", file=sys.stderr)
         return INTERRUPTED if interrupted else NO
     notes = _print(console, found)
-    worse = found.estimated_px > found.declared_px
-    if worse:
-        console.print("The declared geometry predicts the pairs held out better: nothing is written.")
-    else:
-        write_geometry(file, found.estimate.usable, notes)
+    usable = found.estimate.usable
+    reasons = [line.replace(", so the map is wrong", "") for line in convention.complaints]
+    if wrong := beyond_limits({field: getattr(usable, field) for field in KEYS}):
+        reasons.append(wrong)
+    if found.estimated_px > found.declared_px:
+        reasons.append("The declared geometry predicts the pairs held out better")
+    for reason in reasons:
+        console.print(f"{reason}: nothing is written.".replace("?:", "?"), soft_wrap=True, markup=False)
+    if not reasons:
+        write_geometry(file, usable, notes)
         console.print(f"Written to {file}: `mapweave agent {name}` and `mapweave replay` use it.")
     if arguments.json:
-        print(json.dumps(_figures(found, written=not worse)))
-    return NO if worse else 0
+        print(json.dumps(_figures(found, written=not reasons)))
+    return NO if reasons else 0
 
 
-def _recorded(arguments: argparse.Namespace, name: str) -> tuple[RobotDescription, Iterator[Observation]]:
+def _watched(observations: Iterable[Observation], convention: OdometryConvention) -> Iterator[Observation]:
+    """The same, which the convention sees too."""
+    for observation in observations:
+        convention.see(observation)
+        yield observation
+
+
+def _recorded(
+    arguments: argparse.Namespace, name: str, console: Any
+) -> tuple[RobotDescription, Iterator[Observation]]:
     """A recording."""
     from mapweave.agent.drivers.replay import Replay
     from mapweave.terminal import plain_or_terminal, tracked
 
     robot = Replay(arguments.recording, arguments.robot, options=options_of(arguments))
+    for line in (*robot.recording.notes, *robot.recording.damage):
+        console.print(line, soft_wrap=True, markup=False)
     observed = iter(robot.sense, None)
     return robot.describe(), tracked(observed, name, len(robot), plain_or_terminal())
 

@@ -7,6 +7,7 @@ import shutil
 import threading
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -134,6 +135,44 @@ def test_bad_input_is_one_line(folder: Path, tmp_path: Path, capfd: pytest.Captu
     assert not list(tmp_path.glob("*.toml"))
 
 
+@pytest.mark.slow
+def test_turns_of_the_other_sign_are_named_and_nothing_is_written(
+    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A pitch of 180 degrees was written with status 0, with which no agent starts."""
+    header, *lines = (folder / "odometry.csv").read_text().splitlines()
+    rows = [list(map(float, line.split(","))) for line in lines]
+    spoilt = [f"{stamp},{forward},{-turned}" for stamp, forward, turned in rows]
+    (folder / "odometry.csv").write_text("\n".join([header, *spoilt, ""]))
+    assert main(["calibrate", "drive", str(folder), "--calibration", str(tmp_path)]) == NO
+    said = " ".join(capfd.readouterr().out.split())
+    assert (
+        "turns the other way than the odometry" in said
+        and "nothing is written" in said
+        and "Written to" not in said
+    )
+    assert not list(tmp_path.glob("*.toml"))
+
+
+def test_a_geometry_that_cannot_be_read_again_is_not_written(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    live = LIVE.replace('Path("closed")', f"Path({str(tmp_path / 'closed')!r})")
+    Path("live.py").write_text(f"SILENT = False\n{live}")
+    zero = np.zeros(len(Parameter))
+    estimate = SimpleNamespace(
+        declared=zero, vector=zero, covariance=np.eye(len(zero)), shown=zero > 0.0, pairs=0, floor_tracks=0,
+        usable=DriveGeometry(pitch=3.1),
+    )  # fmt: skip
+    found = recorded_drive.DriveCalibration(estimate, 2.0, 1.0)  # type: ignore[arg-type]
+    monkeypatch.setattr(recorded_drive, "calibrate", lambda *_: found)
+    monkeypatch.setattr("mapweave.commands.calibrate_drive._print", lambda *_: {})
+    assert main(["calibrate", "drive", "--robot", "live.py:Live", "--name", "r0"]) == NO
+    assert "pitch_deg is 177.6" in capfd.readouterr().out
+    assert not Path("out").exists()
+
+
 LIVE = """
 from dataclasses import dataclass
 from pathlib import Path
@@ -185,7 +224,9 @@ def test_ctrl_c_before_the_drive_suffices_is_an_interruption_and_no_answer(
     silent: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.chdir(tmp_path)
-    Path("live.py").write_text(f"SILENT = {silent}\n{LIVE}")
+    # It is closed by a thread, which may be later than this test.
+    live = LIVE.replace('Path("closed")', f"Path({str(tmp_path / 'closed')!r})")
+    Path("live.py").write_text(f"SILENT = {silent}\n{live}")
     pressed = threading.Event()
     pressed.set()
     monkeypatch.setattr("mapweave.commands.calibrate_drive.stop_on_signals", lambda: pressed)
