@@ -222,7 +222,7 @@ def bag(path: Path, options: RecordingOptions) -> Recording:
         message = f"{path}: {lacks}; it has {names_of(opened.topics)}"
         raise Incomplete(message, None, (lacks,), has_odometry, opened.contents)
     image = _chosen(opened, options.image_topic, IMAGE_TYPES, "images")
-    stamped = [(stamp, bool(stamp_of(message))) for stamp, message in opened.messages(image.name)]
+    stamped = [(stamp, stamp_of(message)) for stamp, message in opened.messages(image.name)]
     if not stamped:
         raise DeviceError((opened.damage or [f"{path}: {image.name} has no images"])[-1])
     stamps, kept, left_out = _in_order(stamped, "image", image.name)
@@ -281,7 +281,7 @@ def _odometry_topic(opened: Bag, options: RecordingOptions) -> Topic | None:
 
 
 def _poses(opened: Bag, topic: str) -> StampedPoses:
-    rows = [(stamp, bool(stamp_of(message)), pose_of(message)) for stamp, message in opened.messages(topic)]
+    rows = [(stamp, stamp_of(message), pose_of(message)) for stamp, message in opened.messages(topic)]
     poses = np.array([row[2] for row in rows]).reshape(-1, 3)
     good = np.isfinite(poses).all(axis=1)
     if not good.all():
@@ -297,12 +297,12 @@ def _poses(opened: Bag, topic: str) -> StampedPoses:
 
 
 def _in_order(
-    stamped: list[tuple[int, bool]], what: str, topic: str
+    stamped: list[tuple[int, int]], what: str, topic: str
 ) -> tuple[NDArray[np.int64], NDArray[np.bool_], tuple[str, ...]]:
     """Which messages follow all before them.
 
     Args:
-        stamped: stamps, ns, and whether it is the message's own; else it is when the message was recorded.
+        stamped: stamps, ns, and that in the header: 0 where the stamp is when the message was recorded.
         what: one of them is.
         topic: of them.
 
@@ -310,13 +310,14 @@ def _in_order(
         (N,) stamps, (N,) which are kept, and what is left out, in a line; none if nothing is.
     """
     stamps = np.array([stamp for stamp, _ in stamped], np.int64)
-    own = np.array([own for _, own in stamped], np.bool_)
+    headers = np.array([header for _, header in stamped], np.int64)
     # A simulator's first messages may have none: the others' clock is not the recorder's.
-    kept = own if own.any() else ~own
+    own = (headers == stamps) | ~headers.any()
+    kept = own
     # A stamp that lies ahead by damage hides what follows it; nothing goes back in time.
     known = np.where(kept, stamps, np.iinfo(np.int64).min)
     kept = kept & np.append(True, known[1:] > np.maximum.accumulate(known)[:-1])[: len(stamps)]
-    without = int((~own).sum()) if own.any() else 0
+    without = int((~own).sum())
     back = int((~kept).sum()) - without
     goes = "goes back in time or repeats a stamp" if back == 1 else "go back in time or repeat a stamp"
     has = "has" if without == 1 else "have"

@@ -22,9 +22,10 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
 from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.recordings import bag
 from mapweave.agent.recordings.incomplete import Incomplete
-from mapweave.agent.recordings.mcap_writer import FLUSH_S
+from mapweave.agent.recordings.mcap_writer import FLUSH_S, McapWriter
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.hybridmap.errors import DeviceError
@@ -297,6 +298,17 @@ def test_images_that_go_back_in_time_are_left_out_and_said(
     assert replay.recording.increments[1:].sum(axis=0) == pytest.approx(
         drive.increments[left[0] + 1 :].sum(axis=0), abs=1e-4
     )
+
+
+def test_a_clock_that_begins_at_zero_loses_no_message(drive: Drive, tmp_path: Path) -> None:
+    """As a robot's own recordings of a simulation or of a replay have it."""
+    writer = McapWriter(tmp_path / "drive", RobotDescription(drive.camera), True, lambda line: None)
+    for k, (grey, (forward, turn)) in enumerate(zip(drive.images, drive.increments, strict=True)):
+        writer.write(Observation(k * STEP_NS, Odometry(forward, turn), grey), Command())
+    writer.close()
+    replay = Replay(tmp_path / "drive")
+    assert not any("left out" in note for note in replay.recording.notes)
+    assert [o.stamp_ns for o in iter(replay.sense, None)] == [k * STEP_NS for k in range(COUNT)]
 
 
 def test_images_of_distances_are_not_taken_where_there_are_others(drive: Drive, tmp_path: Path) -> None:
