@@ -63,8 +63,8 @@ def not_let_in(settings: BusSettings) -> str:
         return ""
     hint = _key_hint(settings.credentials) or "; if the fleet has keys, give a key file (--keys FILE)"
     if settings.credentials is not None and settings.credentials.certified:
-        hint += "; or the router's certificate is for other names, those of `mapweave keys init --at`"
-        hint += ", or by another authority than this key, that of another `mapweave keys init`"
+        hint += "; or the router's certificate is for other names, those of `mapweave keys init --at`, has "
+        hint += "expired, or is by another authority than this key, that of another `mapweave keys init`"
     return f"what listens there does not let this in{hint}"
 
 

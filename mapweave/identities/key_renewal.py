@@ -7,6 +7,7 @@ from collections.abc import Callable
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder
+from mapweave.identities.validity import out_of_date
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Credentials
 from mapweave.wire.zenoh_bus import ZenohBus
@@ -45,9 +46,13 @@ class KeyRenewal:
         self._own = settings.credentials
         self._behind = False
         self._complaint = self._lack = ""
+        self._out_of_date = False
 
     def check(self) -> None:
-        """Read the catalogue of keys, and open the router again if it has changed."""
+        """Read the catalogue of keys, and open the router again if it has changed.
+
+        That the own certificate does not hold is said once: who connects sees it, and the router does not.
+        """
         try:
             self._behind |= self._folder.changed()
             own, lack = self._own_key() if self._behind or self._lack else (self._own, "")
@@ -67,6 +72,10 @@ class KeyRenewal:
         if lack and lack != self._lack:
             self._say(f"the server has no good key of its own, and goes on with the one that it had: {lack}")
         self._own, self._behind, self._complaint, self._lack = own, False, "", lack
+        old = out_of_date(own)
+        if old and not self._out_of_date:
+            self._say(f"robots and people do not trust this server, and connect no more: {old}")
+        self._out_of_date = bool(old)
 
     def _own_key(self) -> tuple[Credentials | None, str]:
         """The server's key, and why it is not that of the folder."""

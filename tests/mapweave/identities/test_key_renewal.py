@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
 
+from mapweave.identities.authority import Authority, Issued
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.identities.key_renewal import KeyRenewal
@@ -105,3 +107,36 @@ def test_a_server_takes_its_new_key_when_that_can_be_read(running: Running) -> N
     assert len(running.said) == said
     r0 = running.join(running.key_of("r0"))
     eventually(lambda: answered(r0, "r0"))
+
+
+@pytest.mark.parametrize(
+    ("now", "words"),
+    [
+        (timedelta(days=-3), "the certificate of s0 expired on "),
+        (timedelta(days=1), "the certificate of s0 holds from "),
+    ],
+)
+def test_a_server_whose_own_certificate_does_not_hold_says_so_once(
+    running: Running, monkeypatch: pytest.MonkeyPatch, now: timedelta, words: str
+) -> None:
+    """It was up, and no one could connect: the reason was on the machines of the others alone."""
+    running.renewal.check()
+    assert not running.said
+    issue = Authority.issue
+
+    def issued(self: Authority, name: str, role: Role, life: timedelta, hosts: Iterable[str] = ()) -> Issued:
+        return issue(self, name, role, timedelta(days=1), hosts, datetime.now(UTC) + now)
+
+    monkeypatch.setattr(Authority, "issue", issued)
+    running.folder.add("s0", Role.SERVER)
+    for _ in range(3):
+        running.renewal.check()
+    (said,) = [line for line in running.said if "do not trust this server" in line]
+    assert words in said
+    assert not running.join(running.key_of("r0")).wait_connected(0.5)
+    monkeypatch.undo()
+    running.folder.add("s0", Role.SERVER)
+    running.renewal.check()
+    assert [line for line in running.said if "do not trust this server" in line] == [said]
+    r1 = running.join(running.key_of("r1"))
+    eventually(lambda: answered(r1, "r1"))
