@@ -30,7 +30,7 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import FreeRunning, Synchronization
 from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.counted import counted
-from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.errors import InvalidFile, Refused
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.processes.agent_files import epochs_of_files, map_path, trajectory_path, views_path
@@ -227,7 +227,7 @@ class Agent:
             return maps[-1]
         if chosen not in maps:
             held = ", ".join(map(str, maps)) or "none"
-            raise InvalidValue(f"the journal of {self._options.name} has no map {chosen}; it has {held}")
+            raise Refused(f"the journal of {self._options.name} has no map {chosen}; it has {held}")
         return chosen
 
     def _start(self, map_id: MapId, pipeline: Pipeline) -> None:

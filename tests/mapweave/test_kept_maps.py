@@ -175,6 +175,18 @@ def test_a_map_that_is_not_there_cannot_be_resumed(tmp_path, capfd, closed, simu
     assert not list(tmp_path.iterdir()), "nothing is left behind"
 
 
+def test_a_map_that_the_journal_does_not_have_cannot_be_resumed(tmp_path, capfd, closed, recording):
+    driver = tmp_path / "own.py"
+    driver.write_text(
+        "from pathlib import Path\nfrom mapweave.agent.drivers.replay import Replay\n\nclass Own(Replay):\n"
+        f"    def __init__(self, settings):\n        super().__init__(Path({str(recording)!r}))\n"
+    )
+    robot = ["agent", "r0", "--connect", closed, "--data", str(tmp_path / "data"), "--robot", f"{driver}:Own"]
+    assert main([*robot, "--mission", "carried", "--epoch", "3"]) == 0
+    assert main([*robot, "--resume", "r0.7"]) == NO
+    assert "mapweave: the journal of r0 has no map r0.7; it has r0.3" in capfd.readouterr().err
+
+
 def test_a_file_of_a_map_of_before_counts_as_a_number_that_is_taken(tmp_path, recording):
     """The journal is lost, the map files are not."""
     data = tmp_path / "data"
