@@ -107,7 +107,10 @@ def _init(arguments: argparse.Namespace) -> int:
 
 def _add(arguments: argparse.Namespace) -> int:
     from mapweave.identities.hosts import check_hosts
+    from mapweave.identities.key_file import read_key_file
     from mapweave.identities.key_folder import KeyFolder, Profile
+    from mapweave.identities.tokens import time_of
+    from mapweave.identities.validity import validity
     from mapweave.wire.credentials import Role
 
     if arguments.at and arguments.role != Role.SERVER:
@@ -123,6 +126,13 @@ def _add(arguments: argparse.Namespace) -> int:
         )
     path = folder.add(arguments.name, Role(arguments.role), days, arguments.at)
     print(f"{path}: copy this file to {arguments.name}, and to no other")
+    ends, identity = validity(read_key_file(path).credentials.certificate), folder.find(arguments.name)
+    if ends is not None and identity is not None and time_of(identity.expires) > ends[1]:
+        until = identity.expires[:10]
+        print(
+            f"an earlier key of {arguments.name} is good until {until}: if it is to end before, first "
+            f"`mapweave keys revoke {arguments.name}`, then add it again"
+        )
     if arguments.at:
         where = ", ".join(folder.catalogue.endpoints)
         print(f"new keys find the servers at {where}; who has an older key needs `endpoints` in its settings")

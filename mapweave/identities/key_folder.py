@@ -65,7 +65,7 @@ class Identity:
         name: of the robot, server or person.
         role: what it may do.
         issued: when its present key was made, ISO 8601.
-        expires: when that key ends; empty if it does not.
+        expires: when that key ends, or an earlier one that holds longer; empty if it does not.
         subject: common name of its certificate, or its user name. After a revocation it is another one, since
             the old certificate still has the old one.
         revoked: when and why the key was revoked; empty while it is good.
@@ -243,7 +243,8 @@ class KeyFolder:
             article = "an" if known.role is Role.OPERATOR else "a"
             first = f"revoke that key first: mapweave keys revoke {name}"
             raise Refused(f"{name} is {article} {known.role} already; {first}")
-        issued_at = datetime.now(UTC).isoformat(timespec="seconds")
+        # Two keys of one second are two: a running server takes note of each.
+        issued_at = datetime.now(UTC).isoformat(timespec="microseconds")
         void = () if known is None else known.void
         subject = f"{name}~{len(void)}" if void and self.profile is Profile.PRODUCTION else name
         if self.profile is Profile.PRODUCTION:
@@ -256,6 +257,9 @@ class KeyFolder:
                 name, role, authority.certificate, issued.certificate, issued.private_key
             )
             expires = issued.expires.isoformat(timespec="seconds")
+            if known is not None and not known.revoked and time_of(known.expires) > issued.expires:
+                # The router lets in the key of before as long as that holds.
+                expires = known.expires
             identity = Identity(name, role, subject, issued_at, expires, void=void)
         else:
             credentials = Credentials(name, role, password=secrets.token_urlsafe(24))

@@ -195,6 +195,26 @@ def test_no_copy_is_made_of_a_key_that_lets_no_one_in(
         assert not copy.exists()
 
 
+def test_a_key_that_ends_before_the_one_of_before_does_not_end_that(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The list said that all ended tomorrow, and the router let in the key of before for a year."""
+    where = ["--keys", str(tmp_path / "keys")]
+    assert main(["keys", "init", *where]) == 0
+    assert main(["keys", "add", "r0", *where]) == 0
+    folder = KeyFolder(tmp_path / "keys")
+    before = folder.find("r0")
+    capsys.readouterr()
+    assert main(["keys", "add", "r0", "--days", "1", *where]) == 0
+    assert f"an earlier key of r0 is good until {before.expires[:10]}" in capsys.readouterr().out
+    assert main(["keys", "list", *where]) == 0
+    assert f"r0  robot     good, until {before.expires[:10]}" in capsys.readouterr().out
+    assert main(["keys", "revoke", "r0", *where]) == 0
+    assert main(["keys", "add", "r0", "--days", "1", *where]) == 0
+    assert "an earlier key" not in capsys.readouterr().out
+    assert folder.changed() and folder.find("r0").expires < before.expires
+
+
 def test_an_authority_signs_nothing_with_the_key_of_another(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
