@@ -12,6 +12,7 @@ from mapweave.agent.drivers.serial_port import SerialOptions, SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.drivers.wheel_guard import WheelGuard
 from mapweave.agent.drivers.wheeled import WheeledRobot
+from mapweave.hybridmap.errors import DeviceError
 
 START, SAFE, DRIVE_DIRECT, QUERY_LIST = 128, 131, 145, 149
 BUMPS, CHARGE, CAPACITY, MODE, LEFT_COUNTS, RIGHT_COUNTS = 7, 25, 26, 35, 43, 44
@@ -20,6 +21,8 @@ WHEEL_DROPS = 0b1100
 """Bits of both wheels in the packet of the bumper."""
 PASSIVE = 1
 """Mode without wheel control; a cliff, a wheel drop or the charger ends the Safe mode."""
+LARGEST_BUMPS, LARGEST_MODE = 0b1111, 3
+"""Of these packets, by the specification. Answers have no checksum."""
 METRES_PER_COUNT = math.pi * 72e-3 / 508.8
 FASTEST_MM = 500
 QUERY = bytes([QUERY_LIST, 6, BUMPS, CHARGE, CAPACITY, MODE, LEFT_COUNTS, RIGHT_COUNTS])
@@ -63,11 +66,19 @@ class CreateBase(GuardedBase):
         self._guard.moving(bool(left or right))
 
     def read(self) -> BaseReading:
-        """Read encoders, bumper, battery and mode."""
+        """Read encoders, bumper, battery and mode.
+
+        Raises:
+            DeviceError: it does not answer in time, or as no Create does.
+        """
         assert self._port is not None
         self._port.clear()
         self._port.write(QUERY)
         bumps, charge, capacity, mode, left, right = struct.unpack(">BHHBHH", self._port.read(10))
+        if bumps > LARGEST_BUMPS or mode > LARGEST_MODE:
+            raise DeviceError(
+                f"{self._path}: no Create or Roomba answers so; is another device at this port?"
+            )
         self._passive = mode == PASSIVE
         now = time.monotonic()
         way = Wheels(self._counters[0].update(left, now), self._counters[1].update(right, now))

@@ -146,6 +146,8 @@ def _reason(error: Exception) -> str:
         return "there is no such port; is the robot connected and switched on?"
     if number == 13 or "Permission denied" in words:
         return "may not be opened: add your user to the group that owns it (often dialout) and log in again"
+    if "Inappropriate ioctl" in words or "Is a directory" in words:
+        return "is no serial port"
     if number == 11 or "exclusively lock" in words:
         return "is in use by another process"
     if isinstance(error, serial.SerialTimeoutException):

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import pytest
 
+from mapweave.agent.drivers.create import CreateBase
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.observation import Command
+from mapweave.hybridmap.errors import DeviceError
 from tests.agent.drivers.contract import RobotContract, drive, drive_until, drive_way, until
-from tests.agent.drivers.emulators import Create2
+from tests.agent.drivers.emulators import ArduinoSketch, Create2
 
 
 class TestCreate(RobotContract):
@@ -52,3 +55,16 @@ class TestCreate(RobotContract):
         drive(robot, Command(), 0.3)
         seen = drive_way(robot, Command(0.2, 0.0), 0.05)
         assert sum(o.odometry.forward for o in seen) < 0.15
+
+
+def test_a_device_that_is_no_create_is_named(tmp_path: Path) -> None:
+    """Ten bytes of whatever it sends were taken for encoders."""
+    board = ArduinoSketch(tmp_path)
+    board.take = lambda data: None  # type: ignore[method-assign]
+    base = CreateBase(str(board.path))
+    try:
+        with pytest.raises(DeviceError, match="no Create or Roomba answers so"):
+            base.open()
+    finally:
+        base.close()
+        board.close()

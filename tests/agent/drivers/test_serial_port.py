@@ -82,3 +82,6 @@ def test_a_port_that_is_not_there(tmp_path: Path) -> None:
         SerialPort(str(tmp_path / "ttyUSB7"), 115200)
     with pytest.raises(DeviceError, match=f"^{tmp_path}: "):
         SerialPort(str(tmp_path), 115200)
+    for none in (str(tmp_path), "/dev/null"):
+        with pytest.raises(DeviceError, match=f"^{none}: is no serial port$"):
+            SerialPort(none, 115200)
