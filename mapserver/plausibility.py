@@ -1,7 +1,8 @@
 """Plausibility: what is in a map that no robot can have measured, in words.
 
-Such a map is merged as far as its links carry it, but it is no second place: where it shows what other maps
-show, and is not joined with them, it makes no answer ambiguous (mapweave.mapserver.active_nodes).
+Such a map is merged as far as its links carry it, but it moves and joins no others
+(mapweave.merge.pose_graph.staged_optimization), and it is no second place: where it shows what other maps show
+it makes no answer ambiguous (mapweave.mapserver.active_nodes).
 """
 
 from __future__ import annotations
@@ -16,9 +17,6 @@ from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
 from mapweave.merge.mutual_exclusion.trajectories import runs_backwards
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
-LEAST_SIGMA = 1e-6
-"""Standard deviation of an edge that a robot can measure, m and rad: theirs are some 2e-3."""
-
 
 def implausible(hybrid_map: HybridMap) -> str:
     """What no robot can have measured; empty if all of a map may be true."""
@@ -29,13 +27,6 @@ def implausible(hybrid_map: HybridMap) -> str:
     for clock in sorted({node.clock for node in nodes} - {""}):
         if runs_backwards([node for node in nodes if node.clock == clock]):
             return f"its clock {clock} runs backwards: nothing is concluded from its times"
-    exact = (
-        edge.id
-        for edge in hybrid_map.edges.values()
-        if edge.within and edge.a_from_b.covariance.diagonal().max() < LEAST_SIGMA**2
-    )
-    if (first := min(exact, default=None)) is not None:
-        return f"its edge {first} has no uncertainty, which no robot measures"
     return ""
 
 

@@ -24,7 +24,7 @@ from mapweave.hybridmap.query import Certainty
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.copies import LEAST_SAME, Copies, copied_landmarks, one_for_one
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.plausibility import MOST_FRAGMENTS, implausible, unreliable_robots
+from mapweave.mapserver.plausibility import MOST_FRAGMENTS, unreliable_robots
 from mapweave.merge.constraint_checks import check_manual_constraint
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -319,6 +319,8 @@ def test_edges_that_no_robot_measures() -> None:
         (other, EdgeKind.DRIVEN, 999.0, 99.0, ""),
         (other, EdgeKind.DRIVEN, 1001.0, 0.1, "is 1001 m long"),
         (other, EdgeKind.DRIVEN, 3.0, 144.0, "deviation of 12 m"),
+        (NodeId(*LAST, 3), EdgeKind.MAPPED, 3.0, 0.0, "edge z.1.2 has no uncertainty"),
+        (NodeId(*LAST, 3), EdgeKind.MAPPED, 3.0, 1e-8, ""),
         (other, EdgeKind.LOOP, 3.0, 0.1, "is loop and joins nodes of others"),
     ):
         pose = PoseGaussian(Pose2(x), variance * np.eye(3))
@@ -375,14 +377,6 @@ def certainties(merger: Merger, merged: MergedMap) -> list[Certainty]:
     """Of the answers to lost robots."""
     relocalizer = Answers.of(merger, merged, merger.node).relocalizer
     return [relocalizer.answer(view).certainty for view in lost()]
-
-
-@pytest.mark.parametrize(("spread", "words"), [(0.0, "its edge z.1.2 has no uncertainty"), (1e-4, "")])
-def test_no_robot_measures_without_uncertainty(spread: float, words: str) -> None:
-    hybrid_map = HybridMap()
-    for body in views(LAST, Pose2(1.0), spread**2 * np.eye(3)):
-        hybrid_map.apply(body)
-    assert implausible(hybrid_map).startswith(words) and bool(words) == bool(implausible(hybrid_map))
 
 
 @pytest.mark.parametrize("wrong", [0, 3, 4])
