@@ -1,8 +1,8 @@
 """Plausibility: what is in a map that no robot can have measured, in words.
 
 Such a map is merged as far as its links carry it, but it moves and joins no others
-(mapweave.merge.pose_graph.staged_optimization), and it is no second place: where it shows what other maps show
-it makes no answer ambiguous (mapweave.mapserver.active_nodes).
+(mapweave.merge.pose_graph.staged_optimization), and it is no second place: where it shows what other maps
+show it makes no answer ambiguous (mapweave.mapserver.active_nodes).
 """
 
 from __future__ import annotations
