@@ -23,7 +23,10 @@ from mapweave.scenarios.lying import Lies
 from synthetic.world import room, take_map
 
 LIAR = MapId("r2", 1)
-REFUSED = {"node at 1e9 m", "edges of 1e5 m", "covariance of 1e12", "greatest covariance", "edges to nowhere"}
+REFUSED = {
+    "node at 1e9 m", "edges of 1e5 m", "covariance of zero", "covariance of 1e12", "greatest covariance",
+    "edges to nowhere",
+}  # fmt: skip
 """Ways of which some changes are refused one by one."""
 
 
