@@ -115,8 +115,8 @@ def _in_two_stages(
     across = np.flatnonzero(ends_odd == 1)
     stays = across[_stays(factors.take(across), piece, is_odd)]
     part = pieces(Factors.together([factors.take(ends_odd != 1), factors.take(stays)]), len(nodes))
-    ends = part[factors.a] != part[factors.b]
-    rows_parted = np.stack([factors.a[ends], factors.b[ends]], axis=1)
+    cut = part[factors.a] != part[factors.b]
+    rows_parted = np.stack([factors.a[cut], factors.b[cut]], axis=1)
     # Rows are in the order of ids.
     parted = {(nodes[a], nodes[b]) for a, b in np.sort(rows_parted, axis=1).tolist()}
     if not parted.isdisjoint(by_hand):
@@ -126,7 +126,7 @@ def _in_two_stages(
         rows = np.flatnonzero(part == label)
         row_of = np.zeros(len(nodes), np.int64)
         row_of[rows] = np.arange(len(rows))
-        own = factors.take((part[factors.a] == label) & ~ends, row_of)
+        own = factors.take((part[factors.a] == label) & ~cut, row_of)
         some = tuple(nodes[row] for row in rows.tolist())
         means = graph.means[rows]
         if graph.anchor not in some:
