@@ -6,13 +6,13 @@ Only regular files are read: a device or a pipe may have no end.
 from __future__ import annotations
 
 import errno
-import fcntl
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.storage.file_owner import owning
 from mapweave.storage.first_bytes import MAP_FILE, SQLITE
 from mapweave.storage.os_errors import READ_ONLY, no_permission, reason_of
 
@@ -61,6 +61,8 @@ def replacing(path: Path) -> Iterator[Path]:
 
 State = tuple[int, int, int]
 """Of a file: differs once it was replaced."""
+PATIENCE = 20.0
+"""s; for another command to write a map file."""
 
 
 def state_of(path: Path) -> State | None:
@@ -77,20 +79,17 @@ def unchanged_since(path: Path, state: State | None) -> Iterator[None]:
     """Within it a file can be replaced by what was made of its content in that state.
 
     Raises:
-        InvalidFile: the file is another one since, or its folder cannot be locked.
+        InvalidFile: the file is another one since, another command keeps it, or its folder takes no lock.
     """
     try:
-        # The kernel releases the lock of a process that dies.
-        handle = os.open(path.resolve().parent, os.O_RDONLY | os.O_DIRECTORY)
-        try:
-            fcntl.flock(handle, fcntl.LOCK_EX)
+        with owning(path.resolve(), PATIENCE):
             if state_of(path) != state:
                 raise InvalidFile(
                     f"{path}: another command has written it meanwhile, and it is kept: say it again"
                 )
             yield
-        finally:
-            os.close(handle)
+    except BlockingIOError:
+        raise InvalidFile(f"{path}: another command is writing it; say it again") from None
     except OSError as error:
         raise unwritable(path, reason_of(error)) from None
 
