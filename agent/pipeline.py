@@ -126,7 +126,8 @@ class Pipeline:
     @property
     def complaints(self) -> list[str]:
         """What was found to be wrong with the odometry and with the declared geometry, a line each."""
-        return [*self._convention.complaints, *map(str, self.calibration.causes)]
+        odometry = (f"the map is wrong: {line}" for line in self._convention.complaints)
+        return [*odometry, *map(str, self.calibration.causes)]
 
     @property
     def map(self) -> HybridMap:

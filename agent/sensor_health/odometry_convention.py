@@ -40,18 +40,17 @@ SHARE = 0.75
 DEGREES = math.degrees(1.0)
 TURNS = {
     1.0: "",
-    -1.0: "the image turns the other way than the odometry, so the map is wrong: turns are positive to the "
-    "left. Is their sign reversed, are left and right wheel exchanged, or the image mirrored or upside down?",
-    DEGREES: "the odometry turns 57 times as far as the image, so the map is wrong: it is in degrees and "
-    "must be in radians",
-    -DEGREES: "the odometry turns 57 times as far as the image, and the other way, so the map is wrong: it "
-    "is in degrees and must be in radians, positive to the left",
+    -1.0: "the image turns the other way than the odometry: turns are positive to the left. Is their sign "
+    "reversed, are left and right wheel exchanged, or the image mirrored or upside down?",
+    DEGREES: "the odometry turns 57 times as far as the image: it is in degrees and must be in radians",
+    -DEGREES: "the odometry turns 57 times as far as the image, and the other way: it is in degrees and must "
+    "be in radians, positive to the left",
 }
 """Turn by the odometry over that by the image, and what to say of it."""
 WAYS = {
     1.0: "",
-    -1.0: "the image moves back where the odometry moves forward, so the map is wrong: ways are positive "
-    "forward. Is their sign reversed, or does the camera face backward?",
+    -1.0: "the image moves back where the odometry moves forward: ways are positive forward. Is their sign "
+    "reversed, or does the camera face backward?",
 }
 """Sign of the odometry's way where the image moves forward, likewise."""
 

@@ -98,13 +98,14 @@ def run(arguments: argparse.Namespace) -> int:
         return INTERRUPTED if interrupted else NO
     notes = _print(console, found)
     usable = found.estimate.usable
-    reasons = [line.replace(", so the map is wrong", "") for line in convention.complaints]
+    reasons = convention.complaints
     if wrong := beyond_limits({field: getattr(usable, field) for field in KEYS}):
         reasons.append(wrong)
     if found.estimated_px > found.declared_px:
         reasons.append("The declared geometry predicts the pairs held out better")
     for reason in reasons:
-        console.print(f"{reason}: nothing is written.".replace("?:", "?"), soft_wrap=True, markup=False)
+        colon = "" if reason.endswith("?") else ":"
+        console.print(f"{reason}{colon} nothing is written.", soft_wrap=True, markup=False)
     if not reasons:
         write_geometry(file, usable, notes)
         console.print(f"Written to {file}: `mapweave agent {name}` and `mapweave replay` use it.")
