@@ -2,36 +2,40 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 
 from mapweave.hybridmap.errors import SettingsError
+from mapweave.identities.key_file import give_to_folders_owner
+from mapweave.storage.file_owner import lock_of, owning
 from mapweave.storage.os_errors import reason_of
+
+PATIENCE = 20.0
+"""s; for another command to change the keys, which takes it a fraction of a second."""
 
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
     """Wait until no other process changes the folder, and hold the lock; a process that ends releases it.
 
-    The folder itself is locked: a file for that would have to be writable by root and by the server's user.
-
     Raises:
-        SettingsError: it is missing, or no folder.
+        SettingsError: the folder is missing, is none or takes no file, or another process keeps the lock.
     """
-    try:
-        handle = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    except FileNotFoundError:
-        raise SettingsError(f"{folder}: no keys are here; make some with `mapweave keys init`") from None
-    except OSError as error:
-        raise SettingsError(f"{folder}: {reason_of(error)}") from None
-    try:
-        fcntl.flock(handle, fcntl.LOCK_EX)
+    keys = folder / "keys"
+    with ExitStack() as stack:
+        try:
+            stack.enter_context(owning(keys, PATIENCE))
+            # Else the server's user could not change keys after a `sudo mapweave keys add` that was killed.
+            give_to_folders_owner(lock_of(keys))
+        except BlockingIOError:
+            raise SettingsError(f"{folder}: another command is changing the keys; say it again") from None
+        except FileNotFoundError:
+            raise SettingsError(f"{folder}: no keys are here; make some with `mapweave keys init`") from None
+        except OSError as error:
+            raise SettingsError(f"{folder}: {reason_of(error)}") from None
         yield
-    finally:
-        os.close(handle)
 
 
 @contextmanager

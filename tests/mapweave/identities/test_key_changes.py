@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import errno
+import fcntl
 import json
+import os
+import stat
 import subprocess
 import sys
 from collections.abc import Callable
@@ -12,7 +16,8 @@ import pytest
 
 from mapweave.exit_status import NO
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue, SettingsError
-from mapweave.identities import key_folder
+from mapweave.identities import folder_changes, key_folder
+from mapweave.identities.folder_changes import locked
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.identities.logins import Logins
 from mapweave.identities.tokens import TOKENS, read_tokens
@@ -109,6 +114,43 @@ def test_of_two_authorities_at_once_one_is_made(tmp_path: Path) -> None:
     folder = KeyFolder(tmp_path / "keys")
     certificate = folder.router("s0").credentials
     assert certificate is not None and certificate.authority == (folder.path / "authority.pem").read_text()
+
+
+def test_a_share_that_locks_no_folders_takes_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NFS locks only what is open for writing, which no folder is."""
+    flock = fcntl.flock
+
+    def as_nfs(handle: int, operation: int) -> None:
+        if stat.S_ISDIR(os.fstat(handle).st_mode):
+            raise OSError(errno.EBADF, "Bad file descriptor")
+        flock(handle, operation)
+
+    monkeypatch.setattr(fcntl, "flock", as_nfs)
+    folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.LAB, [], "s0")
+    folder.add("r0", Role.ROBOT)
+    folder.revoke("r0")
+    names = {"fleet.json", "passwords", "s0.key.toml"}
+    assert {path.name for path in folder.path.iterdir()} == names, "no lock is left"
+
+
+def test_who_waits_in_vain_for_another_command_changes_no_keys(
+    folder: KeyFolder, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(folder_changes, "PATIENCE", 0.05)
+    before = {path.name: path.read_bytes() for path in folder.path.iterdir()}
+    with locked(folder.path):
+        line = complaint(capfd, "keys", "revoke", "r1", "--keys", folder.path)
+    assert "another command is changing the keys; say it again" in line
+    assert {path.name: path.read_bytes() for path in folder.path.iterdir()} == before
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="only root acts as another user")
+def test_what_root_leaves_when_it_is_killed_holds_up_no_server(folder: KeyFolder) -> None:
+    """Its lock belongs to the folder's owner, the server's user, as what it writes does."""
+    os.chown(folder.path, 12345, 12345)
+    before = {*folder.path.iterdir()}
+    with locked(folder.path):
+        assert [path.stat().st_uid for path in {*folder.path.iterdir()} - before] == [12345]
 
 
 def test_a_key_file_that_was_moved_holds_up_no_change(folder: KeyFolder, tmp_path: Path) -> None:
