@@ -36,6 +36,7 @@ from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.services import guarded
 from mapweave.merge.constraint_checks import check_manual_constraint
 from mapweave.merge.settings import MergeSettings
+from mapweave.merge.unmerged_links import with_unmerged_links
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_said
@@ -215,12 +216,11 @@ class Explainer:
             InvalidFile: the disk does not take it.
         """
         with self._turn:
+            made = self._record.constraints.with_floors(self._annotations().floors)
+            # Of two links in quick succession the second must fit the first.
+            merged = with_unmerged_links(self._answers().merged, made, self._settings.consistency)
             checked = check_manual_constraint(
-                self._answers().merged,
-                self._record.constraints.with_floors(self._annotations().floors),
-                request.constraint,
-                self._record.maps(),
-                self._settings,
+                merged, made, request.constraint, self._record.maps(), self._settings
             )
             words = checked.words
             if request.check:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import http.client
 import json
 import re
+import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -25,6 +26,7 @@ from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstr
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.server import MapServer
 from mapweave.storage.map_file import MapFile
 from mapweave.wire.keys import Keys
@@ -166,6 +168,49 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
         assert asking.merged().poses.keys() == content.poses.keys()
         kinds = [type(one.about) for one in asking.fleet.constraints()]
         assert kinds == [Linked, RetiredNodes, RetiredNodes, Linked, RetiredArea, RetiredArea]
+
+
+def test_of_two_links_before_a_merge_the_second_must_fit_the_first(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Both were taken, and either of them contradicted the map for ever."""
+    merging, merged = threading.Event(), Merger.merged
+    merging.set()
+
+    def in_its_time(self: Merger, use: Any = None) -> Any:
+        assert merging.wait(60)
+        return merged(self, use)
+
+    monkeypatch.setattr(Merger, "merged", in_its_time)
+    with serving(path) as asking:
+        fleet = asking.fleet
+        merging.clear()
+        fleet.link(str(FIRST), str(LAST))
+        between = Pose2(2.5, 2.5, 0.0).inverse() @ Pose2(2.7, 2.4, 2.05 + 1.0)  # of a.1.1 and b.1.3
+        off = between @ Pose2(1.5, 0.0)
+        words = f"standard deviations, at most 4.0 pass. The link by hand of {LAST} and {FIRST} joins them: "
+        with pytest.raises(InvalidValue, match=words):
+            fleet.link("a.1.1", "b.1.3", pose=off, because="it is one room")
+        given = [off.x, off.y, float(np.degrees(off.heading))]
+        body = {"link": ["a.1.1", "b.1.3"], "pose": given, "because": "it is one room"}
+        status, answer = asking.http("POST", body)
+        assert status == 400 and re.search(words, answer["error"]), answer
+        capfd.readouterr()
+        pose = f"--pose={','.join(map(str, given))}"
+        command = ["map", "link", "a.1.1", "b.1.3", pose, "--because", "it is one room", *asking.at]
+        assert main(command) == NO
+        assert re.search(words, capfd.readouterr().err)
+        fleet.link("a.1.1", "b.1.3", pose=between, because="it is one room")
+        assert len(fleet.constraints()) == 2
+        # What is taken back before a merge is in the way of nothing.
+        fleet.undo(2)
+        fleet.undo(1)
+        fleet.link("a.1.1", "b.1.3", pose=off, because="it is one room")
+        merging.set()
+        content = asking.merged()
+        poses = {node: pose.mean for node, (_, pose) in content.poses.items()}
+        a, b = NodeId("a", 1, 1), NodeId("b", 1, 3)
+        assert (poses[a].inverse() @ poses[b]).distance(off) < 0.01
 
 
 @pytest.mark.parametrize(

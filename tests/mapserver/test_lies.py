@@ -13,6 +13,7 @@ from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.edge_limits import unmeasurable
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import MAX_NUMBER
@@ -29,6 +30,8 @@ from mapweave.merge.constraint_checks import check_manual_constraint
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.staged_optimization import ALONE
+from mapweave.merge.settings import ConsistencySettings
+from mapweave.merge.unmerged_links import with_unmerged_links
 from mapweave.scenarios.liar.lies import altered
 from mapweave.wire.codec import decode_change
 from mapweave.wire.log_messages import Head
@@ -194,9 +197,20 @@ def test_a_person_links_two_maps_of_one_recording() -> None:
     assert merged.set_apart.keys() == {LAST}
     asked = ManualConstraint(Linked(again[0].id, NodeId(*LAST, 1)), True, "anna", 1, "one recording")
     linked = check_manual_constraint(merged, ManualConstraints(), asked, merger.maps).constraint
-    merger.constrain(ManualConstraints([linked]))
+    made = ManualConstraints([linked])
+    # What is decided before the next merge must fit it already.
+    unmerged = with_unmerged_links(merged, made, ConsistencySettings())
+    last = max(merged.copies[LAST].nodes)
+    wrong = Linked(again[0].id, last, Pose2(9.0, 9.0, 1.0))
+    with pytest.raises(InvalidValue, match="cannot be linked so"):
+        check_manual_constraint(unmerged, made, replace(asked, about=wrong), merger.maps)
+    right = Linked(again[-1].id, last)
+    assert check_manual_constraint(unmerged, made, replace(asked, about=right), merger.maps)
+    merger.constrain(made)
     merged = merger.merged()
-    assert not merged.set_apart
+    assert not merged.set_apart and unmerged.poses.keys() == merged.poses.keys()
+    assert max(unmerged.pose(node).distance(merged.pose(node)) for node in merged.poses) < 0.05
+    assert with_unmerged_links(merged, made, ConsistencySettings()) is merged
     one, other = (merged.pose(node) for node in (again[0].id, NodeId(*LAST, 1)))
     assert merged.joined(again[0].id.map, LAST) and one.distance(other) < 0.05
     merger.constrain(ManualConstraints([linked, replace(linked, holds=False)]))
