@@ -297,7 +297,7 @@ class Merger:
             copies={which: self._kept[which] for which in self._copied},
             wrong=self._wrong,
             refused_changes={m: why for m, why in self._implausible.refused.items() if m in kept},
-            disbelieved={m: why for m, why in self._implausible.disbelieved.items() if m in kept},
+            disbelieved={m: why for m, why in self._implausible.disbelieved.items() if m in self._kept},
             pruned=self.pruning.pruned,
         )
         if use is not None:

@@ -215,6 +215,10 @@ def test_a_person_links_two_maps_of_one_recording() -> None:
     assert merged.joined(again[0].id.map, LAST) and one.distance(other) < 0.05
     merger.constrain(ManualConstraints([linked, replace(linked, holds=False)]))
     assert merger.merged().set_apart.keys() == {LAST}
+    # What is not believed is held against it also once it is linked, though the server starts again before.
+    merger.note_disbelief(LAST, "change 9 is announced, where 3 have come")
+    merged = merger.merged()
+    assert merged.disbelieved.keys() == {LAST} and not merged.implausible
 
 
 @pytest.mark.parametrize("clock", ["", "utc"])
