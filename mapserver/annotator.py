@@ -142,7 +142,7 @@ class Annotator:
             name = annotations.spelled(annotation.kind, annotation.name)
             annotation = replace(annotation, name=name)
             check_annotation(places.merged, annotations, annotation, self._constraints())
-            check_closure(places.router, annotations, annotation)
+            check_edge(places.router, annotations, annotation)
             self._check(annotation)
             words = "; ".join((annotation.words, *effects_of(annotation, places)))
             if check:
@@ -204,8 +204,8 @@ def check_annotation(
             _check_floor(merged, annotations, body, constraints)
 
 
-def check_closure(router: Router, annotations: Annotations, annotation: Annotation) -> None:
-    """Refuse to close an edge that is none: its barrier would close the ways of others.
+def check_edge(router: Router, annotations: Annotations, annotation: Annotation) -> None:
+    """Refuse to close, prefer or avoid an edge that is none: its barrier would hold for the ways of others.
 
     Args:
         router: of the merged map.
@@ -216,7 +216,7 @@ def check_closure(router: Router, annotations: Annotations, annotation: Annotati
         InvalidValue: no edge and no portal joins the two, or one is not there.
     """
     body = annotation.body
-    if annotation.removed or not isinstance(body, Closure) or body.edge is None:
+    if annotation.removed or not isinstance(body, Closure | Preference) or body.edge is None:
         return
     first, second = body.edge
     for node in body.edge:

@@ -17,7 +17,7 @@ from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_effects import effects_of
 from mapweave.mapserver.annotation_words import annotation_of_words
-from mapweave.mapserver.annotator import check_annotation, check_closure
+from mapweave.mapserver.annotator import check_annotation, check_edge
 from mapweave.mapserver.floor_plans import placed_plans
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
@@ -125,7 +125,7 @@ class OfflineAnnotations:
             annotation = replace(annotation, name=name)
             constraints = ManualConstraints(self._opened.content.constraints)
             check_annotation(self._router.merged, self.annotations(), annotation, constraints)
-            check_closure(self._router, self.annotations(), annotation)
+            check_edge(self._router, self.annotations(), annotation)
         words = "; ".join(
             (annotation.words, *effects_of(annotation, Places(self._router, self.annotations())))
         )

@@ -20,7 +20,7 @@ from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.route import edge_cost
-from mapweave.mapserver.annotator import check_closure
+from mapweave.mapserver.annotator import check_edge
 from mapweave.mapserver.goals import node_of_goal
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.places import Places
@@ -221,17 +221,21 @@ def test_a_route_that_begins_in_a_closed_area_says_so(grid) -> None:
     assert "kitchen" not in outside.reason and "kitchen" not in outside.hops[0].words
 
 
-def test_ways_that_are_no_edges_are_not_closed(grid) -> None:
-    """A barrier between nodes that nothing joins would close the ways of others between the two."""
+def test_ways_that_are_no_edges_are_not_closed_or_preferred(grid) -> None:
+    """A barrier between nodes that nothing joins would hold for the ways of others between the two."""
     wrong = said("door", Closure((at(0, 0), at(4, 0))))
     with pytest.raises(InvalidValue, match=r"no edge joins a.1.1 and a.1.5 \(a.1.1 has edges to nodes a.1.2"):
-        check_closure(grid, law(), wrong)
-    check_closure(grid, law(), replace(wrong, removed=True))
+        check_edge(grid, law(), wrong)
+    check_edge(grid, law(), replace(wrong, removed=True))
+    for factor in (0.5, 4.0):
+        with pytest.raises(InvalidValue, match="no edge joins a.1.1 and a.1.5"):
+            check_edge(grid, law(), said("mat", Preference(factor, (at(0, 0), at(4, 0)))))
+    check_edge(grid, law(), said("mat", Preference(0.5, (at(1, 0), at(0, 0)))))
     with pytest.raises(InvalidValue, match=r"z\.1"):
-        check_closure(grid, law(), said("door", Closure((at(0, 0), NodeId("z", 1, 1)))))
-    check_closure(grid, law(), said("door", Closure((at(1, 0), at(0, 0)))))
+        check_edge(grid, law(), said("door", Closure((at(0, 0), NodeId("z", 1, 1)))))
+    check_edge(grid, law(), said("door", Closure((at(1, 0), at(0, 0)))))
     door = Annotation("door", Portal(at(0, 0), at(4, 0), PortalMeans.DOOR), False, "anna", 1)
-    check_closure(grid, law(door), said("shut", Closure((at(4, 0), at(0, 0)))))
+    check_edge(grid, law(door), said("shut", Closure((at(4, 0), at(0, 0)))))
 
 
 def test_a_robot_in_an_area_that_is_closed_may_leave_it(grid) -> None:
