@@ -228,7 +228,7 @@ def test_ways_that_are_no_edges_are_not_closed_or_preferred(grid) -> None:
         check_edge(grid, law(), wrong)
     check_edge(grid, law(), replace(wrong, removed=True))
     for factor in (0.5, 4.0):
-        with pytest.raises(InvalidValue, match="no edge joins a.1.1 and a.1.5"):
+        with pytest.raises(InvalidValue, match=r"no edge joins a\.1\.1 and a\.1\.5"):
             check_edge(grid, law(), said("mat", Preference(factor, (at(0, 0), at(4, 0)))))
     check_edge(grid, law(), said("mat", Preference(0.5, (at(1, 0), at(0, 0)))))
     with pytest.raises(InvalidValue, match=r"z\.1"):
