@@ -11,13 +11,16 @@ from typing import Any
 import numpy as np
 
 from mapweave.evaluation.map_score import align
+from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.counted import counted
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import event_words
 from mapweave.hybridmap.pose import wrap_angle
 from mapweave.mapserver.map_history import between
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.map_file import MapFile
+from mapweave.wire.codec import encode_body
 
 Pair = tuple[NodeId, NodeId]
 NAMED = 8
@@ -125,6 +128,20 @@ def decided(before: MapFile, after: MapFile) -> list[str]:
     lines = [f"new: {words}" for one, words in new if (one, words) not in old]
     lines += [f"not in the record: {words}" for one, words in old if (one, words) not in new]
     return lines
+
+
+def in_content(before: MapFile, after: MapFile) -> str:
+    """Which nodes and edges two maps do not have alike, in words; empty if they have."""
+    old, new = (
+        {
+            f"edge {body.edge.id}" if isinstance(body, EdgePut) else f"node {body.node.id}": encode_body(body)
+            for body in HybridMap(one.changes).contents()
+        }
+        for one in (before, after)
+    )
+    different = sorted(name for name in old.keys() | new.keys() if old.get(name) != new.get(name))
+    more = f" and {len(different) - NAMED} more" if len(different) > NAMED else ""
+    return ", ".join(different[:NAMED]) + more
 
 
 def difference(before: MergedMap, after: MergedMap) -> MapDifference:

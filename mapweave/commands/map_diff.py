@@ -29,7 +29,7 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Compare and print."""
-    from mapweave.map_difference import decided, difference
+    from mapweave.map_difference import decided, difference, in_content
     from mapweave.mapserver.content_hash import content_hash
 
     files, maps = [], []
@@ -46,5 +46,6 @@ def run(arguments: argparse.Namespace) -> int:
     elif same:
         print("the maps are the same")
     else:
-        print("\n".join(lines or ["landmarks or edges differ, and nothing that follows"]))
+        which = in_content(*files) or "refusals"
+        print("\n".join(lines or [f"landmarks or edges differ, and nothing that follows: {which}"]))
     return DONE if same else NO

@@ -84,7 +84,8 @@ def test_what_a_merge_changed_is_said(tmp_path: Path, capfd: pytest.CaptureFixtu
     assert main(["map", "merge", *map(str, paths), "-o", str(merged)]) == 0
     capfd.readouterr()
     assert main(["map", "diff", str(merged), str(both)]) == NO
-    assert capfd.readouterr().out.startswith("landmarks or edges differ")
+    said = f"landmarks or edges differ, and nothing that follows: node {put.node.id}\n"
+    assert capfd.readouterr().out == said
 
 
 def test_what_people_said_is_a_difference(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
