@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from mapweave.evaluation.map_score import align
-from mapweave.hybridmap.change import EdgePut
+from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
@@ -132,12 +132,11 @@ def decided(before: MapFile, after: MapFile) -> list[str]:
 
 def in_content(before: MapFile, after: MapFile) -> str:
     """Which nodes and edges two maps do not have alike, in words; empty if they have."""
+    maps = [HybridMap(one.changes) for one in (before, after)]
     old, new = (
-        {
-            f"edge {body.edge.id}" if isinstance(body, EdgePut) else f"node {body.node.id}": encode_body(body)
-            for body in HybridMap(one.changes).contents()
-        }
-        for one in (before, after)
+        {f"node {name}": encode_body(NodePut(node)) for name, node in one.nodes.items()}
+        | {f"edge {name}": encode_body(EdgePut(edge)) for name, edge in one.edges.items()}
+        for one in maps
     )
     different = sorted(name for name in old.keys() | new.keys() if old.get(name) != new.get(name))
     more = f" and {len(different) - NAMED} more" if len(different) > NAMED else ""
