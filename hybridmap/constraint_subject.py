@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.ids import NUMBER, MapId, NodeId, check_name
+from mapweave.hybridmap.ids import MapId, NodeId, check_name, read_number
 from mapweave.hybridmap.limits import MAX_STAMP_NS, Key, LandmarkCount, Stamp
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
@@ -305,9 +305,10 @@ def read_end(word: str) -> NodeId | MapId:
     parts = word.split(".")
     if len(parts) == 3:
         return NodeId.parse(word)
-    if len(parts) != 2 or not NUMBER.fullmatch(parts[1]):
+    epoch = read_number(parts[1]) if len(parts) == 2 else None
+    if epoch is None:
         raise InvalidValue(f"{word!r} is neither a node nor a map: {EXAMPLE}")
-    return MapId(check_name(parts[0]), int(parts[1]))
+    return MapId(check_name(parts[0]), epoch)
 
 
 def read_retired(words: Iterable[str]) -> RetiredMap | RetiredNodes:

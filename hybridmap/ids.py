@@ -6,14 +6,18 @@ import re
 from typing import NamedTuple
 
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.limits import Name, Number
+from mapweave.hybridmap.limits import MAX_NUMBER, Name, Number
 
 NAME = re.compile(r"[a-z0-9][a-z0-9_-]{0,31}")
 """See mapweave.hybridmap.limits.Name."""
-
-
-NUMBER = re.compile(r"[0-9]{1,20}")
+DIGITS = re.compile(r"[0-9]{1,20}")
 """Digits of other scripts, and superscripts, are none."""
+
+
+def read_number(text: str) -> int | None:
+    """The number of a map or a node; None if the text is none, or a larger one than any of these."""
+    number = int(text) if DIGITS.fullmatch(text) else None
+    return None if number is None or number > MAX_NUMBER else number
 
 
 def check_name(name: str) -> str:
@@ -57,10 +61,11 @@ class NodeId(NamedTuple):
         Raises:
             InvalidValue: the text is of another form.
         """
-        parts = text.split(".")
-        if len(parts) != 3 or not all(NUMBER.fullmatch(part) for part in parts[1:]):
-            raise InvalidValue(f"{text!r} is no node id; they look like r0.1.17")
-        return NodeId(check_name(parts[0]), int(parts[1]), int(parts[2]))
+        agent, *numbers = text.split(".")
+        match [read_number(number) for number in numbers]:
+            case [int(epoch), int(number)]:
+                return NodeId(check_name(agent), epoch, number)
+        raise InvalidValue(f"{text!r} is no node id; they look like r0.1.17")
 
 
 EdgeId = NodeId

@@ -43,7 +43,7 @@ def add_to(commands: Any) -> None:
         help="a node (r0.1.17), a named place, a position (3.1,-2.0) or home",
     )
     go.add_argument(
-        "--via", action="append", default=[], metavar="PLACE",
+        "--via", type=values.goal, action="append", default=[], metavar="PLACE",
         help="pass this first: a node, a place or a position; may be given again, in the order of the way",
     )  # fmt: skip
     _add_common(go, 600.0)

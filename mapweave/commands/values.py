@@ -46,6 +46,10 @@ def goal(text: str) -> str:
     """Where a robot shall go; the map says whether it is there."""
     if not text.strip():
         raise UsageError("give a node (r0.1.17), a named place, a position (3.1,-2.0) or home")
+    from mapweave.hybridmap.mission_order import MAX_TEXT
+
+    if len(text) > MAX_TEXT:
+        raise UsageError(f"it is longer than {MAX_TEXT} characters")
     return node(text)
 
 

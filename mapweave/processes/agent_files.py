@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from mapweave.hybridmap.ids import NUMBER, MapId
+from mapweave.hybridmap.ids import MapId, read_number
 
 
 def map_path(folder: Path, map_id: MapId) -> Path:
@@ -24,5 +24,5 @@ def views_path(folder: Path, agent: str) -> Path:
 
 def epochs_of_files(folder: Path, agent: str) -> list[int]:
     """Numbers of the maps of an agent that have a file in a folder."""
-    numbers = (path.name.split(".")[1] for path in folder.glob(f"{agent}.*.mapweave"))
-    return [int(number) for number in numbers if NUMBER.fullmatch(number)]
+    numbers = (read_number(path.name.split(".")[1]) for path in folder.glob(f"{agent}.*.mapweave"))
+    return [number for number in numbers if number is not None]
