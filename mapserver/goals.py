@@ -27,6 +27,9 @@ def node_of_goal(goal: str, map_id: MapId, places: Places, name: str = "goal") -
     own = [node for node in merged.poses if node.map == map_id]
     if goal == HOME:
         if not own:
+            first = min(merged.maps[map_id].nodes, default=None) if map_id in merged.maps else None
+            if why := merged.why_left_out(first or NodeId(*map_id, 0)):
+                raise InvalidValue(f"{map_id.agent} has no home: {why}")
             raise InvalidValue(f"the map {map_id} of {map_id.agent} has no node yet: it has no home")
         return min(own)
     named = places.annotations.last("place", goal) is not None

@@ -171,6 +171,18 @@ def test_a_goal_is_of_the_map_that_a_robot_makes_now(house: House) -> None:
         house.person.go("r0", "home")
 
 
+def test_a_robot_whose_map_is_retired_hears_why_it_has_no_home(house: House) -> None:
+    link, _ = house.robot()
+    eventually(lambda: house.entry("r0").alive)
+    house.person.retire(str(ROBOT), because="before the move")
+    assert house.server.settle(30.0)
+    with pytest.raises(
+        InvalidValue, match=r'^r0 has no home: map r0\.1 is retired by .*: "before the move"$'
+    ):
+        house.person.go("r0", "home")
+    link.close()
+
+
 class SharedRecord:
     """The results of a store of two servers, one of which writes before it has heard of the other's."""
 
