@@ -52,7 +52,10 @@ def read_time(text: str, now_ns: int, zone: tzinfo | None = None) -> int:
 
     def in_zone(time: datetime) -> datetime:
         # Of a zone that is not named, the distance from UTC on that day, not today's.
-        return time.replace(tzinfo=now.tzinfo) if zone or now.tzinfo is UTC else time.astimezone()
+        if zone or now.tzinfo is UTC:
+            return time.replace(tzinfo=now.tzinfo)
+        # By way of the stamp: a time that is left out when the clock is set forward is one behind that.
+        return datetime.fromtimestamp(time.timestamp(), UTC).astimezone()
 
     def dated() -> datetime:
         time = datetime.fromisoformat(words)
@@ -63,8 +66,9 @@ def read_time(text: str, now_ns: int, zone: tzinfo | None = None) -> int:
 
     def shown_next() -> datetime:
         today = now.replace(hour=int(clock[1]), minute=int(clock[2]), second=0, microsecond=0, tzinfo=None)
-        time = in_zone(today)
-        return time if time > now else in_zone(today + timedelta(days=1))
+        # A clock that is set back shows a time twice.
+        times = (today, today.replace(fold=1), today + timedelta(days=1))
+        return next(time for time in map(in_zone, times) if time > now)
 
     return _stamp(text, shown_next)
 

@@ -14,6 +14,7 @@ from mapweave.hybridmap.floor_plan import FloorPlan
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.hybridmap.wall_time import utc_words
 from mapweave.mapserver.annotation_effects import effects_of
 from mapweave.mapserver.annotation_words import not_there
 from mapweave.mapserver.floor_plans import check_plan
@@ -93,6 +94,7 @@ class Annotator:
         check: Callable[[Annotation], None],
         constraints: Callable[[], ManualConstraints],
         changed: Callable[[Annotations], None],
+        time_ns: Callable[[], int],
     ) -> None:
         """Begin to answer.
 
@@ -105,8 +107,9 @@ class Annotator:
             check: refuses an annotation that lacks something on this server (InvalidValue).
             constraints: the record of manual constraints.
             changed: called with the whole record whenever there is a new entry.
+            time_ns: wall time by which closures hold, ns.
         """
-        self._places, self._record = places, record
+        self._places, self._record, self._time_ns = places, record, time_ns
         self._check, self._constraints, self._changed = check, constraints, changed
         self._turn = threading.Lock()
         self._closing: list[Closing] = [
@@ -143,6 +146,7 @@ class Annotator:
             annotation = replace(annotation, name=name)
             check_annotation(places.merged, annotations, annotation, self._constraints())
             check_edge(places.router, annotations, annotation)
+            self._check_end(annotation)
             self._check(annotation)
             words = "; ".join((annotation.words, *effects_of(annotation, places)))
             if check:
@@ -151,6 +155,13 @@ class Annotator:
             self._changed(self._record.annotations)
         log.warning("%s", words)
         return words
+
+    def _check_end(self, annotation: Annotation) -> None:
+        """Refuse a closure that never holds, as of who has a clock that is behind (InvalidValue)."""
+        body, now_ns = annotation.body, self._time_ns()
+        if isinstance(body, Closure) and not annotation.removed and (body.end_ns or now_ns + 1) <= now_ns:
+            now = f"by the clock of the map server, {utc_words(now_ns)}"
+            raise InvalidValue(f"{now}, the closure is over already: {body.words}")
 
     def _annotate(self, request: Request, who: str) -> None:
         def annotate(payload: bytes) -> bytes:

@@ -210,7 +210,7 @@ class MapServer:
         )  # fmt: skip
         self._annotator = Annotator(
             self._bus, self._keys, self._name, self._named_places, self._annotations, self._plans.check,
-            lambda: self._constraints.constraints, self._apply_annotations,
+            lambda: self._constraints.constraints, self._apply_annotations, clock.time_ns,
         )  # fmt: skip
         self._views = NodeViews(self._bus, self._keys, lambda: worker.current().merged)
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)

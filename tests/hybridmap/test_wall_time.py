@@ -66,6 +66,29 @@ def test_a_clock_is_set_forward_or_back_until_then(monkeypatch: pytest.MonkeyPat
         time.tzset()
 
 
+def test_a_clock_that_is_set_back_shows_a_time_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of the second 02:30 a quarter of an hour before it, it was that of the next day."""
+    try:
+        with monkeypatch.context() as patch:
+            patch.setenv("TZ", "CET-1CEST,M3.5.0,M10.5.0/3")
+            time.tzset()
+            first, second = (datetime(2026, 10, 25, hour, 30, tzinfo=UTC) for hour in (0, 1))
+            for now, shown in (
+                (first - timedelta(minutes=15), first),
+                (first, second),
+                (second - timedelta(minutes=15), second),
+                (second, second + timedelta(days=1)),
+            ):
+                now_ns = round(now.timestamp()) * 10**9
+                assert read_time("02:30", now_ns) == round(shown.timestamp()) * 10**9
+            # The night in which it is set forward has no 02:30; that was 01:30.
+            night = datetime(2026, 3, 28, 23, 0, tzinfo=UTC)
+            read = read_time("02:30", round(night.timestamp()) * 10**9)
+            assert read == round(datetime(2026, 3, 29, 1, 30, tzinfo=UTC).timestamp()) * 10**9
+    finally:
+        time.tzset()
+
+
 def test_a_long_text_is_refused_at_once() -> None:
     """It may come over HTTP, with megabytes of blanks."""
     with pytest.raises(InvalidValue, match=r"is no time") as refused:

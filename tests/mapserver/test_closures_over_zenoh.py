@@ -6,6 +6,7 @@ import json
 import re
 import time
 from collections.abc import Callable
+from types import SimpleNamespace
 
 import pytest
 
@@ -31,7 +32,9 @@ KEYS = Keys("demo")
 
 
 def test_what_is_closed_from_the_shell_holds_for_all(
-    mapped_room: Callable[[], MappedRoom], capsys: pytest.CaptureFixture[str]
+    mapped_room: Callable[[], MappedRoom],
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     endpoint, mapped = f"tcp/127.0.0.1:{free_port()}", mapped_room()
     first, second, last = sorted(mapped.truth)[0], sorted(mapped.truth)[1], sorted(mapped.truth)[-1]
@@ -90,6 +93,14 @@ def test_what_is_closed_from_the_shell_holds_for_all(
             fleet.annotate("closure", "brief", place="kitchen", radius=0.02, end_ns=soon)
             eventually(lambda: not asks().closed)
             assert time.time_ns() >= soon
+
+            # By a person whose clock is an hour behind.
+            with monkeypatch.context() as patch:
+                behind = time.time_ns() - 3600 * 10**9
+                patch.setattr("mapweave.fleet_annotations.time", SimpleNamespace(time_ns=lambda: behind))
+                late = behind + 1800 * 10**9
+                with pytest.raises(InvalidValue, match=r"^by the clock of the map server, .* is over"):
+                    fleet.annotate("closure", "late", place="kitchen", radius=0.02, end_ns=late)
 
             assert shell("avoid", str(first), str(second), "--factor", "9")[0] == 0
             assert "cost times 9" in shell("closures")[1]
