@@ -94,14 +94,14 @@ class Database:
                 raise self._in_use() from None
             code = getattr(error, "sqlite_errorcode", 0) & 0xFF
             if code == sqlite3.SQLITE_CORRUPT:
-                raise self._damaged(str(error)) from None
+                raise self.damaged(str(error)) from None
             if code in DISK_ERRORS and (reason := _disk_trouble(self._file)):
                 raise InvalidFile(f"{self.path}: {self.what}: {reason}") from None
             advice = self._advice if code == sqlite3.SQLITE_NOTADB else ""
             raise InvalidFile(f"{self.path}: {self.what} cannot be used ({error}){advice}") from None
         except UnicodeDecodeError:
             # SQLite quotes a damaged schema in its error, which then is no text.
-            raise self._damaged("its schema is no text") from None
+            raise self.damaged("its schema is no text") from None
 
     @contextmanager
     def transaction(self) -> Iterator[sqlite3.Connection]:
@@ -125,6 +125,10 @@ class Database:
                 if self.connection.in_transaction:
                     self.connection.execute("ROLLBACK")
                 raise
+
+    def damaged(self, reason: str) -> InvalidFile:
+        """The error of a damaged file, with what to do about it."""
+        return InvalidFile(f"{self.path}: {self.what} is damaged ({reason}){self._advice}")
 
     def close(self) -> None:
         """Close the file. Idempotent."""
@@ -190,13 +194,10 @@ class Database:
         # A message that begins with the file's name may have two lines; the second gives the reason.
         damage = str(self.connection.execute("PRAGMA quick_check(1)").fetchone()[0])
         if damage != "ok":
-            raise self._damaged(damage.splitlines()[-1])
+            raise self.damaged(damage.splitlines()[-1])
 
     def _in_use(self) -> InvalidFile:
         return InvalidFile(f"{self.path}: {self.what} is in use by another process; stop it first")
-
-    def _damaged(self, reason: str) -> InvalidFile:
-        return InvalidFile(f"{self.path}: {self.what} is damaged ({reason}){self._advice}")
 
 
 def _disk_trouble(file: Path) -> str:

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
+import logging
 import secrets
 import threading
 import zlib
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeGuard
 
 from mapweave.agent.replication.compaction import undone
 from mapweave.agent.replication.log_entry import Entry
@@ -22,6 +22,8 @@ from mapweave.wire.codec import decode_body, element_of, encode_body, wrap_body
 from mapweave.wire.keys import check_epoch
 from mapweave.wire.messages import decode, encode
 
+log = logging.getLogger(__name__)
+
 APPLICATION_ID = 0x4D574A4C
 """'MWJL' in the file's header."""
 
@@ -33,11 +35,16 @@ CREATE TABLE change (
     epoch INTEGER NOT NULL, sequence INTEGER NOT NULL, element INTEGER NOT NULL, put INTEGER NOT NULL,
     stamp_ns INTEGER NOT NULL, body BLOB NOT NULL, crc INTEGER NOT NULL, PRIMARY KEY (epoch, sequence)
 ) WITHOUT ROWID;
-CREATE INDEX change_element ON change (epoch, element, sequence);
 CREATE TABLE ack (
     epoch INTEGER NOT NULL, server TEXT NOT NULL, watermark INTEGER NOT NULL, PRIMARY KEY (epoch, server)
 ) WITHOUT ROWID
 """
+LATER = """
+CREATE TABLE IF NOT EXISTS mission (id TEXT PRIMARY KEY, body BLOB NOT NULL);
+CREATE TABLE IF NOT EXISTS checksum (name TEXT PRIMARY KEY, crc INTEGER NOT NULL);
+DROP INDEX IF EXISTS change_element
+"""
+"""What journals of before lack, or have and need not."""
 
 READ_AT_ONCE = 256
 ADVICE = (
@@ -74,12 +81,41 @@ class Draft:
         return Draft(element.map, element.number, put, stamp_ns, encoded)
 
 
-def body_of(encoded: bytes, crc: int) -> ChangeBody | None:
+def checksum(key: Sequence[object], encoded: bytes) -> int:
+    """Of a row of `change`: of its body in the lower 32 bits, of what precedes that in the 31 above."""
+    return _of_key(key) << 32 | zlib.crc32(encoded)
+
+
+def key_holds(key: Sequence[object], crc: object) -> bool:
+    """Whether what precedes the body of a row, its number and stamp for example, is what was written.
+
+    In journals of before only bodies have a checksum.
+    """
+    return all(isinstance(one, int) for one in (*key, crc)) and crc >> 32 in (0, _of_key(key))  # type: ignore[operator]
+
+
+def body_of(encoded: object, crc: int) -> ChangeBody | None:
     """The body of a row; None if the disk has damaged it."""
     try:
-        return decode_body(encoded) if zlib.crc32(encoded) == crc else None
+        return decode_body(encoded) if _body_holds(encoded, crc) else None
     except InvalidMessage:
         return None
+
+
+def entry_of(map_id: MapId, sequence: int, number: int, put: int, encoded: object, crc: int) -> Entry:
+    """A row of a map's log as an entry; its element is that of its body if that is undamaged."""
+    body = body_of(encoded, crc)
+    if body is None or element_of(body).map != map_id:
+        return Entry(sequence, NodeId(*map_id, number), bool(put), None)
+    return Entry(sequence, element_of(body), not isinstance(body, NodeRetired | EdgeRetired), body)
+
+
+def _of_key(key: Sequence[object]) -> int:
+    return zlib.crc32(repr(tuple(key)).encode()) >> 1
+
+
+def _body_holds(encoded: object, crc: int) -> TypeGuard[bytes]:
+    return isinstance(encoded, bytes) and zlib.crc32(encoded) == crc & 0xFFFFFFFF
 
 
 class Journal:
@@ -108,6 +144,7 @@ class Journal:
         )
         try:
             self.agent = self._owner(path) if agent is None else self._own(path, agent)
+            self._check_keys()
         except BaseException:
             self._database.close()
             raise
@@ -125,9 +162,38 @@ class Journal:
                 rows.execute("INSERT INTO owner VALUES (?)", (agent,))
             elif owner[0] != agent:
                 raise InvalidFile(f"{path}: is the journal of agent {owner[0]}, not of {agent}")
-            # A journal of before has none.
-            rows.execute("CREATE TABLE IF NOT EXISTS mission (id TEXT PRIMARY KEY, body BLOB NOT NULL)")
+            for statement in LATER.split(";"):
+                rows.execute(statement)
+            if not self._table_holds("map"):
+                raise self._database.damaged("its list of maps")
+            if not self._table_holds("ack"):
+                log.warning("%s: what servers have acknowledged is damaged; they are asked again", path)
+                rows.execute("DELETE FROM ack")
+                self._sum_table("ack")
         return agent
+
+    def _check_keys(self) -> None:
+        """Refuse a journal with a number or a stamp that is not what was written: its order is not known."""
+        with self._database.guard():
+            for *key, crc in self._database.connection.execute(
+                "SELECT epoch, sequence, element, put, stamp_ns, crc FROM change"
+            ):
+                if not key_holds(key, crc):
+                    raise self._database.damaged(
+                        f"the number or the stamp of a change, {key[1]} as it stands"
+                    )
+
+    def _table_holds(self, table: str) -> bool:
+        rows = self._read("SELECT crc FROM checksum WHERE name = ?", (table,))
+        return not rows or rows[0][0] == self._of_table(table)
+
+    def _sum_table(self, table: str) -> None:
+        """Write the checksum of a small table, in the transaction that changes it."""
+        values = (table, self._of_table(table))
+        self._database.connection.execute("INSERT OR REPLACE INTO checksum VALUES (?, ?)", values)
+
+    def _of_table(self, table: str) -> int:
+        return zlib.crc32(repr(self._read(f"SELECT * FROM {table} ORDER BY 1, 2")).encode())
 
     def open_map(self, epoch: int | None) -> MapId:
         """Begin a map or go on with one.
@@ -146,6 +212,7 @@ class Journal:
                 epoch = int(rows.execute("SELECT coalesce(max(epoch), 0) + 1 FROM map").fetchone()[0])
             # A number that an agent with a lost disk will not draw again; SQLite's integers have a sign.
             rows.execute("INSERT OR IGNORE INTO map VALUES (?, ?)", (epoch, secrets.randbits(63)))
+            self._sum_table("map")
         return MapId(self.agent, epoch)
 
     def maps(self) -> list[MapId]:
@@ -195,16 +262,16 @@ class Journal:
         with self._lock:
             first = self._newest_of(map_id) + 1
             with self._database.transaction() as rows:
+                keys = [
+                    (map_id.epoch, first + k, d.element, int(d.put), d.stamp_ns) for k, d in enumerate(drafts)
+                ]
                 rows.executemany(
                     "INSERT INTO change VALUES (?, ?, ?, ?, ?, ?, ?)",
                     (
-                        (
-                            map_id.epoch, first + k, d.element, d.put, d.stamp_ns, d.encoded,
-                            zlib.crc32(d.encoded),
-                        )
-                        for k, d in enumerate(drafts)
+                        (*key, d.encoded, checksum(key, d.encoded))
+                        for key, d in zip(keys, drafts, strict=True)
                     ),
-                )  # fmt: skip
+                )
             self._newest[map_id] = first + len(drafts) - 1
         return first
 
@@ -254,8 +321,8 @@ class Journal:
     def entries(self, map_id: MapId) -> Iterator[Entry]:
         """Every change that is still there, in order; damaged ones without a body."""
         query = "SELECT sequence, element, put, body, crc FROM change WHERE epoch = ? ORDER BY sequence"
-        for sequence, number, put, body, crc in self._read(query, self._epoch(map_id)):
-            yield Entry(sequence, NodeId(*map_id, number), bool(put), body_of(body, crc))
+        for row in self._read(query, self._epoch(map_id)):
+            yield entry_of(map_id, *row)
 
     def acknowledge(self, server: str, map_id: MapId, watermark: int, reset: bool = False) -> None:
         """Remember that a server has every change up to the watermark; it never goes back.
@@ -280,6 +347,7 @@ class Journal:
                     "DO UPDATE SET watermark = max(watermark * ?, excluded.watermark)",
                     (map_id.epoch, check_name(server), watermark, not reset),
                 )
+                self._sum_table("ack")
 
     def acknowledged(self, map_id: MapId) -> dict[str, int]:
         """Up to which change which server has the log."""
@@ -304,9 +372,9 @@ class Journal:
             limit = min((acknowledged.get(server, 0) for server in servers), default=0)
             with self._database.transaction() as rows:
                 dropped = rows.execute(
-                    "DELETE FROM change WHERE epoch = :epoch AND sequence <= :limit AND put AND EXISTS ("
-                    "SELECT 1 FROM change AS later WHERE later.epoch = :epoch AND later.element = "
-                    "change.element AND later.sequence > change.sequence AND later.sequence <= :limit)",
+                    "DELETE FROM change WHERE epoch = :epoch AND sequence <= :limit AND put AND sequence "
+                    "NOT IN (SELECT max(sequence) FROM change WHERE epoch = :epoch AND sequence <= :limit "
+                    "GROUP BY element)",
                     {"epoch": map_id.epoch, "limit": limit},
                 ).rowcount
                 retired = "SELECT 1 FROM change WHERE epoch = ? AND NOT put AND sequence <= ? LIMIT 1"
@@ -320,11 +388,13 @@ class Journal:
                 return dropped + len(some)
 
     def missions(self) -> list[MissionReport]:
-        """Missions that were kept; one that cannot be read is left out."""
+        """Missions that were kept; one that is damaged is left out, and the log says so."""
         reports = []
-        for (body,) in self._read("SELECT body FROM mission"):
-            with suppress(InvalidMessage):
-                reports.append(decode(body, MissionReport))
+        for (kept,) in self._read("SELECT body FROM mission"):
+            try:
+                reports.append(_mission(kept))
+            except InvalidMessage:
+                log.warning("%s: a mission is damaged; it is left out", self._database.path)
         return list(Missions.newest(reports).reports)
 
     def keep_missions(self, reports: Sequence[MissionReport]) -> None:
@@ -336,7 +406,7 @@ class Journal:
         with self._lock, self._database.transaction() as rows:
             rows.executemany(
                 "INSERT OR REPLACE INTO mission VALUES (?, ?)",
-                ((report.order.id, encode(report)) for report in reports),
+                ((report.order.id, _with_check(encode(report))) for report in reports),
             )
             rows.execute(
                 "DELETE FROM mission WHERE rowid NOT IN "
@@ -365,7 +435,7 @@ class Journal:
             "WHERE epoch = ? AND sequence BETWEEN ? AND ? ORDER BY sequence"
         )
         for sequence, stamp_ns, body, crc in self._read(query, (*self._epoch(map_id), first, last)):
-            yield sequence, stamp_ns, body if zlib.crc32(body) == crc else None
+            yield sequence, stamp_ns, body if _body_holds(body, crc) else None
 
     def _decode(self, sequence: int, body: bytes | None) -> ChangeBody:
         if body is None:
@@ -374,3 +444,14 @@ class Journal:
             return decode_body(body)
         except InvalidMessage as error:
             raise InvalidFile(f"{self._database.path}: change {sequence}: {error}") from None
+
+
+def _with_check(encoded: bytes) -> bytes:
+    return encoded + zlib.crc32(encoded).to_bytes(4, "little")
+
+
+def _mission(kept: object) -> MissionReport:
+    """What `_with_check` was made of, or without a check as in journals of before; raises InvalidMessage."""
+    if not isinstance(kept, bytes):
+        raise InvalidMessage("a mission is no bytes")
+    return decode(kept[:-4] if _with_check(kept[:-4]) == kept else kept, MissionReport)

@@ -9,7 +9,7 @@ from itertools import islice
 from pathlib import Path
 from typing import Any
 
-from mapweave.agent.replication.journal import body_of
+from mapweave.agent.replication.journal import body_of, entry_of, key_holds
 from mapweave.agent.replication.log_entry import Entry
 from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
@@ -20,9 +20,9 @@ from mapweave.wire.keys import check_epoch
 
 MOST_LOOKUPS = 1_000_000
 """Changes that are looked up one by one, some ten seconds: a damaged number may be any."""
-COLUMNS = "SELECT epoch, sequence, element, put, body, crc FROM change"
+COLUMNS = "SELECT epoch, sequence, element, put, stamp_ns, body, crc FROM change"
 
-Row = tuple[int, int, int, int, bytes, int]
+Row = tuple[int, int, int, int, int, bytes, int]
 
 
 @dataclass(frozen=True)
@@ -134,9 +134,11 @@ def _agent(rows: Iterable[Row], owners: Iterable[tuple[Any]]) -> str:
 
 
 def _entries(map_id: MapId, rows: Mapping[tuple[int, int], Row]) -> Iterator[Entry]:
-    for (epoch, sequence), (*_, number, put, encoded, crc) in sorted(rows.items()):
-        if epoch == map_id.epoch:
-            body = body_of(encoded, crc)
-            if body is not None and element_of(body).map != map_id:
-                body = None
-            yield Entry(sequence, NodeId(*map_id, number), bool(put), body)
+    for (epoch, sequence), (*key, encoded, crc) in sorted(rows.items()):
+        if epoch != map_id.epoch:
+            continue
+        if key_holds(key, crc):
+            yield entry_of(map_id, sequence, key[2], key[3], encoded, crc)
+        else:
+            # What it is about is not known.
+            yield Entry(sequence, NodeId(*map_id, 0), True, None)
