@@ -61,7 +61,8 @@ def not_let_in(settings: BusSettings) -> str:
         return old
     if not any(map(_listens, settings.endpoints)):
         return ""
-    hint = _key_hint(settings.credentials) or "; if the fleet has keys, give a key file (--keys FILE)"
+    hint = _key_hint(settings.credentials, asked=False)
+    hint = hint or "; if the fleet has keys, give a key file (--keys FILE)"
     if settings.credentials is not None and settings.credentials.certified:
         hint += "; or the router's certificate is for other names, those of `mapweave keys init --at`, has "
         hint += "expired, or is by another authority than this key, that of another `mapweave keys init`"
@@ -115,10 +116,15 @@ def router_gone() -> NotConnected:
     return NotConnected("the router is gone: start `mapweave server` there again")
 
 
-def _key_hint(holder: Credentials | None) -> str:
-    """A router drops what a key may not do, without a word."""
+def _key_hint(holder: Credentials | None, asked: bool = True) -> str:
+    """A router drops what a key may not do, without a word; of no role it refuses the connection."""
     if holder is None:
         return ""
+    if not asked:
+        return (
+            f"; or the key of {holder.name} was revoked or has expired: `mapweave keys list` at the server "
+            "and the server's log say so"
+        )
     if holder.role is Role.ROBOT:
         return (
             f"; or {holder.name} may not ask this: its key is a robot's, use a viewer's or an operator's; "

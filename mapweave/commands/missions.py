@@ -115,7 +115,8 @@ def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -
         report = give(fleet)
         if arguments.wait and report.open:
             print(words(report), file=sys.stderr)
-            report = fleet.wait(report, arguments.timeout, _progress(), _silence(arguments.robot))
+            keys = network_of(arguments, settings_of(arguments)).keys
+            report = fleet.wait(report, arguments.timeout, _progress(), _silence(arguments.robot, keys))
             if report.open:
                 print(_late(report, arguments.timeout), file=sys.stderr)
     _print([report], arguments.json)
@@ -161,12 +162,13 @@ def _progress() -> Callable[[MissionReport, AgentStatus], None]:
     return show
 
 
-def _silence(robot: str) -> Callable[[float], None]:
-    """Prints a line while nothing is heard of the robot."""
+def _silence(robot: str, keys: str) -> Callable[[float], None]:
+    """Prints a line while nothing is heard of the robot; who waits hears nothing once the key is revoked."""
+    also = f" Is {keys} still good (`mapweave keys list` at the server)?" if keys else ""
 
     def show(silent: float) -> None:
         words = f"{robot}: nothing heard for {silent:.0f} s: is its agent running, and its network up?"
-        print(words, file=sys.stderr, flush=True)
+        print(words + also, file=sys.stderr, flush=True)
 
     return show
 

@@ -7,6 +7,7 @@ import errno
 import json
 import os
 import resource
+import socket
 import stat
 import subprocess
 import sys
@@ -17,11 +18,12 @@ import pytest
 from cryptography import x509
 
 from mapweave.cli import main
-from mapweave.connection import no_server
+from mapweave.connection import no_server, not_let_in
 from mapweave.exit_status import FAILED, NO, USAGE
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.identities.logins import Logins
+from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Role
 from tests.mapweave.command_line import complaint
 
@@ -119,6 +121,17 @@ def test_a_question_with_a_robots_key_is_said_to_need_anothers(keys: Path) -> No
     robot = read_key_file(keys / "r0.key.toml").credentials
     assert "its key is a robot's, use a viewer's or an operator's" in str(no_server("f1", robot))
     assert "a robot's" not in str(no_server("f1", replace(robot, role=Role.VIEWER)))
+
+
+def test_a_robot_that_is_not_let_in_hears_that_its_key_may_be_no_longer_good(keys: Path) -> None:
+    """An agent heard that it should use an operator's key."""
+    robot = read_key_file(keys / "r0.key.toml").credentials
+    with socket.create_server(("127.0.0.1", 0)) as there:
+        scheme = "tls" if robot.certified else "tcp"
+        endpoint = f"{scheme}/127.0.0.1:{there.getsockname()[1]}"
+        advice = not_let_in(BusSettings(endpoints=(endpoint,), credentials=robot))
+    assert "or the key of r0 was revoked or has expired: `mapweave keys list`" in advice
+    assert "operator" not in advice
 
 
 @pytest.mark.parametrize("role", ["viewer", "robot"])
