@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -23,6 +24,9 @@ from mapweave.hybridmap.errors import InvalidFile
 if TYPE_CHECKING:
     from mapweave.hybridmap.constraint_subject import Subject
     from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint, ManualConstraints
+
+PATIENT = 2.0
+"""s; who waits longer hears what for."""
 
 
 def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -> None:
@@ -101,8 +105,11 @@ def _settled(arguments: argparse.Namespace) -> None:
     from mapweave.wire.keys import Keys
     from mapweave.wire.log_messages import decode_record
 
-    end = time.monotonic() + arguments.timeout
-    while time.monotonic() < end:
+    begin, heard = time.monotonic(), False
+    while (waited := time.monotonic() - begin) < arguments.timeout:
+        if waited > PATIENT and not heard:
+            heard = True
+            print("waiting until the server has merged with it ...", file=sys.stderr, flush=True)
         if all(
             decode_record(reply.payload)["settled"] for reply in ask(arguments, Keys.server_statuses, b"")
         ):

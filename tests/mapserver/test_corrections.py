@@ -16,6 +16,7 @@ import pytest
 
 from mapweave import Fleet
 from mapweave.cli import main
+from mapweave.commands import map_constraint
 from mapweave.exit_status import NO, USAGE
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import ChangeBody
@@ -101,6 +102,20 @@ def path(tmp_path: Path) -> Path:
     return write_store(tmp_path / "s0.sqlite", logs())
 
 
+@pytest.fixture
+def merging(monkeypatch: pytest.MonkeyPatch) -> threading.Event:
+    """While it is not set, servers do not merge."""
+    merging, merged = threading.Event(), Merger.merged
+    merging.set()
+
+    def in_its_time(self: Merger, use: Any = None) -> Any:
+        assert merging.wait(60)
+        return merged(self, use)
+
+    monkeypatch.setattr(Merger, "merged", in_its_time)
+    return merging
+
+
 def components(content: MapFile) -> int:
     return len({number for number, _ in content.poses.values()})
 
@@ -171,17 +186,9 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
 
 
 def test_of_two_links_before_a_merge_the_second_must_fit_the_first(
-    path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+    path: Path, merging: threading.Event, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Both were taken, and either of them contradicted the map for ever."""
-    merging, merged = threading.Event(), Merger.merged
-    merging.set()
-
-    def in_its_time(self: Merger, use: Any = None) -> Any:
-        assert merging.wait(60)
-        return merged(self, use)
-
-    monkeypatch.setattr(Merger, "merged", in_its_time)
     with serving(path) as asking:
         fleet = asking.fleet
         merging.clear()
@@ -211,6 +218,23 @@ def test_of_two_links_before_a_merge_the_second_must_fit_the_first(
         poses = {node: pose.mean for node, (_, pose) in content.poses.items()}
         a, b = NodeId("a", 1, 1), NodeId("b", 1, 3)
         assert (poses[a].inverse() @ poses[b]).distance(off) < 0.01
+
+
+def test_who_waits_for_a_merge_hears_what_for(
+    path: Path,
+    merging: threading.Event,
+    monkeypatch: pytest.MonkeyPatch,
+    capfd: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(map_constraint, "PATIENT", 0.05)
+    with serving(path) as asking:
+        capfd.readouterr()
+        merging.clear()
+        threading.Timer(0.5, merging.set).start()
+        assert main(["map", "retire", "b.1.5", *asking.at]) == 0
+        out, err = capfd.readouterr()
+        assert out.startswith("node b.1.5 is retired by carl") and out.count("\n") == 1
+        assert err.count("waiting until the server has merged with it ...\n") == 1
 
 
 @pytest.mark.parametrize(
