@@ -17,10 +17,11 @@ from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.recording import Recording
 from mapweave.agent.recordings.splits import read_split
+from mapweave.agent.recordings.wheel_data import Wheels
 from mapweave.hybridmap.errors import DeviceError
 
 AXLE_PER_HEIGHT = 0.9
-"""A recording does not give its robot's width; taller robots are wider."""
+"""Where a recording does not give its robot's axle; taller robots are wider."""
 
 
 class Replay:
@@ -69,10 +70,16 @@ class Replay:
         """The camera; no rangers and no wheels to command."""
         recording = self.recording
         tick = float(np.median(np.diff(recording.stamps_ns))) * 1e-9 * self._frames.step
+        wheels = recording.wheels
+        if wheels is None:
+            axle = AXLE_PER_HEIGHT * max(recording.camera.mount_height, 0.1)
+            wheels = Wheels(axle, RobotDescription.wheel_noise, RobotDescription.side_slip)
         return RobotDescription(
             camera=recording.camera,
             distortion=recording.distortion,
-            axle=AXLE_PER_HEIGHT * max(recording.camera.mount_height, 0.1),
+            axle=wheels.axle,
+            wheel_noise=wheels.wheel_noise,
+            side_slip=wheels.side_slip,
             max_forward=0.0,
             max_turn=0.0,
             tick=tick,

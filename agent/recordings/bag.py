@@ -18,6 +18,7 @@ from mapweave.agent.recordings.incomplete import CameraGiven, Incomplete, comple
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
 from mapweave.agent.recordings.recording import BagContents, Images, Recording, StampedPoses, Topic, names_of
+from mapweave.agent.recordings.wheel_data import Wheels, wheels_of
 from mapweave.agent.ros_messages.images import grey_of
 from mapweave.agent.ros_messages.values import (
     CAMERA_TYPE,
@@ -54,6 +55,7 @@ class Bag:
         path: of it.
         topics: of all its parts.
         damage: what cannot be read of it, a line each.
+        wheels: how they err; None if it does not say.
     """
 
     def __init__(self, path: Path) -> None:
@@ -63,6 +65,7 @@ class Bag:
             DeviceError: nothing of it can be read.
         """
         self.path, self.damage = path, list[str]()
+        self.wheels: Wheels | None = None
         self._parts = [part for each in parts_of(path) for part in self._opened(each)]
         if not self._parts:
             raise DeviceError((self.damage or [f"{path}: no bag in it"])[0])
@@ -101,7 +104,9 @@ class Bag:
 
     def _opened(self, path: Path) -> list[WholeBag | DamagedBag]:
         try:
-            return [WholeBag(self, path)]
+            whole = WholeBag(self, path)
+            self._take_wheels(path, whole.custom_data)
+            return [whole]
         except Exception as error:  # noqa: BLE001  # as above
             reason = _line(error)
         parts: list[WholeBag | DamagedBag] = []
@@ -116,6 +121,12 @@ class Bag:
             self.damaged(f"{path}: not a bag that can be read ({reason})")
         return parts
 
+    def _take_wheels(self, path: Path, custom_data: object) -> None:
+        try:
+            self.wheels = self.wheels or wheels_of(custom_data)
+        except ValueError as error:
+            self.damaged(f"{path}: {error}; it is not used")
+
 
 class WholeBag:
     """A bag as it should be, read by `rosbags`.
@@ -123,6 +134,7 @@ class WholeBag:
     Attributes:
         topics: by name: the type of its messages, and how many there are.
         span_ns: when the first message and the last were recorded; empty if there are none.
+        custom_data: of its metadata.yaml, as it was read; None if there is none.
     """
 
     def __init__(self, owner: Bag, path: Path) -> None:
@@ -145,6 +157,8 @@ class WholeBag:
             self.topics[connection.topic] = connection.msgtype, count + connection.msgcount
         begin, end = self._reader.start_time, self._reader.end_time
         self.span_ns = (begin, end) if self._reader.message_count else ()
+        storage = getattr(self._reader.readers[0], "storage", None)
+        self.custom_data: object = getattr(getattr(storage, "metadata", None), "custom", None)
 
     def messages(self, topic: str) -> Iterator[tuple[int, Any]]:
         """Stamps, ns, and messages of a topic, in the order in which they were recorded.
@@ -243,7 +257,8 @@ def bag(path: Path, options: RecordingOptions) -> Recording:
     begins = int(np.diff(kidnapped, prepend=False)[kidnapped].sum())
     lifted = (f"the robot was lifted {begins} times",) if begins else ()
     damage = (*opened.damage, *whole.damage[len(lost) :])
-    return replace(whole, kidnapped=kidnapped, notes=(*whole.notes, *lifted), damage=damage)
+    notes = [*whole.notes, *lifted]
+    return replace(whole, kidnapped=kidnapped, notes=tuple(notes), damage=damage, wheels=opened.wheels)
 
 
 def _of(opened: Bag, kinds: Sequence[str]) -> list[Topic]:

@@ -16,6 +16,7 @@ import cv2
 import numpy as np
 
 from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.recordings.wheel_data import wheel_data
 from mapweave.agent.ros_messages import making
 from mapweave.agent.ros_messages.values import FOOTPRINT as BASE
 from mapweave.agent.ros_messages.values import KIDNAP_TYPE
@@ -169,6 +170,8 @@ class _Part:
             for function in (making.header, making.pose, making.twist, making.transform)
         )
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
+        for key, value in wheel_data(description).items():
+            self._writer.set_custom_data(key, value)
         self._writer.open()
         self._connections: dict[str, Any] = {}
         self._description = description

@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.recordings.heading_check import contradiction
+from mapweave.agent.recordings.wheel_data import Wheels
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array, Pose2
@@ -81,6 +82,7 @@ class Recording:
         damage: what cannot be read of it, a line each; what comes before is used.
         kidnapped: (N,) whether the robot was lifted since the image before; None if the format does not say.
         bag: what else is in it, if it is one.
+        wheels: how they err; None if it does not say.
     """
 
     path: Path
@@ -94,6 +96,7 @@ class Recording:
     damage: tuple[str, ...] = ()
     kidnapped: NDArray[np.bool_] | None = None
     bag: BagContents | None = None
+    wheels: Wheels | None = None
 
     def __len__(self) -> int:
         """How many images there are."""

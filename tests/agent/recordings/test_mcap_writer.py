@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,11 +14,16 @@ from rosbags.highlevel import AnyReader
 
 from mapweave.agent.drivers.recorded import RecordedRobot
 from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.mission import Carried
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.agent.recordings.mcap_writer import PART_S
+from mapweave.agent.pipeline import Pipeline
+from mapweave.agent.recordings.mcap_writer import PART_S, McapWriter
 from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.equidistant import Equidistant
 from mapweave.vision.lens import NO_DISTORTION, Distortion
+from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, Drive
 
 LIFTED = (3, 4, 8)
@@ -79,6 +86,71 @@ def test_what_a_robot_recorded_is_replayed_as_it_sensed_it(drive: Drive, tmp_pat
         assert (observation.odometry.forward, observation.odometry.turn) == pytest.approx(
             tuple(increment), abs=1e-9
         )
+
+
+def carried(description: RobotDescription, seen: list[Observation]) -> dict[int, Pose2]:
+    """The map that is made on the way, by the stamps of its nodes."""
+    pipeline = Pipeline(MapId("r0", 1), description)
+    pipeline.set_mission(Carried())
+    for one in seen:
+        pipeline.step(one)
+    pipeline.finish()
+    return {node.stamp_ns: node.map_from_robot.mean for node in pipeline.map.nodes.values()}
+
+
+def on_a_curve(walls: PhotoWalls) -> list[Observation]:
+    """Six metres, with noise of wheels."""
+    rng, pose, seen = np.random.default_rng(1), Pose2(), list[Observation]()
+    for k in range(140):
+        turn = 0.05 * math.sin(0.1 * k)
+        step = Odometry(0.03, turn).motion()
+        pose = pose @ step
+        measured = Odometry(0.03 * rng.normal(1.0, 0.05), turn + rng.normal(0.0, 0.005))
+        seen.append(Observation(1 + k * 100_000_000, measured, walls.render(pose)))
+    return seen
+
+
+def test_a_lossless_recording_is_replayed_to_the_very_same_map(walls: PhotoWalls, tmp_path: Path) -> None:
+    """Axle and noise of the wheels were guessed: other nodes were made, some centimetres off."""
+    robot = replace(DESCRIPTION, axle=0.35, wheel_noise=0.06, side_slip=0.01)
+    seen = on_a_curve(walls)
+    writer = McapWriter(tmp_path / "walk", robot, lossless=True)
+    for one in seen:
+        while writer.written < one.stamp_ns // 100_000_000 - 50:
+            time.sleep(0.01)
+        writer.write(one, Command())
+    writer.close()
+    replay = Replay(tmp_path / "walk")
+    described = replay.describe()
+    assert (described.axle, described.wheel_noise, described.side_slip) == (0.35, 0.06, 0.01)
+    made, replayed = carried(robot, seen), carried(described, list(iter(replay.sense, None)))
+    assert len(made) >= 3 and replayed.keys() == made.keys()
+    for stamp, pose in made.items():
+        assert replayed[stamp].vector == pytest.approx(pose.vector, abs=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("given", "line"),
+    [
+        ("'-3.0'", "gives what no wheels can have: mapweave.axle_m '-3.0'"),
+        ("wide", "gives what no wheels can have: mapweave.axle_m 'wide'"),
+        (".nan", "gives what no wheels can have: mapweave.axle_m nan"),
+        (None, "lacks mapweave.axle_m"),
+    ],
+)
+def test_wheels_of_the_metadata_that_cannot_be_right_are_named(
+    drive: Drive, given: str | None, line: str, tmp_path: Path
+) -> None:
+    record(drive, tmp_path / "walk")
+    metadata = tmp_path / "walk" / "walk_0" / "metadata.yaml"
+    lines = metadata.read_text().splitlines()
+    (at,) = (k for k, text in enumerate(lines) if "mapweave.axle_m" in text)
+    lines[at : at + 1] = [] if given is None else [f"    mapweave.axle_m: {given}"]
+    metadata.write_text("\n".join(lines))
+    replay = Replay(tmp_path / "walk")
+    assert len(replay) == COUNT and replay.describe().wheel_noise == RobotDescription.wheel_noise
+    (damage,) = replay.damage
+    assert line in damage
 
 
 def test_failed_proximity_sensors_do_not_end_a_recording(drive: Drive, tmp_path: Path) -> None:
