@@ -78,7 +78,9 @@ def body_of_words(
         raise InvalidValue(f"`near` is a node or the name of a place, not {near!r:.40}")
     for name in TIMES:
         if isinstance(plain.get(name), str):
-            plain[name] = read_time(plain[name], now_ns, UTC)
+            begin_ns = plain.get("begin_ns")
+            begin_ns = begin_ns if name != "begin_ns" and isinstance(begin_ns, int) else 0
+            plain[name] = read_time(plain[name], now_ns, UTC, begin_ns)
     if (place := plain.pop("place", None)) is not None:
         entry = annotations.last("place", str(place))
         if entry is None:

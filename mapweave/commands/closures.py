@@ -91,7 +91,7 @@ def run_close(arguments: argparse.Namespace) -> int:
     for field, text, word in (("begin_ns", arguments.begin, "from"), ("end_ns", arguments.end, "until")):
         if text is not None:
             with arguments_read():
-                times[field] = stamp_ns = read_time(text, now_ns)
+                times[field] = stamp_ns = read_time(text, now_ns, begin_ns=times.get("begin_ns", 0))
             print(f"{word} {local_words(stamp_ns)} ({utc_words(stamp_ns)})")
     with record_of(arguments) as record:
         name, fields = _meant(arguments, "closure", record)

@@ -154,7 +154,7 @@ def _token(arguments: argparse.Namespace) -> int:
 def _check_days(days: float) -> None:
 
     if not 0.0 < days <= 3650.0:
-        raise UsageError(f"--days {days:g}: give 1 to 3650")
+        raise UsageError(f"--days {days:g}: give more than 0, and at most 3650")
 
 
 def _list(arguments: argparse.Namespace) -> int:

@@ -38,6 +38,22 @@ def test_times_are_read(text, zone, expected) -> None:
 
 
 @pytest.mark.parametrize(
+    ("begin", "end", "expected"),
+    [
+        ("22:00", "06:00", datetime(2026, 3, 2, 6, 0, tzinfo=UTC)),
+        ("13:00", "13:40", datetime(2026, 3, 2, 13, 40, tzinfo=UTC)),
+        ("2026-03-05 22:00", "06:00", datetime(2026, 3, 6, 6, 0, tzinfo=UTC)),
+        ("2026-03-05 22:00", "+2h", datetime(2026, 3, 1, 15, 30, tzinfo=UTC)),
+        ("1999-01-01", "14:00", datetime(2026, 3, 1, 14, 0, tzinfo=UTC)),
+    ],
+)
+def test_an_end_without_a_date_is_behind_its_begin(begin: str, end: str, expected: datetime) -> None:
+    """A closure over midnight could be made before 06:00 and after 22:00 with dates alone."""
+    begin_ns = read_time(begin, NOW_NS, UTC)
+    assert read_time(end, NOW_NS, UTC, begin_ns) == round(expected.timestamp()) * 10**9
+
+
+@pytest.mark.parametrize(
     "text",
     ["", "soon", "25:00", "14:61", "2026-13-01", "1960-01-01", "+h", "9999-12-31 23:59", "14"],
 )
