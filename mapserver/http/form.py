@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import logging
 from typing import Any
 
 from python_multipart.exceptions import FormParserError
@@ -10,6 +11,9 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.mapserver.http.photo import Photo
+
+# What is wrong with a form is said to who has sent it, and to no log.
+logging.getLogger("python_multipart").setLevel(logging.CRITICAL)
 
 MOST_PARTS = 32
 LONGEST_FIELD = 4096

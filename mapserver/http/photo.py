@@ -120,8 +120,9 @@ def _number(name: str, value: Any) -> float:
         number = float(value)
     except (TypeError, ValueError, OverflowError):
         number = math.nan
-    if isinstance(value, bool) or not math.isfinite(number) or abs(number) > 1e6:
-        raise InvalidValue(f"{name} must be a number, not {str(value)[:40]!r}")
+    if isinstance(value, bool) or not abs(number) <= 1e6:
+        least = " of at most a million" if abs(number) > 1e6 else ""
+        raise InvalidValue(f"{name} must be a number{least}, not {str(value)[:40]!r}")
     return number
 
 

@@ -91,6 +91,8 @@ METHODS = {
 }
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 """Of the text format of Prometheus."""
+GIVEN = "goal", "via", "by", "id"
+"""What may be said of a mission behind the `?`."""
 BY = "http"
 """Gives a mission, if the request does not say."""
 
@@ -309,6 +311,11 @@ class Questions:
             return {"said": await run_in_threadpool(self._server.portal_done, robot, _author(request))}
         if kind not in (MissionKind.GO, MissionKind.EXPLORE, MissionKind.STOP):
             raise HTTPException(HTTPStatus.NOT_FOUND, f"there is no mission {kind!r}: go, explore, stop")
+        # A stop stops whatever is said with it.
+        if kind != MissionKind.STOP and (unknown := sorted(query.keys() - set(GIVEN))):
+            raise InvalidValue(f"{unknown[0]!r:.40}: there is no such value; give {', '.join(GIVEN)}")
+        if len(query.getlist("goal")) > 1:
+            raise InvalidValue("goal is given twice: `via` names places on the way")
         goal, by, mission_id = query.get("goal", ""), _author(request), query.get("id", "")
         report = await run_in_threadpool(
             self._server.give, robot, MissionKind(kind), goal.strip(), by, mission_id,

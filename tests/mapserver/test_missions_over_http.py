@@ -95,6 +95,13 @@ def test_a_robot_at_a_portal_takes_it_from_any_client_that_it_was_taken_through(
         (f"/robots/r0/go?goal={THERE}&via=r9.1.1", 400, "via point r9.1.1 is not in the merged map"),
         (f"/robots/r0/go?goal={THERE}&via=nowhere", 400, "via point 'nowhere' is no place of this map"),
         ("/robots/r0/go", 400, "give goal"),
+        # A misspelt place on the way was passed over without a word.
+        (
+            f"/robots/r0/go?goal={THERE}&vai=kitchen",
+            400,
+            "'vai': there is no such value; give goal, via, by, id",
+        ),
+        (f"/robots/r0/go?goal={THERE}&goal=home", 400, "goal is given twice"),
         ("/robots/r0/stop?goal=r0.1.1", 400, "takes no goal"),
         ("/robots/r7/explore", 400, "no robot r7"),
         ("/robots/R%200/stop", 400, "name"),

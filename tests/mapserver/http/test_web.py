@@ -112,6 +112,7 @@ def test_a_form_with_a_camera_file(served: Web, services: StubServices) -> None:
     ("query", "words"),
     [
         ("?fx=wide", "fx must be a number, not 'wide'"),
+        ("?fx=1e9", "fx must be a number of at most a million, not '1e9'"),
         ("?fx=-5", "focal lengths must be positive"),
         ("?hfov=200", "hfov 200 is no angle of view"),
         ("?hfov=nan", "hfov must be a number"),
