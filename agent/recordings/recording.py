@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.recordings.heading_check import contradiction
+from mapweave.agent.recordings.odometry_jumps import bridged
 from mapweave.agent.recordings.wheel_data import Wheels
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
@@ -274,7 +275,8 @@ def assembled(
     if wrong:
         damage = (*damage, f"{path}: {wrong}; what comes before is used")
         stamps, increments = stamps[:whole_count], increments[:whole_count]
-    notes = (*notes, *_milliseconds(increments, stamps))
+    increments, jumps = bridged(increments, stamps)
+    notes = (*notes, *jumps, *_milliseconds(increments, stamps))
     factor = math.ceil(camera.width / MOST_WIDTH)
     if factor > 1:
         notes = (*notes, f"images are reduced {factor} times")
