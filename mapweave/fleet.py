@@ -37,6 +37,7 @@ from mapweave.hybridmap.mission_order import (
 )
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.identities.key_file import read_key_file
+from mapweave.refusals import listed
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Credentials
@@ -253,10 +254,11 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             via: what to pass before, in order, in the same words.
 
         Raises:
+            InvalidValue: `via` is one place, and no list.
             Refused: the robot or the goal does not exist, or no way leads there.
             NotConnected: the robot does not answer.
         """
-        return self._give(robot, MissionKind.GO, goal, wait, tuple(via))
+        return self._give(robot, MissionKind.GO, goal, wait, listed("via", via))
 
     def explore(self, robot: str, wait: float = 0.0) -> MissionReport:
         """Let a robot map all floor that it can reach; see `go`."""

@@ -42,7 +42,7 @@ from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAn
 from mapweave.map_reading import MapReading
 from mapweave.merge.settings import MergeSettings
 from mapweave.node_table import NodeTable
-from mapweave.refusals import check_component, refusals
+from mapweave.refusals import check_component, listed, refusals
 from mapweave.storage.map_file import MapFile, write_map_file
 
 if TYPE_CHECKING:
@@ -225,10 +225,14 @@ class Map(ABC):
             via: what to pass before, in order.
 
         Raises:
+            InvalidValue: one place is given for a list of places, or for a pair.
             Refused: a node is not there.
         """
-        stops = [start, *via, goal]
-        nodes = self._named(*stops, *(end for pair in blocked for end in pair))
+        stops = [start, *listed("via", via), goal]
+        pairs_of_names = [listed("blocked", pair) for pair in blocked]
+        if any(len(pair) != 2 for pair in pairs_of_names):
+            raise InvalidValue("`blocked` is a list of pairs of nodes")
+        nodes = self._named(*stops, *(end for pair in pairs_of_names for end in pair))
         stopping, closed = nodes[: len(stops)], nodes[len(stops) :]
         pairs = tuple(zip(closed[::2], closed[1::2], strict=True))
         legs = []

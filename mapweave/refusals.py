@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from typing import TypeVar
 
 from mapweave.hybridmap.errors import InvalidValue, Refused
+from mapweave.hybridmap.ids import NodeId
+
+Name = TypeVar("Name", bound=NodeId | str)
 
 
 @contextmanager
@@ -19,6 +23,21 @@ def refusals() -> Iterator[None]:
         yield
     except InvalidValue as error:
         raise Refused(str(error)) from error
+
+
+def listed(name: str, given: Iterable[Name]) -> tuple[Name, ...]:
+    """What a list has; one text would be taken for as many names as it has letters.
+
+    Args:
+        name: of the argument.
+        given: nodes, or names of places.
+
+    Raises:
+        InvalidValue: it is one node or one name.
+    """
+    if isinstance(given, str | NodeId):
+        raise InvalidValue(f"`{name}` is a list, such as [{str(given)!r}], and not one place")
+    return tuple(given)
 
 
 def check_component(number: int, count: int) -> None:

@@ -147,6 +147,19 @@ def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path: Path) -> No
     assert not none.found and not none.hops and "r0.1.3 to r1.1.5: " in none.reason
     assert not file.route("r0.1.1", "r0.1.3", blocked=[(a, b) for a in graph for b in graph if a < b]).found
     for asked in (fleet, file):
+        # The letters of one name were looked for one by one.
+        for one in (
+            {"via": "kitchen"},
+            {"via": mapweave.NodeId("r1", 1, 3)},
+            {"blocked": ("r0.1.1", "r0.1.3")},
+        ):
+            with pytest.raises(mapweave.MapweaveError, match=r"is a list, such as .*, and not one place"):
+                asked.route("r0.1.1", "r1.1.5", **one)
+        with pytest.raises(mapweave.MapweaveError, match="`blocked` is a list of pairs of nodes"):
+            asked.route("r0.1.1", "r1.1.5", blocked=[("r0.1.1",)])
+    with pytest.raises(mapweave.MapweaveError, match="`via` is a list"):
+        fleet.go("r0", "kitchen", via="kitchen")
+    for asked in (fleet, file):
         pair = asked.explain("r0.1.1", mapweave.NodeId("r1", 1, 1))
         assert isinstance(pair, PairExplanation) and pair.standing == "linked" and pair.evidence
         (maps,) = asked.explain_maps()
