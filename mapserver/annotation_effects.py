@@ -1,4 +1,4 @@
-"""What an annotation would do to a map, in words, for a person who has not said it yet."""
+"""What an annotation does to a map, and a retirement to annotations, for a person who has not said it yet."""
 
 from __future__ import annotations
 
@@ -9,9 +9,16 @@ import numpy as np
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor, Place, Preference
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.counted import counted
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.portal import Portal
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.route_rules import RouteRules
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.retired_nodes import retired_nodes
+
+MOST_LOST = 8
+"""Of what loses its effect, so many are named."""
 
 
 def effects_of(annotation: Annotation, places: Places) -> Iterator[str]:
@@ -43,6 +50,37 @@ def effects_of(annotation: Annotation, places: Places) -> Iterator[str]:
     before = places.annotations.last(annotation.kind, annotation.name)
     if before is not None:
         yield f"it takes the place of: {before.words}"
+
+
+def without_effect(constraint: ManualConstraint, merged: MergedMap, annotations: Annotations) -> str:
+    """What of closures, preferences and portals a retirement leaves without effect, in words; or nothing.
+
+    Args:
+        constraint: not merged yet.
+        merged: without it.
+        annotations: the record.
+    """
+    if not constraint.holds:
+        return ""
+    alone = ManualConstraints([constraint])
+    gone = retired_nodes(merged.maps, alone, merged.graphs)
+    of = merged.component_of
+    kinds = annotations.in_force(Closure), annotations.in_force(Preference), annotations.in_force(Portal)
+    lost = [
+        f"{entry.kind} {entry.name}"
+        for entry, nodes in ((entry, nodes_of(body)) for kind in kinds for entry, body in kind)
+        if any(node in gone or alone.retires(node) for node in nodes)
+        and all(of(node) is not None for node in nodes)
+    ]
+    more = f" and {len(lost) - MOST_LOST} more" if len(lost) > MOST_LOST else ""
+    return f"without effect as long as it holds: {', '.join(lost[:MOST_LOST])}{more}" if lost else ""
+
+
+def nodes_of(body: Closure | Preference | Portal) -> tuple[NodeId, ...]:
+    """The nodes by which something is known to be where: without one of them it has no effect."""
+    if isinstance(body, Portal):
+        return body.a, body.b
+    return body.edge if body.edge is not None else (body.anchor,)
 
 
 def _nodes_in(area: Area, merged: MergedMap) -> int:

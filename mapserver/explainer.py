@@ -28,6 +28,7 @@ from mapweave.hybridmap.manual_constraint import (
 from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.admission_control import AdmissionControl
+from mapweave.mapserver.annotation_effects import without_effect
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.constraint_history import with_constraints
@@ -222,7 +223,8 @@ class Explainer:
             checked = check_manual_constraint(
                 merged, made, request.constraint, self._record.maps(), self._settings
             )
-            words = checked.words
+            lost = without_effect(checked.constraint, merged, self._annotations())
+            words = "; ".join(filter(None, (checked.words, lost)))
             if request.check:
                 return f"only checked, nothing is changed: {words}"
             self._record.add(checked.constraint)

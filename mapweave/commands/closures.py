@@ -12,9 +12,11 @@ from typing import TYPE_CHECKING, Any
 from mapweave.commands import values
 from mapweave.commands.annotating import add_area_options, add_record_options, area_fields, record_of
 from mapweave.commands.usage import UsageError, arguments_read
+from mapweave.hybridmap.errors import InvalidValue
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
+    from mapweave.hybridmap.annotation import Annotation
     from mapweave.offline_annotations import OfflineAnnotations
 
 WHERE = (
@@ -123,18 +125,33 @@ def run_list(arguments: argparse.Namespace) -> int:
 
     with record_of(arguments) as record:
         said = record.annotations()
-    entries = [entry for entry, _ in (*said.in_force(Closure), *said.in_force(Preference))]
+        entries = [entry for entry, _ in (*said.in_force(Closure), *said.in_force(Preference))]
+        notes = [] if arguments.json else [_without_effect(record, entry) for entry in entries]
     if arguments.json:
         print(json.dumps({"annotations": [json_values(entry) for entry in entries]}))
         return 0
     now_ns = time.time_ns()
-    for entry in entries:
+    for entry, note in zip(entries, notes, strict=True):
         body = entry.body
         state = "" if not isinstance(body, Closure) or body.holds(now_ns) else ", not now"
-        print(f"{entry.words}{state}")
+        print(f"{entry.words}{state}{note}")
     if not entries:
         print("nothing is closed, preferred or avoided")
     return 0
+
+
+def _without_effect(record: Fleet | OfflineAnnotations, entry: Annotation) -> str:
+    """That something has no effect while a node of it takes no part in the map, and why; or nothing."""
+    from mapweave.hybridmap.annotation import Closure, Preference
+    from mapweave.hybridmap.query import ResolveRequest
+    from mapweave.mapserver.annotation_effects import nodes_of
+
+    assert isinstance(entry.body, Closure | Preference), "of these kinds"
+    try:
+        record.resolve(ResolveRequest(tuple(map(str, nodes_of(entry.body)))))
+    except InvalidValue as error:
+        return f"; without effect: {error}"
+    return ""
 
 
 def _withdraw(arguments: argparse.Namespace, kind: str) -> int:

@@ -121,6 +121,7 @@ def _settled(arguments: argparse.Namespace) -> None:
 def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
     from mapweave.hybridmap.annotation import Annotations
     from mapweave.hybridmap.manual_constraint import ManualConstraints
+    from mapweave.mapserver.annotation_effects import without_effect
     from mapweave.mapserver.map_files import map_file_of
     from mapweave.mapserver.map_history import between
     from mapweave.merge.constraint_checks import check_manual_constraint
@@ -147,7 +148,8 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     earlier = ManualConstraints(content.constraints, floors=said.floors)
     with refusals():
         checked = check_manual_constraint(before, earlier, constraint, settings=settings)
-    constraint, words = checked.constraint, checked.words
+    constraint = checked.constraint
+    words = "; ".join(filter(None, (checked.words, without_effect(constraint, before, said))))
     if arguments.check:
         print(f"only checked, nothing is changed: {words}")
         return

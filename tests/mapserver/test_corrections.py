@@ -411,6 +411,10 @@ def test_what_is_taken_back_says_what_another_correction_still_excludes(
 ) -> None:
     with serving(path) as asking:
         fleet = asking.fleet
+        fleet.annotate("closure", "shut", edge=["a.1.1", "a.1.3"])
+        fleet.annotate("closure", "other", edge=["b.1.1", "b.1.3"])
+        said = fleet.retire("a.1.1", check=True)
+        assert said.endswith("; without effect as long as it holds: closure shut")
         fleet.retire("b.1.5", because="a mirror")
         asking.merged()
         status, answer = asking.http("POST", {"retire": ["b.1"], "by": "bob", "because": "another day"})

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from mapweave.cli import main
 from mapweave.exit_status import NO
 from mapweave.hybridmap.annotation import Annotations, Closure
@@ -48,3 +50,28 @@ def test_a_way_is_open_when_it_was_reopened_whichever_end_was_named_first(tmp_pa
     assert main(["close", *ends[::-1], "--map", str(path), "--name", " ".join(ends[::-1])]) == 0
     assert main(["reopen", *ends, "--map", str(path)]) == 0
     assert closed(path) == 0
+
+
+def test_what_a_retirement_leaves_without_effect_is_named(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Closures were listed as closed, and no longer held."""
+    path = map_of("r0", tmp_path)
+    at = ["--map", str(path)]
+    assert main(["close", "r0.1.1", "r0.1.3", *at]) == 0
+    assert main(["avoid", "r0.1.5", "--radius", "0.1", *at]) == 0
+    capfd.readouterr()
+    assert main(["map", "retire", "r0.1.1", "--check", *at]) == 0
+    assert capfd.readouterr().out.endswith("; without effect as long as it holds: closure r0.1.1 r0.1.3\n")
+    assert main(["closures", *at]) == 0
+    assert "without effect" not in capfd.readouterr().out
+    assert main(["map", "retire", "r0.1", *at]) == 0
+    lost = "without effect as long as it holds: closure r0.1.1 r0.1.3, preference r0.1.5"
+    assert lost in capfd.readouterr().out
+    assert main(["closures", *at]) == 0
+    lines = capfd.readouterr().out.splitlines()
+    assert all("; without effect: node r0.1." in line and "is retired by" in line for line in lines)
+    assert len(lines) == 2
+    # What has none already is not named again.
+    assert main(["map", "retire", "r0.1", "--undo", *at]) == 0
+    assert "without effect" not in capfd.readouterr().out
