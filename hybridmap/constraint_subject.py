@@ -347,7 +347,8 @@ def read_window(
 
     Args:
         which: the map.
-        begin: ns since 1970, or as people write it (mapweave.hybridmap.wall_time); empty: no beginning.
+        begin: ns since 1970, or as people write it (mapweave.hybridmap.wall_time), of the past if it has no
+            date; empty: no beginning.
         end: likewise.
         now_ns: the present.
         zone: of times that name none; None: this machine's.
@@ -360,7 +361,7 @@ def read_window(
         if isinstance(word, int) or (word.isdecimal() and len(word) <= LONGEST):
             stamps.append(min(int(word), MAX_STAMP_NS))
         else:
-            stamps.append(read_time(word, now_ns, zone) if word else default)
+            stamps.append(read_time(word, now_ns, zone, past=True) if word else default)
     return RetiredWindow(which, *stamps)
 
 

@@ -30,7 +30,9 @@ def local_words(stamp_ns: int, zone: tzinfo | None = None) -> str:
     return datetime.fromtimestamp(stamp_ns // NANOSECONDS, UTC).astimezone(zone).strftime("%Y-%m-%d %H:%M %z")
 
 
-def read_time(text: str, now_ns: int, zone: tzinfo | None = None, begin_ns: int = 0) -> int:
+def read_time(
+    text: str, now_ns: int, zone: tzinfo | None = None, begin_ns: int = 0, *, past: bool = False
+) -> int:
     """A time as ns since 1970.
 
     Args:
@@ -38,6 +40,7 @@ def read_time(text: str, now_ns: int, zone: tzinfo | None = None, begin_ns: int 
         now_ns: the present.
         zone: of times that name none; this machine's by default.
         begin_ns: of an end, what it is the end of: without a date it is the next time after that, too.
+        past: whether a time without a date is the last that the clock showed, and not the next.
 
     Raises:
         InvalidValue: it is no time.
@@ -65,16 +68,19 @@ def read_time(text: str, now_ns: int, zone: tzinfo | None = None, begin_ns: int 
     if (clock := CLOCK.fullmatch(words)) is None:
         return _stamp(text, dated)
 
-    def shown_next() -> datetime:
+    def shown() -> datetime:
         begin = datetime.fromtimestamp(begin_ns / NANOSECONDS, UTC)
         # Of a zone that is not named, its date on that day.
         after = max(now, begin.astimezone(now.tzinfo if zone or now.tzinfo is UTC else None))
         today = after.replace(hour=int(clock[1]), minute=int(clock[2]), second=0, microsecond=0, tzinfo=None)
         # A clock that is set back shows a time twice.
-        times = (today, today.replace(fold=1), today + timedelta(days=1))
+        if past:
+            times = today.replace(fold=1), today, today - timedelta(days=1)
+            return next(time for time in map(in_zone, times) if time <= after)
+        times = today, today.replace(fold=1), today + timedelta(days=1)
         return next(time for time in map(in_zone, times) if time > after)
 
-    return _stamp(text, shown_next)
+    return _stamp(text, shown)
 
 
 def _stamp(text: str, make: Callable[[], datetime]) -> int:

@@ -176,6 +176,9 @@ def test_subjects_as_people_write_them() -> None:
         read_pose([1, 2, 400])
     window = read_window(A.map, "1970-01-01T00:01", "1970-01-01T01:02+01:00", 0)
     assert (window.begin_ns, window.end_ns) == (60 * 10**9, 120 * 10**9)
+    # In the afternoon, all until noon: not what is mapped until tomorrow's.
+    day, hour = 86_400 * 10**9, 3600 * 10**9
+    assert read_window(A.map, "", "12:00", day + 15 * hour) == RetiredWindow(A.map, 0, day + 12 * hour)
     assert read_window(A.map, "7", 9, 0) == RetiredWindow(A.map, 7, 9)
     assert read_window(A.map, "", "", 0) == RetiredWindow(A.map, 0, MAX_STAMP_NS)
     for wrong in (

@@ -38,6 +38,19 @@ def test_times_are_read(text, zone, expected) -> None:
 
 
 @pytest.mark.parametrize(
+    ("text", "zone", "expected"),
+    [
+        ("14:00", UTC, datetime(2026, 2, 28, 14, 0, tzinfo=UTC)),
+        ("13:30", UTC, datetime(2026, 3, 1, 13, 30, tzinfo=UTC)),
+        ("15:00", EAST, datetime(2026, 3, 1, 13, 0, tzinfo=UTC)),
+        ("2026-07-01 08:15", UTC, datetime(2026, 7, 1, 8, 15, tzinfo=UTC)),
+    ],
+)
+def test_times_of_the_past_are_read(text: str, zone: timezone, expected: datetime) -> None:
+    assert read_time(text, NOW_NS, zone, past=True) == round(expected.timestamp()) * 10**9
+
+
+@pytest.mark.parametrize(
     ("begin", "end", "expected"),
     [
         ("22:00", "06:00", datetime(2026, 3, 2, 6, 0, tzinfo=UTC)),
