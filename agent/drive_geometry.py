@@ -92,7 +92,11 @@ class DriveGeometry:
 
     @property
     def vector(self) -> Array:
-        """(10,) in the order of `Parameter`."""
+        """(10,) in the order of `Parameter`; raises InvalidValue without a height above the floor."""
+        if not self.height > 0.0:
+            raise InvalidValue(
+                f"camera: height_m is {self.height:g}; a robot needs its height above the floor"
+            )
         return np.array(
             [
                 math.log(self.wheel_scale), math.log(self.turn_scale), self.drift, self.forward, self.left,

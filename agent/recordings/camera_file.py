@@ -32,8 +32,10 @@ def read_camera(path: str | PathLike[str]) -> tuple[Camera, Distortion]:
             mount_forward=number(values, "forward_m") if "forward_m" in values else 0.0,
         )  # fmt: skip
         check_mount(camera.mount_height, camera.mount_forward)
-        model = LensModel(values.get("lens", LensModel.RADIAL_TANGENTIAL))
-        return lens_of(camera, model, values.get("distortion", ()))
+        model = values.get("lens", LensModel.RADIAL_TANGENTIAL)
+        if model not in list(LensModel):
+            raise ValueError(f"lens {model!r} is not known; it is {' or '.join(LensModel)}")
+        return lens_of(camera, LensModel(model), values.get("distortion", ()))
     except KeyError as missing:
         raise DeviceError(f"{path}: {missing.args[0]!r} is missing") from None
     except (ValueError, TypeError, OverflowError, InvalidValue) as error:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -23,9 +24,14 @@ def images_of(folder: Path) -> list[Path]:
     """The images of a recording in the order of the numbers in their names.
 
     Raises:
-        DeviceError: there are none.
+        DeviceError: there are none, or one is there in two formats.
     """
-    return images_in(folder / "images")
+    images = images_in(folder / "images")
+    for before, image in pairwise(sorted(images, key=lambda path: path.stem)):
+        if before.stem == image.stem:
+            both = " and ".join(sorted((before.name, image.name)))
+            raise DeviceError(f"{folder / 'images'}: {both} are one image; keep one format")
+    return images
 
 
 def images_in(folder: Path) -> list[Path]:
@@ -34,7 +40,8 @@ def images_in(folder: Path) -> list[Path]:
     Raises:
         DeviceError: there are none.
     """
-    images = [p for p in folder.glob("*") if p.suffix.lower() in IMAGE_SUFFIXES]
+    # On disks of others macOS keeps a file `._0001.png` of its own beside each.
+    images = [p for p in folder.glob("[!.]*") if p.suffix.lower() in IMAGE_SUFFIXES]
     if not images:
         raise DeviceError(f"{folder}: no images there (png, jpg, pgm or bmp)")
     return sorted(images, key=_natural_order)

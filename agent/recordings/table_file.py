@@ -88,13 +88,16 @@ def rows_of(path: Path, lines: Sequence[str], columns: Sequence[str]) -> TableRo
         columns: that it must have; others are not read.
 
     Raises:
-        DeviceError: it lacks a column, or something else separates the columns.
+        DeviceError: it lacks a column or has one twice, or something else separates the columns.
     """
     reader = TableRows(lines, skipinitialspace=True)
     try:
         lacking = [name for name in columns if name not in (reader.fieldnames or ())]
     except csv.Error as error:
         raise DeviceError(f"{path}: line 1: {error}") from None
+    for name in columns:
+        if list(reader.fieldnames or ()).count(name) > 1:
+            raise DeviceError(f"{path}: column {name!r} is there twice; keep one")
     if not lacking:
         return reader
     if lacking[0] in named_columns(lines):

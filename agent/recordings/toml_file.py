@@ -49,6 +49,8 @@ def number(values: Mapping[str, Any], name: str) -> float:
     """
     value = values[name]
     try:
+        if isinstance(value, bool):
+            raise TypeError
         return float(value)
     except OverflowError:
         raise ValueError(f"{name} has too many digits") from None
@@ -60,7 +62,7 @@ def number(values: Mapping[str, Any], name: str) -> float:
 def whole(values: Mapping[str, Any], name: str) -> int:
     """A whole number of a table. Errors as of `number`."""
     value = values[name]
-    if not isinstance(value, int):
+    if not isinstance(value, int) or isinstance(value, bool):
         # What fits nowhere is refused rather than rounded: half a frame or pixel is a mistake.
         raise ValueError(f"{name} {value!r} is no whole number")  # noqa: TRY004
     return value

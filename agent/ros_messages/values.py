@@ -39,12 +39,14 @@ class Mount(NamedTuple):
         left: m.
         up: above the floor, m.
         heading: of its x axis, rad; of the viewing direction if its frame is a camera's optical one.
+        pitch: likewise, rad below the horizon.
     """
 
     forward: float
     left: float
     up: float
     heading: float
+    pitch: float = 0.0
 
 
 def stamp_of(message: Any) -> int:
@@ -163,4 +165,5 @@ def _mount(robot_from_frame: Array | None, ahead: Array) -> Mount | None:
         return None
     x, y, z = robot_from_frame[:3, 3].tolist()
     direction = robot_from_frame[:3, :3] @ ahead
-    return Mount(x, y, z, math.atan2(direction[1], direction[0]))
+    pitch = -math.asin(min(max(float(direction[2]), -1.0), 1.0))
+    return Mount(x, y, z, math.atan2(direction[1], direction[0]), pitch)

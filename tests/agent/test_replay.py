@@ -247,6 +247,23 @@ WRONG = {
     "lens is no number": (replaced("camera.toml", "0.02", "nan"), "camera.toml"),
     "camera with another key": (replaced("camera.toml", "forward_m", "foward_m"), "did you mean 'forward_m'"),
     "width is text": (replaced("camera.toml", "width = 320", 'width = "a"'), "width 'a' is no whole number"),
+    "focal length is true": (replaced("camera.toml", "fx = 277.0", "fx = true"), "fx True is no number"),
+    "lens of another name": (
+        lambda folder: (folder / "camera.toml").write_text(
+            "lens = 'fisheye'\n" + (folder / "camera.toml").read_text()
+        ),
+        "lens 'fisheye' is not known; it is radial-tangential or equidistant",
+    ),
+    "an image in two formats": (
+        lambda folder: cv2.imwrite(
+            str(next((folder / "images").iterdir()).with_suffix(".bmp")), np.zeros((240, 320), np.uint8)
+        ),
+        "are one image; keep one format",
+    ),
+    "odometry with a column twice": (
+        written("odometry.csv", "forward_m,turn_rad,forward_m\n" + "0,0,9\n" * COUNT),
+        "column 'forward_m' is there twice",
+    ),
     "camera of deep lists": (written("camera.toml", "width = " + "[" * 5000), "camera.toml"),
     "camera with a long number": (replaced("camera.toml", "0.05", "9" * 400), "has too many digits"),
     "camera height in mm": (replaced("camera.toml", "height_m = 0.3", "height_m = 300"), "is in metres"),

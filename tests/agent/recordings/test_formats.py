@@ -403,3 +403,14 @@ def test_files_of_an_editor_of_windows(drive: Drive, tmp_path: Path) -> None:
         b"\xef\xbb\xbfforward_m,turn_rad\r\n" + b"0.1,0.0\r\n" * len(drive.images)
     )
     assert open_recording(folder).increments[1] == pytest.approx([0.1, 0.0])
+
+
+def test_files_of_macos_beside_the_images_are_none(drive: Drive, tmp_path: Path) -> None:
+    """Each was taken for an image, and each second image was left out."""
+    folder_with_poses(drive, tmp_path)
+    for path in list((tmp_path / "images").iterdir()):
+        (tmp_path / "images" / f"._{path.name}").write_bytes(b"\0\5\x16\7")
+    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
+    (tmp_path / "odometry.csv").write_text("forward_m,turn_rad\n" + "0.1,0.0\n" * len(drive.images))
+    replay = Replay(tmp_path)
+    assert len(replay) == len(drive.images) and replay.damage == []

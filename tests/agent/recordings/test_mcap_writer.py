@@ -17,8 +17,9 @@ from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Pipeline
-from mapweave.agent.recordings.mcap_writer import PART_S, McapWriter
-from mapweave.hybridmap.errors import DeviceError
+from mapweave.agent.recordings.mcap_writer import PART_S, McapWriter, _Part
+from mapweave.agent.recordings.options import RecordingOptions
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.equidistant import Equidistant
@@ -270,3 +271,41 @@ def test_what_cannot_be_written_ends_the_recording_with_one_line(drive: Drive, t
     (line,) = lines
     assert line.startswith(f"{tmp_path / 'walk'}: the recording ends here, ") and "\n" not in line
     assert len(Replay(tmp_path / "walk")) >= 5
+
+
+@pytest.mark.parametrize(
+    ("height", "pitch", "line"),
+    [(0.3, 0.6, "34 deg down by tf"), (0.3, -0.2, "11 deg up by tf"), (0.0, 0.0, ""), (-0.3, 0.0, "")],
+)
+def test_a_mount_that_cannot_be_right_or_is_not_level_is_named(
+    drive: Drive, height: float, pitch: float, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A camera at the floor or below it was a traceback; one that looks down was mapped as if level."""
+    mount = _Part._mount
+
+    def mounted(part: _Part) -> Any:
+        made = mount(part)
+        turn = made.transform.rotation
+        # About the camera's x axis, to the right.
+        x, w = -math.sin(pitch / 2), math.cos(pitch / 2)
+        q = turn.x, turn.y, turn.z, turn.w
+        turn.x, turn.y = q[3] * x + q[0] * w, q[1] * w + q[2] * x
+        turn.z, turn.w = q[2] * w - q[1] * x, q[3] * w - q[0] * x
+        made.transform.translation.z = height
+        return made
+
+    monkeypatch.setattr(_Part, "_mount", mounted)
+    record(drive, tmp_path / "walk")
+    if height > 0.0:
+        notes = Replay(tmp_path / "walk").recording.notes
+        assert [line in note for note in notes].count(True) == 1
+        return
+    with pytest.raises(DeviceError, match="does not say how high the camera is; give --camera-height"):
+        Replay(tmp_path / "walk")
+    assert len(Replay(tmp_path / "walk", options=RecordingOptions(camera_height=0.3))) == COUNT
+
+
+def test_a_robot_whose_camera_is_at_the_floor_is_refused_in_one_line() -> None:
+    camera = replace(DESCRIPTION.camera, mount_height=0.0)
+    with pytest.raises(InvalidValue, match=r"^camera: height_m is 0; a robot needs its height"):
+        Pipeline(MapId("r0", 1), replace(DESCRIPTION, camera=camera))
