@@ -5,13 +5,14 @@ from __future__ import annotations
 import os
 import sqlite3
 from collections.abc import Callable, Iterator
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.database_reader import reading
 from mapweave.storage.file_owner import owning
 from mapweave.storage.os_errors import DISK_FULL, READ_ONLY, no_permission
+from mapweave.storage.write_ahead_log import lost_commits
 
 LEAST_FREE = 1 << 16
 """Bytes; a disk with less takes no page of SQLite with its place in the write-ahead log."""
@@ -41,6 +42,7 @@ class Database:
         repair: Callable[[sqlite3.Connection], None] | None = None,
         advice: str = "",
         read_only: bool = False,
+        refuse_loss: bool = False,
     ) -> None:
         """Open the file, or make it.
 
@@ -53,6 +55,8 @@ class Database:
             repair: called before the check of the file's pages; may take out rows that are damaged.
             advice: what to do about a damaged file, for people; appended to the reason.
             read_only: change nothing, neither the file nor its folder; the file must be there.
+            refuse_loss: a file whose write-ahead log is damaged before its last commits is damaged, too; else
+                SQLite goes on as if these had never been made.
 
         Raises:
             InvalidFile: damaged, of another kind or version, in use, or not readable.
@@ -69,7 +73,7 @@ class Database:
                     self.connection = self._closing.enter_context(reading(path, kind))
                     self._check_kind(application_id, version)
                 else:
-                    self._open(application_id, version, schema)
+                    self._open(application_id, version, schema, refuse_loss)
                 self._check_pages()
             self._inode = self._inode_now()
         except BaseException:
@@ -134,7 +138,7 @@ class Database:
         """Close the file. Idempotent."""
         self._closing.close()
 
-    def _open(self, application_id: int, version: int, schema: str) -> None:
+    def _open(self, application_id: int, version: int, schema: str, refuse_loss: bool) -> None:
         owned = True
         try:
             self._closing.enter_context(owning(self._file, BUSY))
@@ -143,6 +147,12 @@ class Database:
         except OSError:
             # The folder takes no file, or is not there: SQLite finds out which.
             owned = False
+        # Before SQLite sees the log: it would put what it takes for the whole into the file, and delete it.
+        lost = 0
+        with suppress(OSError):  # SQLite says why, too
+            lost = lost_commits(self._file) if refuse_loss and owned else 0
+        if lost:
+            raise self.damaged(f"its last {lost} commits cannot be read")
         for locking in ("NORMAL", "EXCLUSIVE") if owned else ("EXCLUSIVE",):
             self._connect()
             try:

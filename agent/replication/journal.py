@@ -140,8 +140,9 @@ class Journal:
         self._lock = threading.RLock()
         self._newest: dict[MapId, int] = {}
         self._database = Database(
-            path, "agent journal", APPLICATION_ID, VERSION, SCHEMA, None, ADVICE, read_only=agent is None
-        )
+            path, "agent journal", APPLICATION_ID, VERSION, SCHEMA, None, ADVICE,
+            read_only=agent is None, refuse_loss=True,
+        )  # fmt: skip
         try:
             self.agent = self._owner(path) if agent is None else self._own(path, agent)
             self._check_keys()

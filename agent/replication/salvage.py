@@ -15,6 +15,7 @@ from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.storage.database_reader import reading
+from mapweave.storage.write_ahead_log import lost_commits
 from mapweave.wire.codec import element_of
 from mapweave.wire.keys import check_epoch
 
@@ -31,7 +32,7 @@ class SalvagedJournal:
 
     Attributes:
         maps: what is left of each map, oldest first.
-        whole: whether all pages could be read.
+        whole: whether all pages and commits could be read.
     """
 
     maps: Mapping[MapId, RetainedMap]
@@ -56,7 +57,7 @@ def salvage(path: Path) -> SalvagedJournal:
     kept = {}
     for map_id in (MapId(agent, epoch) for epoch in sorted(epochs)):
         kept[map_id] = RetainedMap.of_entries(map_id, _entries(map_id, rows))
-    return SalvagedJournal(kept, not error)
+    return SalvagedJournal(kept, not (error or lost_commits(path)))
 
 
 def _read(connection: sqlite3.Connection, query: str, *values: object) -> tuple[list[Any], str]:

@@ -215,3 +215,76 @@ def test_a_journal_of_before_goes_on(sound: bytes, tmp_path: Path, caplog: pytes
     with closing(Journal(path, "r0")) as journal:
         journal.append(MAP, [NodeRetired(NodeId(*MAP, 1))], 30)
         assert journal.head(MAP) == len(rows) + 1
+
+
+@pytest.fixture(scope="module")
+def killed(tmp_path_factory: pytest.TempPathFactory) -> tuple[bytes, bytes]:
+    """Database and log of an agent that was killed: nothing has come from the log into the database."""
+    path = tmp_path_factory.mktemp("killed") / "r0.sqlite"
+    with closing(Journal(path, "r0")) as journal:
+        journal.open_map(1)
+        for k, body in enumerate(log_of(12)):
+            journal.append(MAP, [body], k)
+        return path.read_bytes(), path.with_name("r0.sqlite-wal").read_bytes()
+
+
+def left_behind(path: Path, killed: tuple[bytes, bytes], log: bytes) -> Path:
+    path.write_bytes(killed[0])
+    path.with_name("r0.sqlite-wal").write_bytes(log)
+    return path
+
+
+@pytest.mark.parametrize("place", [0, 9, 20, 28, 40, 3000, 0.1, 0.3, 0.6, 0.8, 0.9])
+def test_damage_in_the_log_of_an_agent_that_was_killed_is_found(
+    place: float, killed: tuple[bytes, bytes], tmp_path: Path
+) -> None:
+    """SQLite went on as if all that follows had never been made: the robot had a part of its map, or none."""
+    log = bytearray(killed[1])
+    log[int(place * len(log)) if isinstance(place, float) else place] ^= 4
+    path = left_behind(tmp_path / "r0.sqlite", killed, bytes(log))
+    for _ in range(2):
+        with pytest.raises(
+            InvalidFile, match=r"journal is damaged \(its last \d+ commits cannot be read\); save"
+        ):
+            Journal(path, "r0")
+    assert path.with_name("r0.sqlite-wal").read_bytes() == log, "nothing is changed"
+    if isinstance(place, float) and place >= 0.3:
+        salvaged = salvage(path)
+        assert not salvaged.whole and 1 <= len(salvaged.maps[MAP].contents) <= 22
+
+
+def test_a_log_that_a_loss_of_power_has_cut_short_goes_on(
+    killed: tuple[bytes, bytes], tmp_path: Path
+) -> None:
+    """The last commit was not on the disk yet, in whole or in part: it was never acknowledged."""
+    whole = contents_of(left_behind(tmp_path / "r0.sqlite", killed, killed[1]))
+    assert whole.logs[0][2] == 24
+    damaged = bytearray(killed[1])
+    damaged[-2000] ^= 1
+    for k, log in enumerate((bytes(damaged), killed[1][:-1], killed[1][:-4000], killed[1][:20], b"")):
+        folder = tmp_path / str(k)
+        folder.mkdir()
+        path = left_behind(folder / "r0.sqlite", killed, log)
+        with closing(Journal(path, "r0")) as journal:
+            assert len(log) < 100 or journal.head(MAP) == 23
+
+
+@settings(max_examples=20, deadline=None)
+@given(st.lists(st.integers(1, 5), min_size=1, max_size=8), st.integers(0, 6))
+def test_a_log_that_holds_is_never_refused(
+    tmp_path_factory: pytest.TempPathFactory, sizes: list[int], checkpoint: int
+) -> None:
+    """Also one that SQLite has begun again: what is behind its end is of before."""
+    folder = tmp_path_factory.mktemp("log")
+    path, log = folder / "r0.sqlite", log_of(6)
+    with closing(Journal(path, "r0")) as journal:
+        journal.open_map(1)
+        for k, size in enumerate(sizes):
+            journal.append(MAP, log[:size], k)
+            if k == checkpoint:
+                journal._database.connection.execute("PRAGMA wal_checkpoint(RESTART)")
+        files = path.read_bytes(), path.with_name("r0.sqlite-wal").read_bytes()
+    other = folder / "copy"
+    other.mkdir()
+    with closing(Journal(left_behind(other / "r0.sqlite", files, files[1]), "r0")) as journal:
+        assert journal.head(MAP) == sum(sizes)
