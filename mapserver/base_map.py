@@ -15,7 +15,7 @@ from mapweave.hybridmap.change import Change, ChangeBody, NodePut
 from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
 from mapweave.mapserver.log.store import Store
@@ -63,11 +63,6 @@ class BaseMap:
         """For example `office.mapweave: 120 nodes of 3 maps`."""
         nodes = sum(len(hybrid.nodes) for hybrid in self.maps.values())
         return f"{self.name}: {counted(nodes, 'node')} of {counted(len(self.maps), 'map')}"
-
-    def nodes(self) -> Iterator[NodeId]:
-        """Every node."""
-        for hybrid in self.maps.values():
-            yield from hybrid.nodes
 
     def beside(self, store: Store) -> BaseMap:
         """What of it counts beside a store: of a map that is in both, the newer state does.

@@ -38,7 +38,6 @@ FAILED = "failed"
 FILES = {
     "log": "",
     "write_ahead_log": "-wal",
-    "places": ".places",
     "verdicts": ".verdicts",
     "superseded": ".superseded",
 }

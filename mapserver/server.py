@@ -49,7 +49,7 @@ from mapweave.mapserver.places import Places
 from mapweave.mapserver.plan_service import PlanService
 from mapweave.mapserver.pose_broadcast import PoseBroadcast
 from mapweave.mapserver.quotas import Quotas, QuotaSettings
-from mapweave.mapserver.retrieval.place_database import EVERY, PlaceDatabase
+from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.roster import Roster
 from mapweave.mapserver.schedule import LiveSchedule, Schedule
 from mapweave.mapserver.services import Services
@@ -134,7 +134,7 @@ class MapServer:
             self._store.close()
             raise
         self._cluster = Cluster(s.cluster)
-        self._places = PlaceDatabase(self._store, path, [*self._base.nodes()], self._cluster.index)
+        places = PlaceDatabase(self._cluster.index)
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._history = MapHistory(self._store, clock=clock.time_ns)
         self._metrics = Metrics()
@@ -143,7 +143,7 @@ class MapServer:
             self._store, s.merge.keep_superseded_days, self._said, base.maps if base else ()
         )  # fmt: skip
         self._worker = MergeWorker(
-            clock, MERGE_SHARE, self._places, s.merge, findings, self._history, self._cluster.compare,
+            clock, MERGE_SHARE, places, s.merge, findings, self._history, self._cluster.compare,
             self._metrics.merged, pruning,
         )  # fmt: skip
         self._constraints = ConstraintRecord(self._store, self._base)
@@ -217,7 +217,6 @@ class MapServer:
         self._metrics.read(self._sources())
         clock.every(STATUS_EVERY, self._publish)
         clock.every(RETRY_EVERY, self._missions.retry)
-        clock.every(EVERY, self._places.save_if_worthwhile)
         self._store.follow(self._follow)
         # Behind the reading of the store: its map can be seen meanwhile.
         for job in library_jobs():
@@ -238,7 +237,6 @@ class MapServer:
         self._broadcast.close()
         self._cluster.close()
         self._worker.close()
-        self._places.close()
         self._store.close()
 
     def summary(self) -> str:

@@ -197,7 +197,6 @@ def _read_store(path: Path) -> None:
             store.refusals(map_id)
             for change in store.replay(map_id):
                 check_finite(change)
-        store.present()
         store.constraints()
         store.traffic()
     finally:

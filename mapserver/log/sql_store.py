@@ -60,17 +60,6 @@ class SqlStore(SqlSizes, Store):
             rows = [row for m in maps for row in self._read(f"{query} WHERE agent = ? AND epoch = ?", m)]
         return {MapId(agent, epoch): Position(int(log_id), mark) for agent, epoch, log_id, mark in rows}
 
-    def present(self) -> set[NodeId]:
-        """All nodes that are not retired, without reading their contents."""
-        query = (
-            "SELECT agent, epoch, number, kind FROM change WHERE kind IN (?, ?) "
-            "ORDER BY agent, epoch, sequence"
-        )
-        nodes: set[NodeId] = set()
-        for *element, kind in self._read(query, (NodePut.__name__, NodeRetired.__name__)):
-            (nodes.add if kind == NodePut.__name__ else nodes.discard)(NodeId(*element))
-        return nodes
-
     def watermark(self, map_id: MapId) -> int:
         """Up to which change the log is settled, 0 without a log."""
         rows = self._read("SELECT watermark FROM log WHERE agent = ? AND epoch = ?", map_id)

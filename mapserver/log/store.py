@@ -107,9 +107,6 @@ class Store(Protocol):
     def positions(self, maps: Collection[MapId] | None = None) -> dict[MapId, Position]:
         """Which log is kept of each of these maps, or of all, and how far it is settled."""
 
-    def present(self) -> set[NodeId]:
-        """All nodes that are not retired, without reading their contents."""
-
     def watermark(self, map_id: MapId) -> int:
         """Up to which change the log is settled, 0 without a log."""
 

@@ -77,4 +77,4 @@ class FlatLandmarks:
         """All landmarks at once in the order of their ids: they are few."""
         del size
         order = np.argsort(self.ids, kind="stable")
-        yield Block(self.codes[order], self.ids[order], np.zeros(len(order), np.int64))
+        yield Block(self.codes[order], self.ids[order])

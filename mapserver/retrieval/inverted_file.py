@@ -24,12 +24,10 @@ class Block(NamedTuple):
     Attributes:
         codes: (N, 32).
         ids: (N,).
-        cells: (N,) where each lies, in rising order.
     """
 
     codes: Codes
     ids: Ids
-    cells: Ids
 
 
 class InvertedFile:
@@ -56,12 +54,6 @@ class InvertedFile:
             part = slice(start, start + BLOCK)
             vectors = codes[part].astype(np.float32)
             self._put(vectors, ids[part], self.means.nearest(vectors))
-
-    def put(self, block: Block) -> None:
-        """Take in landmarks of which it is known where they lie."""
-        for start in range(0, len(block.ids), BLOCK):
-            part = slice(start, start + BLOCK)
-            self._put(block.codes[part].astype(np.float32), block.ids[part], block.cells[part])
 
     def remove(self, first: int, last: int, codes: Codes | None = None) -> None:
         """Forget the ids from first to last, that one left out.
@@ -122,17 +114,15 @@ class InvertedFile:
         cell = 0
         while cell < self._index.nlist:
             codes, ids = [np.zeros((0, DIMENSIONS), np.uint8)], [np.zeros(0, np.int64)]
-            counts: list[int] = []
-            first, some = cell, 0
+            some = 0
             while cell < self._index.nlist and some < size:
                 n = lists.list_size(cell)
                 if n:
                     codes.append(faiss.rev_swig_ptr(lists.get_codes(cell), n * DIMENSIONS).reshape(n, -1))
                     ids.append(faiss.rev_swig_ptr(lists.get_ids(cell), n))
-                counts.append(n)
                 cell, some = cell + 1, some + n
             # What is concatenated is copied.
-            yield Block(np.concatenate(codes), np.concatenate(ids), np.repeat(np.arange(first, cell), counts))
+            yield Block(np.concatenate(codes), np.concatenate(ids))
 
     def _put(self, vectors: Vectors, ids: Ids, cells: Ids) -> None:
         import faiss

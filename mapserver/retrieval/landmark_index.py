@@ -158,12 +158,8 @@ class LandmarkIndex:
 
     def blocks(self) -> Iterator[Block]:
         """Landmarks by cells, as they are when their turn comes; without cells, all."""
-        return self.contents()[1]
-
-    def contents(self, size: int = AT_ONCE) -> tuple[CoarseQuantizer | None, Iterator[Block]]:
-        """What the cells are about, None without cells, and the landmarks in just these, see `blocks`."""
         with self.lock.reading():
-            return self.means, self._in_turn(self._landmarks.blocks(size))
+            return self._in_turn(self._landmarks.blocks(AT_ONCE))
 
     def _in_turn(self, blocks: Iterator[Block]) -> Iterator[Block]:
         while True:
@@ -172,20 +168,6 @@ class LandmarkIndex:
             if block is None:
                 return
             yield block
-
-    def restore(self, means: CoarseQuantizer, blocks: Iterator[Block]) -> None:
-        """Hold these, in these cells. Only an empty index can do that."""
-        cells, end = InvertedFile(means), 0
-        for block in blocks:
-            cells.put(block)
-            end = max(end, int(block.ids.max(initial=-1)) + 1)
-        with self.lock.writing():
-            if len(cells) <= self._settings.exact:
-                self._flat = FlatLandmarks()
-                for block in cells.blocks(AT_ONCE):
-                    self._flat.add(block.codes, block.ids)
-            self._learned, self._end = len(cells), end
-            self._swap(cells)
 
     def _grow(self) -> None:
         """Learn cells if there are many more landmarks than when it was last done."""

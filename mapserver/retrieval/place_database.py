@@ -1,4 +1,4 @@
-"""The place database: the one owner of the place index. It builds, updates and saves it; all others ask.
+"""The place database: the one owner of the place index. It builds and updates it; all others ask.
 
 A node can be found as soon as it is announced. Superseded nodes of an earlier drive leave the index, so that
 a new node costs the same on every drive. Nodes of today stay in it, superseded or not: while maps are being
@@ -7,35 +7,21 @@ made, links between all of them distinguish true merges from false ones.
 
 from __future__ import annotations
 
-import logging
-import time
 from collections.abc import Callable, Collection, Iterable, Sequence
-from pathlib import Path
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.query import View
-from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.retrieval import voting
 from mapweave.mapserver.retrieval.compared_landmarks import bounded
-from mapweave.mapserver.retrieval.index_file import load, save
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.mapserver.retrieval.ranking import Ranked
 from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP
 
-log = logging.getLogger(__name__)
-
-SUFFIX = ".places"
-"""Of the index's file, behind the store's name."""
-EVERY = 600.0
-"""Seconds between two checks whether there is something new to save."""
-WORTHWHILE = 0.02
-"""Share of the nodes that must be new before a running server saves the index."""
 SETTLED = 3600.0
 """s on the robot's own clock after which what it saw is no longer of today."""
 SECOND = 1_000_000_000
@@ -81,33 +67,18 @@ class NodeIndex(Protocol):
 
 
 class PlaceDatabase:
-    """Nodes by their landmarks, in memory or with a store.
+    """Nodes by their landmarks, in memory.
 
     One thread, the merging one, changes it, but for `announce`; any thread may ask.
     """
 
-    def __init__(
-        self,
-        store: Store | None = None,
-        path: Path | None = None,
-        others: Collection[NodeId] = (),
-        index: NodeIndex | None = None,
-    ) -> None:
-        """Begin with the saved index, as far as it agrees with the store.
+    def __init__(self, index: NodeIndex | None = None) -> None:
+        """Begin with no node.
 
         Args:
-            store: has the nodes; None: start empty, and never save.
-            path: of the store's file; the index is next to it.
-            others: nodes that come at the start from elsewhere; the saved index may have them, too.
-            index: empty, to be filled and asked instead of one of its own; it is never saved.
+            index: empty, to be filled and asked instead of one of its own.
         """
-        self._store = store
-        self._others = frozenset(others)
-        self._path = None if path is None else path.with_name(path.name + SUFFIX)
-        own = self._restored() if index is None else PlaceIndex()
-        self._index: NodeIndex = own if index is None else index
-        self._own = own if index is None else None
-        self._saved = own.version
+        self._index: NodeIndex = PlaceIndex() if index is None else index
         self._left_out: set[NodeId] = set()
         self._newest: dict[str, tuple[int, int]] = {}
 
@@ -198,48 +169,3 @@ class PlaceDatabase:
             return True
         epoch, stamp_ns = self._newest.get(node_id.agent, (node_id.epoch, node.stamp_ns))
         return epoch > node_id.epoch or stamp_ns - node.stamp_ns > SETTLED * SECOND
-
-    # Save.
-
-    def save_if_worthwhile(self) -> None:
-        """Save the index if enough is new; called every so many seconds."""
-        if self._own is None:
-            return
-        (before, _), (now, nodes) = self._saved, self._own.version
-        # A large index is not written for a few nodes: they are soon put in again.
-        if now - before >= WORTHWHILE * nodes:
-            self._save()
-
-    def close(self) -> None:
-        """Save for the last time; the database must not change afterwards."""
-        self._save()
-
-    def _restored(self) -> PlaceIndex:
-        if self._store is None or self._path is None:
-            return PlaceIndex()
-        began, logs = time.monotonic(), self._store.positions()
-        try:
-            index = load(self._path, logs)
-        except InvalidFile as error:
-            if logs:
-                log.info("the place index is built again: %s", error)
-            return PlaceIndex()
-        removed = index.retain(self._store.present() | self._others)
-        log.info(
-            "the place index of %d nodes is as it was saved; %d are gone; %.1f s",
-            len(index), removed, time.monotonic() - began,
-        )  # fmt: skip
-        return index
-
-    def _save(self) -> None:
-        if self._own is None or self._store is None or self._path is None:
-            return
-        if (state := self._own.version) == self._saved:
-            return
-        try:
-            # The logs first: later changes may be in the index, but are not claimed.
-            save(self._path, self._own, self._store.positions())
-        except InvalidFile as error:
-            log.warning("%s; the next start takes longer", error)
-            return
-        self._saved = state

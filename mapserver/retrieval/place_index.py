@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections import deque
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
@@ -17,7 +17,6 @@ from mapweave.hybridmap.node import CODE_BYTES, Node
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.retrieval import voting
 from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS, bounded
-from mapweave.mapserver.retrieval.fingerprint import fingerprint, landmark_prints
 from mapweave.mapserver.retrieval.landmark_index import LandmarkIndex, LandmarkIndexSettings
 from mapweave.mapserver.retrieval.ranking import NearestLandmarks, Ranked, rank
 from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_OVERLAP
@@ -26,8 +25,6 @@ log = logging.getLogger(__name__)
 
 SLOT_BITS = 16
 """A landmark's id in the index: its node's slot, then its number in the node."""
-FEW_REMOVED = 20
-"""Of more nodes that go at once, the index is read through once for where they lie."""
 AT_ONCE = 1024
 """Nodes that are taken in at once."""
 
@@ -76,26 +73,9 @@ class PlaceIndex:
             return node_id in self._slots
 
     @property
-    def settings(self) -> PlaceIndexSettings:
-        """How places are found."""
-        return self._settings
-
-    @property
     def landmarks(self) -> LandmarkIndex:
         """What the nodes' landmarks are in; their ids are slot << SLOT_BITS, plus their number."""
         return self._landmarks
-
-    @property
-    def version(self) -> tuple[int, int]:
-        """Changes whenever a node is added, removed or changed."""
-        with self._current():
-            return self._next, len(self._slots)
-
-    @property
-    def slots(self) -> Mapping[NodeId, int]:
-        """Where each node's landmarks are: a copy."""
-        with self._current():
-            return dict(self._slots)
 
     def announce(self, node: Node) -> None:
         """Add a node, or replace it, without waiting; any thread may do so."""
@@ -130,32 +110,8 @@ class PlaceIndex:
                 del self._nodes[slot]
                 # Others than those that are there would leave some behind.
                 codes = None if codes is None else codes[:MOST_LANDMARKS]
-                codes = codes if codes is not None and fingerprint(codes) == seal else None
+                codes = codes if codes is not None and _fingerprint(codes) == seal else None
                 self._landmarks.remove(slot << SLOT_BITS, (slot + 1) << SLOT_BITS, codes)
-
-    def retain(self, node_ids: Collection[NodeId]) -> int:
-        """Forget all nodes but these, and return how many were forgotten."""
-        kept = frozenset(node_ids)
-        removed = {slot: node_id for node_id, slot in self.slots.items() if node_id not in kept}
-        codes = self._codes_of(removed) if len(removed) > FEW_REMOVED else {}
-        for slot, node_id in removed.items():
-            self.remove(node_id, codes.get(slot))
-        return len(removed)
-
-    def _codes_of(self, slots: Collection[int]) -> dict[int, NDArray[np.uint8]]:
-        """The descriptors of some nodes, by their slots: read out of the index in one pass."""
-        wanted = np.zeros(max(slots) + 2, np.bool_)
-        wanted[list(slots)] = True
-        ids, codes = [np.zeros(0, np.int64)], [np.zeros((0, CODE_BYTES), np.uint8)]
-        for block in self._landmarks.blocks():
-            chosen = wanted[np.minimum(block.ids >> SLOT_BITS, len(wanted) - 1)]
-            ids.append(block.ids[chosen])
-            codes.append(block.codes[chosen])
-        all_ids = np.concatenate(ids)
-        order = np.argsort(all_ids)
-        slot = all_ids[order] >> SLOT_BITS
-        parts = np.split(np.concatenate(codes)[order], np.flatnonzero(np.diff(slot)) + 1)
-        return dict(zip(np.unique(slot).tolist(), parts, strict=False))
 
     def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> Ranked:
         """Rank nodes by their similarity to a view, see mapweave.mapserver.retrieval.voting.votes.
@@ -262,34 +218,11 @@ class PlaceIndex:
         """Wait until cells that are being learned are in use."""
         self._landmarks.settle()
 
-    def adopt(self, slots: Mapping[NodeId, int], landmarks: LandmarkIndex) -> None:
-        """Take the place of an empty index by what was kept of another; its nodes may yet be replaced.
-
-        Args:
-            slots: where each node's landmarks are. Landmarks of no node are forgotten.
-            landmarks: filled, with the ids of those slots.
-        """
-        own = np.zeros(max(slots.values(), default=-1) + 2, np.bool_)
-        own[np.fromiter(slots.values(), np.int64, len(slots))] = True
-        prints, strays = np.zeros(len(own), np.uint64), set[int]()
-        for block in landmarks.blocks():
-            # The last one belongs to no node.
-            slot = np.minimum(block.ids >> SLOT_BITS, len(own) - 1)
-            np.add.at(prints, slot, landmark_prints(block.codes, block.ids & ((1 << SLOT_BITS) - 1)))
-            strays.update((block.ids[~own[slot]] >> SLOT_BITS).tolist())
-        for stray in sorted(strays):
-            landmarks.remove(stray << SLOT_BITS, (stray + 1) << SLOT_BITS)
-        self._landmarks, self._lock = landmarks, landmarks.lock
-        self._slots = dict(slots)
-        self._nodes = {slot: node_id for node_id, slot in slots.items()}
-        self._prints = {slot: int(prints[slot]) for slot in self._nodes}
-        self._next = max(self._nodes, default=-1) + 1
-
     def _take(self, nodes: list[Node]) -> None:
         """Take in nodes at once."""
         codes, ids = [np.zeros((0, CODE_BYTES), np.uint8)], [np.zeros(0, np.int64)]
         for node in map(bounded, nodes):
-            stored, seal = self._slots.get(node.id), fingerprint(node.landmarks.codes)
+            stored, seal = self._slots.get(node.id), _fingerprint(node.landmarks.codes)
             if stored is not None:
                 if self._prints[stored] == seal:
                     continue
@@ -305,3 +238,8 @@ class PlaceIndex:
         """Take in what was collected, and empty the lists."""
         self._landmarks.add(np.concatenate(codes), np.concatenate(ids))
         del codes[1:], ids[1:]
+
+
+def _fingerprint(codes: NDArray[np.uint8]) -> int:
+    """Of a node's (N, 32) codes."""
+    return hash(codes.tobytes())

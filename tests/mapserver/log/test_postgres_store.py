@@ -73,7 +73,7 @@ def seen(result: Applied | MapweaveError) -> object:
 def content(store: Store) -> list[object]:
     """All that can be seen of a store."""
     return [
-        store.maps(), store.positions(), store.present(), store.refused(), store.damaged(),
+        store.maps(), store.positions(), store.refused(), store.damaged(),
         store.constraints(), store.annotations(), store.result("poses"), store.kept("r0"), store.traffic(),
         *((store.watermark(m), store.log_id(m), store.refusals(m, 3)) for m in (MAP, OTHER)),
         *(store.unverified(m) for m in (MAP, OTHER)),

@@ -33,7 +33,7 @@ def contents(cells: InvertedFile) -> tuple[Codes, Ids]:
     """In the order of the ids, read in several blocks."""
     blocks = list(cells.blocks(500))
     assert len(blocks) > 1
-    codes, ids, _ = (np.concatenate(column) for column in zip(*blocks, strict=True))
+    codes, ids = (np.concatenate(column) for column in zip(*blocks, strict=True))
     order = np.argsort(ids)
     return codes[order], ids[order]
 
