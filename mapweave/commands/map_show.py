@@ -14,7 +14,6 @@ from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.refusals import check_component
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.ids import NodeId
@@ -54,6 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.hybridmap.node import EdgeKind
     from mapweave.mapserver.content_hash import content_hash
+    from mapweave.refusals import check_component
 
     if arguments.out is not None and not arguments.no_picture:
         need("viz")
