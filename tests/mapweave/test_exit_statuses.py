@@ -200,7 +200,6 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (NO, "{planned} --format g2o -o {out} --plan office --component 7"),
         (FAILED, "{tmp}/none --format g2o -o {out}"),
     ],
-    "map import": [(USAGE, "{tmp}/in.g2o -o {tmp}/x.mapweave"), (FAILED, "{tmp}/none.g2o -o {tmp}/x.g2o")],
     "open": [(USAGE, "{map} --http x"), (FAILED, "{tmp}/none.mapweave")],
     "record": [
         (USAGE, "R0 -o {tmp}/drive"), (USAGE, "r0 --robot nosuch -o {tmp}/drive --connect {at}"),

@@ -129,7 +129,6 @@ CASES: list[tuple[str, str, str]] = [
     ("map extract", "{tmp}/none.sqlite -o {tmp}/maps", "no such file"),
     ("map from-photos", "{recording} --spacing 0.5 -o {tmp}/photos.mapweave", SERVER),
     ("map export", "{merged} --format g2o -o {tmp}/out.g2o", SERVER),
-    ("map import", "{tmp}/out.g2o -o {tmp}/optimum.g2o", SERVER),
 ]
 
 
