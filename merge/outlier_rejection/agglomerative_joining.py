@@ -10,10 +10,8 @@ from __future__ import annotations
 
 from collections.abc import Container, Mapping, Sequence, Set
 
-import networkx as nx
-
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
+from mapweave.merge.outlier_rejection.fleet_chance import FleetChance, chance_by_map
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup
 from mapweave.merge.outlier_rejection.link_probability import standpoints
 from mapweave.merge.outlier_rejection.pairwise_consistency import (
@@ -65,8 +63,8 @@ def agglomerate(
             kept += [link for link in groups[key].sorted.kept if link.key not in keys]
     refused = {r.pair: r for key in asked for r in groups[key].sorted.refused if r.pair not in keys}
     waiting = [link for key, links in asked.items() if key[0] != key[1] for link in links]
-    between = {key: group.sorted for key, group in groups.items() if group.first is not group.second}
-    chance = _chance_support(groups, standing)
+    between = {key: group for key, group in groups.items() if group.first is not group.second}
+    chance = chance_by_map(groups.values(), standing)
     sorted_before: dict[Key, tuple[PoseGraph, PoseGraph, int, Sorted]] = {}
     while True:
         by_node = fragment_by_node([Fragment(graph.anchor, graph, ()) for graph in solver.solve(kept)])
@@ -81,10 +79,10 @@ def agglomerate(
         pools = group_links(waiting, by_node)
         if not pools:
             break
-        own: dict[Key, list[Sorted]] = {}
-        for (a, b), sorted_links in between.items():
+        own: dict[Key, list[LinkGroup]] = {}
+        for (a, b), group in between.items():
             first, second = sorted((by_node[a].name, by_node[b].name))
-            own.setdefault((first, second), []).append(sorted_links)
+            own.setdefault((first, second), []).append(group)
         pooled = {}
         for key, links in pools.items():
             first_graph, second_graph = (by_node[name].graph for name in key)
@@ -92,7 +90,7 @@ def agglomerate(
             if cached is None or cached[:3] != (first_graph, second_graph, len(links)):
                 sorted_links = _sorted(links, key, groups, by_node, s)
                 cached = sorted_before[key] = first_graph, second_graph, len(links), sorted_links
-            pooled[key] = _beyond_chance(cached[3], own[key], chance[key[0].map], s)
+            pooled[key] = chance[key[0].map].beyond(cached[3], own[key], s)
         chosen = joined(
             {key: sorted_links.weight for key, sorted_links in pooled.items() if sorted_links.kept}, pooled
         )
@@ -116,7 +114,7 @@ def _with_borne_out(
     solver: ComponentSolver,
     kept: Sequence[Link],
     refused: Sequence[Link],
-    chance: Mapping[MapId, ChanceSupport],
+    chance: Mapping[MapId, FleetChance],
     s: ConsistencySettings,
 ) -> list[Link]:
     """Kept links, with the refused ones that the joined map bears out after all, until there is none.
@@ -151,28 +149,6 @@ def _sorted(
         return group.sorted
     best = sorted(links, key=lambda link: (-link.weight, link.pair))[:MOST_POOLED]
     return sort_links(best, first, second, s)
-
-
-def _chance_support(groups: Mapping[Key, LinkGroup], standing: Sequence[Link]) -> dict[MapId, ChanceSupport]:
-    """Chance support by map: measured on all maps that links connect to it, directly or not."""
-    ties: nx.Graph = nx.Graph(link.maps for link in standing)
-    ties.add_edges_from((group.first.name.map, group.second.name.map) for group in groups.values())
-    out: dict[MapId, ChanceSupport] = {}
-    for island in nx.connected_components(ties):
-        supports = [
-            group.sorted.supports[0]
-            for group in groups.values()
-            if group.first is not group.second and group.first.name.map in island
-        ]
-        out |= dict.fromkeys(island, ChanceSupport.of(supports))
-    return out
-
-
-def _beyond_chance(
-    sorted_links: Sorted, own: Sequence[Sorted], chance: ChanceSupport, s: ConsistencySettings
-) -> Sorted:
-    """What chance does is read off all pieces but the two that are judged."""
-    return sorted_links.beyond_chance(chance.without(ChanceSupport.of(group.supports[0] for group in own)), s)
 
 
 def best_supported(weights: Mapping[Key, float]) -> dict[NodeId, Key]:
@@ -219,7 +195,7 @@ def _ranked(weights: Mapping[Key, float]) -> list[Key]:
 def _borne_out(
     links: Sequence[Link],
     by_node: Mapping[NodeId, Fragment],
-    chance: Mapping[MapId, ChanceSupport],
+    chance: Mapping[MapId, FleetChance],
     s: ConsistencySettings,
 ) -> list[Link]:
     """The links within pieces that these bear out: likely ones to which they can be bent without strain."""
@@ -229,7 +205,7 @@ def _borne_out(
         inside.setdefault(piece.name, (piece.graph, []))[1].append(link)
     out: list[Link] = []
     for graph, inside_links in inside.values():
-        least = max(0.0, LEAST_EVIDENCE - chance[inside_links[0].a.map].log_odds)
+        least = max(0.0, LEAST_EVIDENCE - chance[inside_links[0].a.map].every.log_odds)
         rated = standpoints(inside_links, graph, kept=False)
         out += [
             link
