@@ -37,14 +37,10 @@ CREATE TABLE change (
 ) WITHOUT ROWID;
 CREATE TABLE ack (
     epoch INTEGER NOT NULL, server TEXT NOT NULL, watermark INTEGER NOT NULL, PRIMARY KEY (epoch, server)
-) WITHOUT ROWID
+) WITHOUT ROWID;
+CREATE TABLE mission (id TEXT PRIMARY KEY, body BLOB NOT NULL, crc INTEGER NOT NULL);
+CREATE TABLE checksum (name TEXT PRIMARY KEY, crc INTEGER NOT NULL)
 """
-LATER = """
-CREATE TABLE IF NOT EXISTS mission (id TEXT PRIMARY KEY, body BLOB NOT NULL);
-CREATE TABLE IF NOT EXISTS checksum (name TEXT PRIMARY KEY, crc INTEGER NOT NULL);
-DROP INDEX IF EXISTS change_element
-"""
-"""What journals of before lack, or have and need not."""
 
 READ_AT_ONCE = 256
 ADVICE = (
@@ -87,11 +83,8 @@ def checksum(key: Sequence[object], encoded: bytes) -> int:
 
 
 def key_holds(key: Sequence[object], crc: object) -> bool:
-    """Whether what precedes the body of a row, its number and stamp for example, is what was written.
-
-    In journals of before only bodies have a checksum.
-    """
-    return all(isinstance(one, int) for one in (*key, crc)) and crc >> 32 in (0, _of_key(key))  # type: ignore[operator]
+    """Whether what precedes the body of a row, its number and stamp for example, is what was written."""
+    return isinstance(crc, int) and crc >> 32 == _of_key(key)
 
 
 def body_of(encoded: object, crc: int) -> ChangeBody | None:
@@ -163,8 +156,6 @@ class Journal:
                 rows.execute("INSERT INTO owner VALUES (?)", (agent,))
             elif owner[0] != agent:
                 raise InvalidFile(f"{path}: is the journal of agent {owner[0]}, not of {agent}")
-            for statement in LATER.split(";"):
-                rows.execute(statement)
             if not self._table_holds("map"):
                 raise self._database.damaged("its list of maps")
             if not self._table_holds("ack"):
@@ -391,9 +382,11 @@ class Journal:
     def missions(self) -> list[MissionReport]:
         """Missions that were kept; one that is damaged is left out, and the log says so."""
         reports = []
-        for (kept,) in self._read("SELECT body FROM mission"):
+        for body, crc in self._read("SELECT body, crc FROM mission"):
             try:
-                reports.append(_mission(kept))
+                if not _body_holds(body, crc):
+                    raise InvalidMessage("is not what was written")
+                reports.append(decode(body, MissionReport))
             except InvalidMessage:
                 log.warning("%s: a mission is damaged; it is left out", self._database.path)
         return list(Missions.newest(reports).reports)
@@ -404,10 +397,11 @@ class Journal:
         Raises:
             InvalidFile: the disk does not take it.
         """
+        encoded = [(report, encode(report)) for report in reports]
         with self._lock, self._database.transaction() as rows:
             rows.executemany(
-                "INSERT OR REPLACE INTO mission VALUES (?, ?)",
-                ((report.order.id, _with_check(encode(report))) for report in reports),
+                "INSERT OR REPLACE INTO mission VALUES (?, ?, ?)",
+                ((report.order.id, body, zlib.crc32(body)) for report, body in encoded),
             )
             rows.execute(
                 "DELETE FROM mission WHERE rowid NOT IN "
@@ -445,14 +439,3 @@ class Journal:
             return decode_body(body)
         except InvalidMessage as error:
             raise InvalidFile(f"{self._database.path}: change {sequence}: {error}") from None
-
-
-def _with_check(encoded: bytes) -> bytes:
-    return encoded + zlib.crc32(encoded).to_bytes(4, "little")
-
-
-def _mission(kept: object) -> MissionReport:
-    """What `_with_check` was made of, or without a check as in journals of before; raises InvalidMessage."""
-    if not isinstance(kept, bytes):
-        raise InvalidMessage("a mission is no bytes")
-    return decode(kept[:-4] if _with_check(kept[:-4]) == kept else kept, MissionReport)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import logging
 import sqlite3
-import zlib
 from contextlib import closing
 from pathlib import Path
 from typing import NamedTuple
@@ -197,24 +196,6 @@ def test_a_damaged_mission_is_left_out_with_a_line(
     with caplog.at_level(logging.WARNING), closing(Journal(path, "r0")) as journal:
         assert journal.missions() == []
     assert "a mission is damaged" in caplog.text
-
-
-def test_a_journal_of_before_goes_on(sound: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
-    """Only bodies had a checksum, and there was an index."""
-    path = tmp_path / "r0.sqlite"
-    path.write_bytes(sound)
-    before = contents_of(path)
-    with closing(sqlite3.connect(path)) as disk, disk:
-        rows = disk.execute("SELECT sequence, body FROM change").fetchall()
-        for sequence, body in rows:
-            disk.execute("UPDATE change SET crc = ? WHERE sequence = ?", (zlib.crc32(body), sequence))
-        disk.execute("UPDATE mission SET body = substr(body, 1, length(body) - 4)")
-        disk.execute("DROP TABLE checksum")
-        disk.execute("CREATE INDEX change_element ON change (epoch, element, sequence)")
-    assert contents_of(path) == before and not caplog.text
-    with closing(Journal(path, "r0")) as journal:
-        journal.append(MAP, [NodeRetired(NodeId(*MAP, 1))], 30)
-        assert journal.head(MAP) == len(rows) + 1
 
 
 @pytest.fixture(scope="module")
