@@ -24,7 +24,7 @@ GROUPS = {
     "Maps": (
         "map show", "map diff", "open", "map explain", "map route", "map history", "map link", "map unmerge",
         "map retire", "map undo", "map merge",
-        "map fetch", "map backup", "map export", "map extract", "map from-photos", "relocalize",
+        "map fetch", "map backup", "map export", "map extract", "map import", "map from-photos", "relocalize",
     ),
     "Keys": ("keys init", "keys add", "keys token", "keys list", "keys revoke", "keys bundle"),
     "Recordings": ("info", "replay", "eval replay", "eval relocalize", "eval merge"),

@@ -1,6 +1,7 @@
 """Merging with false links, by every way there is: who keeps the true ones, and how far off the map then is.
 
-    python -m benchmarks.merge [--seed N] [--runs N] [--g2o FILE ...] [--split N] [--json]
+    python -m benchmarks.merge [--seed N] [--runs N] [--g2o FILE ...] [--split N]
+        [--robots FOLDER ...] [--json]
     python -m benchmarks.merge --scale [NODES ...] [--seed N] [--json]
 
 Synthetic fleets of four robots (see `synthetic.fleet`) with 0, 50, 80 and 90 % false links, `--runs`
@@ -15,7 +16,9 @@ alone (GNC), pairwise consistency alone (PCM), the two together, and Mapweave.
 
 Drives through a city of square blocks (see `synthetic.city`), and with `--g2o FILE` the graphs in
 files, are split among `--split` robots and merged: `cost_ratio` is the chi-square of all edges, refused ones
-too, over that of GTSAM's batch optimum; null where the graph ended in pieces.
+too, over that of GTSAM's batch optimum; null where the graph ended in pieces. With `--robots FOLDER`, which
+holds one g2o file of a graph in space for each robot: how many links between robots there are, and which of
+them pairwise consistency keeps, as pairs of keys.
 
 With `--scale` only that is measured: fleets of maps of 100 nodes (see `benchmarks.merge.scale`), and by the
 number of nodes what a new node costs, verification included, and a merge: median and 95th percentile in ms by
@@ -42,6 +45,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from benchmarks.command_line import command_line
+from benchmarks.merge.robots import kept_links
 from benchmarks.merge.scale import scale
 from mapweave.formats.g2o import G2oGraph, read_g2o
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
@@ -69,12 +73,13 @@ def main() -> None:
     try:
         if arguments.runs < 1 or arguments.split < 2:
             raise InvalidValue("--runs is at least 1, --split at least 2")
-        if arguments.scale is not None and arguments.g2o:
-            raise InvalidValue("--scale runs by itself: leave out --g2o")
+        if arguments.scale is not None and (arguments.g2o or arguments.robots):
+            raise InvalidValue("--scale runs by itself: leave out --g2o and --robots")
         if arguments.scale is not None:
             _scale(arguments, console)
             return
         # Unreadable files are reported before the long work.
+        folders = {str(folder): kept_links(folder) for folder in arguments.robots}
         graphs = {path.stem: read_g2o(path) for path in arguments.g2o}
         with Progress(console=console) as progress:
             found = with_false_links(arguments.seed, arguments.runs, FleetSettings(), progress)
@@ -94,12 +99,21 @@ def main() -> None:
         console.print(_table(figure, found))
     for figure in independent[MAPWEAVE]:
         console.print(_table(figure, independent, ", each false link for itself"))
+    for folder, (links, kept) in folders.items():
+        console.print(f"{folder}: {len(kept)} of {len(links)} links between robots are kept")
     if arguments.json:
+        spatial = {
+            "robots": {
+                folder: {"links": len(links), "kept": len(kept), "kept_links": kept}
+                for folder, (links, kept) in folders.items()
+            }
+        }
         out = {
             "seed": arguments.seed,
             "runs": arguments.runs,
             **_with_rivals(found),
             "independent": _with_rivals(independent),
+            **spatial,
         }
         print(json.dumps(out))
 
@@ -194,6 +208,7 @@ def _arguments() -> argparse.Namespace:
         "--g2o", type=Path, nargs="*", default=[], help="planar pose graphs to split and merge"
     )
     parser.add_argument("--split", type=int, default=4, help="robots among which they are split (default 4)")
+    parser.add_argument("--robots", type=Path, nargs="*", default=[], help="folders of one g2o file a robot")
     parser.add_argument(
         "--scale",
         type=int,

@@ -91,6 +91,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "map backup": ("mapweave map backup out/server/s0.sqlite -o backup/monday.sqlite",),
     "map export": ("mapweave map export office.mapweave --format geojson -o office.geojson",),
     "map extract": ("mapweave map extract out/agents/r0.sqlite -o maps/",),
+    "map import": ("mapweave map import graph.g2o -o optimum.g2o",),
     "map from-photos": ("mapweave map from-photos photos/ --spacing 0.5 -o hall.mapweave",),
     "record": ("mapweave record r0 --robot create -o drive/",),
     "replay": ("mapweave replay drive/ --offline", "mapweave replay walk.mp4 --camera camera.toml"),

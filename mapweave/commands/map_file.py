@@ -13,6 +13,7 @@ from mapweave.commands import (
     map_extract,
     map_fetch,
     map_history,
+    map_import,
     map_link,
     map_merge,
     map_photographs,
@@ -37,6 +38,6 @@ def add_to(commands: Any) -> None:
     for action in (
         map_show, map_diff, map_explain, map_route, map_history, map_link, map_unmerge, map_retire, map_undo,
         map_pin, map_portal,
-        map_merge, map_fetch, map_backup, map_export, map_extract, map_photographs,
+        map_merge, map_fetch, map_backup, map_export, map_extract, map_import, map_photographs,
     ):  # fmt: skip
         action.add_to(actions)

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import argparse
 import json
+import sys
 from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, router_of
 from mapweave.commands.network import add_network, add_timeout
 from mapweave.exit_status import DONE, NO
@@ -15,6 +17,7 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.explanation import RouteExplanation
     from mapweave.hybridmap.ids import NodeId
     from mapweave.mapserver.routes import Router
+    from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
 def add_to(actions: Any) -> None:
@@ -41,6 +44,7 @@ def add_to(actions: Any) -> None:
         help="pass this first: a node, a place or a position; may be given again, in the order of the way",
     )
     parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
+    parser.add_argument("--draw", type=values.png, metavar="PNG", help="draw the way on the map")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_timeout(parser)
     add_network(parser)
@@ -51,9 +55,12 @@ def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
     from mapweave.commands.map_ends import node_of, resolved
     from mapweave.explanation_text import route_words
+    from mapweave.extras import need
     from mapweave.hybridmap.explanation import route_over
     from mapweave.mapserver.http.json_values import json_values
 
+    if arguments.draw is not None:
+        need("viz")
     stops = [arguments.start, *arguments.via, arguments.goal]
     words = [*stops, *(word for pair in arguments.blocked for word in pair)]
     router = None if arguments.map is None else router_of(arguments)
@@ -62,8 +69,44 @@ def run(arguments: argparse.Namespace) -> int:
     blocked = tuple(zip(rest[::2], rest[1::2], strict=True))
     legs = [_explained(arguments, router, *ends, blocked) for ends in pairwise(nodes[: len(stops)])]
     explanation = route_over(legs)
-    print(json.dumps(json_values(explanation)) if arguments.json else "\n".join(route_words(explanation)))
+    values, lines = json_values(explanation), route_words(explanation)
+    if arguments.draw is not None and explanation.found:
+        draw_route(arguments, None if router is None else router.merged, explanation)
+        values["picture"] = str(arguments.draw)
+        lines.append(f"  picture   {arguments.draw}")
+    print(json.dumps(values) if arguments.json else "\n".join(lines))
+    if arguments.draw is not None and not explanation.found:
+        print(f"{arguments.draw} is not drawn: there is no way", file=sys.stderr)
     return DONE if explanation.found else NO
+
+
+def draw_route(
+    arguments: argparse.Namespace, merged: MergedMap | None, explanation: RouteExplanation
+) -> None:
+    """Draw a way on the part of the map through which it leads."""
+    import numpy as np
+
+    from mapweave.commands.map_ends import ask
+    from mapweave.drawing.map_picture import Drive, MapPicture, draw_map
+    from mapweave.hybridmap.hybrid_map import HybridMap
+    from mapweave.mapserver.map_files import map_file_of
+    from mapweave.storage.map_file import unpack_map_file
+    from mapweave.wire.keys import Keys
+
+    if merged is None:
+        content = unpack_map_file(ask(arguments, Keys.any_server_map, b"")[0].payload)
+    else:
+        content = map_file_of(merged)
+    part, _ = content.poses[explanation.start]
+    poses = {node: p.mean for node, (number, p) in content.poses.items() if number == part}
+    stops = (explanation.start, *(hop.b for hop in explanation.hops))
+    # Beyond a portal it leads through another part.
+    way = [poses[node] for node in stops if node in poses]
+    places = np.array([[pose.x, pose.y] for pose in way])
+    drive = Drive(places, way[0], way[-1], "the way", begun="start")
+    title = f"{explanation.start} to {explanation.goal}\n{explanation.reason}"
+    edges = list(HybridMap(content.changes).edges.values())
+    draw_map(MapPicture(title, poses, edges, drives=[drive]), arguments.draw)
 
 
 def _explained(

@@ -5,10 +5,13 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import sys
 import time
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, router_of
 from mapweave.commands.network import (
     add_network,
@@ -27,9 +30,12 @@ if TYPE_CHECKING:
     from collections.abc import Callable
 
     from mapweave.hybridmap.floor_plan import PlacedPlan
+    from mapweave.hybridmap.ids import NodeId
+    from mapweave.hybridmap.node import Node
     from mapweave.hybridmap.pose import Pose2
     from mapweave.hybridmap.query import RelocalizeAnswer, View, Whereabouts
     from mapweave.settings import NetworkSettings
+    from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
 
@@ -50,6 +56,10 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--map", type=map_source, metavar="FILE", help=f"answer from {SOURCES}; no server is asked"
     )
+    parser.add_argument(
+        "--draw", type=values.png, metavar="PNG",
+        help="draw the best candidate's landmarks next to the image, joined where they match",
+    )  # fmt: skip
     add_plan_option(parser)
     add_timeout(parser, 5.0)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
@@ -60,6 +70,7 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
     from mapweave.agent.recordings.camera_file import read_camera
+    from mapweave.drawing.match_picture import draw_matches
     from mapweave.hybridmap.query import Certainty
     from mapweave.storage.image_file import read_grey
     from mapweave.vision.lens import Lens
@@ -74,21 +85,33 @@ def run(arguments: argparse.Namespace) -> int:
     camera, distortion = read_camera(camera_file)
     grey = read_grey(arguments.image, camera, str(camera_file))
 
+    lens = Lens(camera, distortion)
     plan = plan_of(arguments)
 
+    @cache
     def view() -> View:
-        return Sift(Lens(camera, distortion)).extract(grey).view(camera)
+        return Sift(lens).extract(grey).view(camera)
 
-    answer = _by_server(arguments, view) if arguments.map is None else _by_map(arguments, view())
+    if arguments.map is None:
+        answer, node = _by_server(arguments, view)
+    else:
+        answer, node = _by_map(arguments, view())
     if arguments.json:
         print(json.dumps(_json(answer, plan)))
     else:
         _print(answer, plan)
+    if arguments.draw is not None and node is not None:
+        best = answer.candidates[0].node_from_robot.mean
+        draw_matches(arguments.draw, grey, lens, node, view(), best)
+    elif arguments.draw is not None:
+        print(f"{arguments.draw} is not drawn: no place was recognised", file=sys.stderr)
     return DONE if answer.certainty is Certainty.FOUND else NO
 
 
-def _by_server(arguments: argparse.Namespace, view: Callable[[], View]) -> RelocalizeAnswer:
-    """The answer of a running server."""
+def _by_server(
+    arguments: argparse.Namespace, view: Callable[[], View]
+) -> tuple[RelocalizeAnswer, Node | None]:
+    """The answer of a running server, and the best candidate's node if it is to be drawn."""
     from mapweave.connection import no_server
     from mapweave.hybridmap.query import RelocalizeAnswer
     from mapweave.wire.messages import decode, encode_view
@@ -99,18 +122,26 @@ def _by_server(arguments: argparse.Namespace, view: Callable[[], View]) -> Reloc
         if not bus.ask(keys.server_statuses(), b"", arguments.timeout):
             raise no_server(network.fleet, key_holder(network))  # said before the work
         payload = _ask(bus, network, keys.any_relocalize(), encode_view(view()), arguments.timeout)
-        return decode(payload, RelocalizeAnswer)
+        answer = decode(payload, RelocalizeAnswer)
+        if arguments.draw is None or not answer.candidates:
+            return answer, None
+        return answer, _node(bus, keys, network, answer.candidates[0].node, arguments.timeout)
     finally:
         bus.close()
 
 
-def _by_map(arguments: argparse.Namespace, view: View) -> RelocalizeAnswer:
-    """The answer of a map."""
+def _by_map(arguments: argparse.Namespace, view: View) -> tuple[RelocalizeAnswer, Node | None]:
+    """The answer of a map, and the best candidate's node."""
     from mapweave.mapserver.places import Places
     from mapweave.offline_relocalization import relocalizer_in
 
     router = router_of(arguments)
-    return Places(router, router.annotations).named(relocalizer_in(router.merged).answer(view))
+    merged = router.merged
+    answer = Places(router, router.annotations).named(relocalizer_in(merged).answer(view))
+    if not answer.candidates:
+        return answer, None
+    best = answer.candidates[0].node
+    return answer, merged.maps[best.map].nodes[best]
 
 
 def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, patience: float) -> bytes:
@@ -131,6 +162,18 @@ def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, pati
         if time.monotonic() + pause > end:
             raise NotConnected(f"the map server is {replies[0].error}")
         time.sleep(pause)
+
+
+def _node(bus: ZenohBus, keys: Keys, network: NetworkSettings, node_id: NodeId, patience: float) -> Node:
+    """A node of the merged map: the beginning of the way from itself to itself."""
+    from mapweave.hybridmap.query import RouteAnswer, RouteRequest
+    from mapweave.wire.messages import decode, encode
+
+    request = encode(RouteRequest(node_id, node_id))
+    way = decode(_ask(bus, network, keys.any_route(), request, patience), RouteAnswer)
+    if not way.legs or way.legs[0].node.id != node_id:
+        raise NotConnected(f"the map server did not give node {node_id}: {way.reason}")
+    return way.legs[0].node
 
 
 def _json(answer: RelocalizeAnswer, plan: PlacedPlan | None) -> dict[str, Any]:

@@ -72,6 +72,7 @@ class Drive:
         goal: where it shall end, if it was sent anywhere.
         label: for the legend.
         robot: its name, written where it was put down.
+        begun: for the legend, what its start is.
     """
 
     positions: Array
@@ -79,6 +80,7 @@ class Drive:
     goal: Pose2 | None
     label: str
     robot: str = ""
+    begun: str = "put down here"
 
 
 @dataclass(frozen=True, eq=False)
@@ -379,7 +381,7 @@ def _draw_drives(axes: Any, drives: Sequence[Drive]) -> None:
     labelled = set()
     for drive in drives:
         axes.plot(*drive.positions.T, "--", color="black", linewidth=1.8, zorder=5, label=drive.label)
-        for pose, mark, label in ((drive.start, "X", "put down here"), (drive.goal, "*", "goal")):
+        for pose, mark, label in ((drive.start, "X", drive.begun), (drive.goal, "*", "goal")):
             if pose is None:
                 continue
             axes.plot(

@@ -1,11 +1,15 @@
 """The merge benchmark: its fleets keep their word, and its scores and split graphs against what is known."""
 
 import math
+from pathlib import Path
 
+import gtsam
 import numpy as np
 import pytest
 
+from benchmarks.merge.robots import kept_links
 from mapweave.formats.g2o import G2oEdge, G2oGraph
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.pose import Pose2
 from mapweave.merge.merging import merge_maps
 from synthetic.fleet import FleetSettings, draw_fleet
@@ -49,3 +53,35 @@ def test_a_split_graph_has_the_cost_of_the_whole() -> None:
         chi2 = chi2_of(factors_of(graph), RIVALS[name](maps, links), nodes)
         assert chi2 == pytest.approx(best, rel=1e-3)
     assert chi2_of(factors_of(graph), merge_maps(maps, []), nodes) is None
+
+
+def test_in_space_the_links_that_close_loops_are_kept(tmp_path: Path) -> None:
+    """Two robots on random ways in space; links that were planted false are left out."""
+    rng = np.random.default_rng(6)
+    poses = {}
+    for first in ("a", "b"):
+        here = gtsam.Pose3.Expmap(rng.normal(0, 1, 6))
+        for k in range(12):
+            poses[gtsam.symbol(first, k)] = here
+            here = here.compose(gtsam.Pose3.Expmap(rng.normal(0, 0.5, 6)))
+    information = " ".join(f"{v}" for v in np.diag([100.0] * 3 + [10000.0] * 3)[np.triu_indices(6)])
+
+    def line(i: int, j: int, off: gtsam.Pose3) -> str:
+        noise = gtsam.Pose3.Expmap(rng.normal(0, [0.01] * 3 + [0.1] * 3))
+        measured = poses[i].inverse().compose(poses[j]).compose(off).compose(noise)
+        q, t = measured.rotation().toQuaternion(), measured.translation()
+        numbers = [*t, q.x(), q.y(), q.z(), q.w()]
+        return f"EDGE_SE3:QUAT {i} {j} {' '.join(f'{v:.9f}' for v in numbers)} {information}"
+
+    keys = sorted(poses)
+    way = [line(i, i + 1, gtsam.Pose3()) for i in keys if i + 1 in poses]
+    true = [(gtsam.symbol("a", k), gtsam.symbol("b", 11 - k)) for k in range(5)]
+    false = [(gtsam.symbol("a", k), gtsam.symbol("b", k)) for k in range(6, 10)]
+    links = [line(i, j, gtsam.Pose3()) for i, j in true]
+    links += [line(i, j, gtsam.Pose3.Expmap(rng.normal(0, 2, 6))) for i, j in false]
+    (tmp_path / "0.g2o").write_text("\n".join(way))
+    (tmp_path / "1.g2o").write_text("\n".join(links))
+    every, kept = kept_links(tmp_path)
+    assert sorted(every) == sorted(true + false) and set(kept) <= set(true) and len(kept) >= 4
+    with pytest.raises(InvalidFile, match="no g2o file"):
+        kept_links(tmp_path / "nowhere")

@@ -30,12 +30,19 @@ WRONG = [
     ("flood", "--seconds nan", "--seconds and --rate must be positive"),
     ("flood", "--rate 0", "--seconds and --rate must be positive"),
     ("fuzz", "--seconds 0", "seconds above 0"),
+    ("mapping_run", "--out {file}", "name a folder that can be written"),
+    ("mapping_run", "--out {file}/below", "name a folder that can be written"),
+    ("mapping_run", "--steps 3", "at least 30"),
     ("navigate", "--runs 0", "navigate: --runs 0"),
     ("parking", "--starts 0", "at least 1"),
     ("parking", "--out {file}/x", "can be made"),
     ("servo", "--trials 0", "--trials"),
     ("servo", "--jobs 0", "--jobs"),
     ("relocalize", "--nodes 300", "at least 1000 nodes and 4 queries"),
+    ("sim", "--robots 0", "--robots"),
+    ("sim", "--robots 3 17", "--robots"),
+    ("sim", "--seconds 0", "--seconds"),
+    ("sim", "--seconds nan", "--seconds"),
     ("trust", "--lying 0", "trust: a seed of 0 or more"),
 ]
 
@@ -72,4 +79,4 @@ def test_python_starts_it_by_the_name_of_its_folder(name: str) -> None:
 
 
 def test_the_benchmarks_are_found() -> None:
-    assert {"parking", "navigate", "servo", "ekf", "relocalize", "merge"} <= set(SEEDED)
+    assert {"parking", "navigate", "servo", "ekf", "relocalize", "merge", "sim"} <= set(SEEDED)

@@ -50,7 +50,7 @@ def test_endless_input_is_not_read(tmp_path, capfd, pipe):
         os.mkfifo(path)
     for command in (
         ("map", "show", path), ("map", "export", path, "--format", "tum", "-o", tmp_path / "x"),
-        ("map", "merge", path, "-o", tmp_path / "x"),
+        ("map", "merge", path, "-o", tmp_path / "x"), ("map", "import", path, "-o", tmp_path / "x"),
         ("server", "--settings", path),
     ):  # fmt: skip
         assert "not a regular file" in complaint(capfd, *command)

@@ -156,7 +156,7 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (NO, "r0.1.1 r9.1.1 --map {map}"), (FAILED, "--connect {at}"),
     ],
     "map route": [
-        (USAGE, "r0.1.1"), (NO, "r0.1.1 r9.1.1 --map {map}"),
+        (USAGE, "r0.1.1"), (USAGE, "r0.1.1 r0.1.3 --draw x.gif"), (NO, "r0.1.1 r9.1.1 --map {map}"),
         (FAILED, "r0.1.1 r0.1.3 --connect {at}"),
     ],
     "map history": [(USAGE, "--most 0 --map {map}"), (FAILED, "--connect {at}")],
@@ -200,6 +200,7 @@ CASES: dict[str, list[tuple[int, str]]] = {
         (NO, "{planned} --format g2o -o {out} --plan office --component 7"),
         (FAILED, "{tmp}/none --format g2o -o {out}"),
     ],
+    "map import": [(USAGE, "{tmp}/in.g2o -o {tmp}/x.mapweave"), (FAILED, "{tmp}/none.g2o -o {tmp}/x.g2o")],
     "open": [(USAGE, "{map} --http x"), (FAILED, "{tmp}/none.mapweave")],
     "record": [
         (USAGE, "R0 -o {tmp}/drive"), (USAGE, "r0 --robot nosuch -o {tmp}/drive --connect {at}"),
@@ -211,7 +212,7 @@ CASES: dict[str, list[tuple[int, str]]] = {
     ],
     "info": [(USAGE, ""), (FAILED, "{tmp}/none")],
     "relocalize": [
-        (USAGE, "{images}/0.png --timeout 0"), (USAGE, "{map}"),
+        (USAGE, "{images}/0.png --timeout 0"), (USAGE, "{map}"), (USAGE, "{images}/0.png --draw x.gif"),
         (NO, "{images}/0.png --map {map}"), (FAILED, "{tmp}/none.png"),
         (FAILED, "{images}/0.png --connect {at}"),
     ],

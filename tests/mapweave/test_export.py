@@ -21,8 +21,9 @@ from mapweave.cli import main
 from mapweave.exit_status import NO
 from mapweave.formats.export import FORMATS
 from mapweave.formats.g2o import G2oEdge, G2oGraph, read_g2o, write_g2o
+from mapweave.formats.g2o_optimum import optimum_of
 from mapweave.formats.map_part import MapPart
-from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2
@@ -200,17 +201,55 @@ def test_g2o_comes_back_to_the_last_bit(
         assert np.array_equal(first.information, second.information)
 
 
-def square() -> G2oGraph:
-    """A loop of four by two sides."""
+def square(noise: float, seed: int) -> G2oGraph:
+    """A loop of four by two sides, with measurements that are off."""
+    rng = np.random.default_rng(seed)
     true = [Pose2(x, y, h) for x, y, h in ((0, 0, 0), (2, 0, 1.57), (2, 2, 3.14), (0, 2, -1.57))]
-    ends = ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2))
-    measured = [G2oEdge.measured(i, j, true[i].inverse() @ true[j], np.eye(3)) for i, j in ends]
-    return G2oGraph(dict(enumerate(true)), measured)
+    covariance = np.diag([0.1, 0.1, 0.02]) ** 2
+    measured = [
+        G2oEdge.measured(
+            i, j, true[i].inverse() @ true[j] @ Pose2(*(noise * rng.normal(0, [0.1, 0.1, 0.02]))), covariance
+        )
+        for i, j in ((0, 1), (1, 2), (2, 3), (3, 0), (0, 2))
+    ]
+    return G2oGraph({k: pose @ Pose2(0.1 * k, 0, 0.05 * k) for k, pose in enumerate(true)}, measured)
+
+
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_back_end_finds_gtsam_s_optimum_of_others_graphs(
+    seed: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    graph = square(1.0, seed)
+    write_g2o(tmp_path / "in.g2o", graph)
+    factors, values = gtsam.readG2o(str(tmp_path / "in.g2o"), False)
+    factors.add(gtsam.PriorFactorPose2(0, values.atPose2(0), gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)))
+    best = 2.0 * factors.error(gtsam.GaussNewtonOptimizer(factors, values).optimize())
+    wrong = tmp_path / "out.mapweave"
+    assert main(["map", "import", str(tmp_path / "in.g2o"), "-o", str(wrong)]) == 2
+    assert "what is written is a pose graph, no map" in capfd.readouterr().err and not wrong.exists()
+    arguments = ["map", "import", str(tmp_path / "in.g2o"), "-o", str(tmp_path / "out.g2o"), "--json"]
+    assert main(arguments) == 0
+    result = json.loads(capfd.readouterr().out)
+    assert result["chi2"] == pytest.approx(best, rel=1e-5) and result["chi2_before"] > 2 * result["chi2"]
+    assert read_g2o(tmp_path / "out.g2o").chi2() == pytest.approx(result["chi2"])
+
+
+def test_a_graph_whose_numbers_are_too_large_is_refused_in_one_line(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    path = tmp_path / "in.g2o"
+    edge = "EDGE_SE2 0 1 1 0 0 1e308 0 0 1 0 1\n"
+    path.write_text(f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1e308 0 0\n{edge}")
+    assert main(["map", "import", str(path), "-o", str(tmp_path / "out.g2o")]) == 1
+    words = "its numbers are too large to be added up: give metres and radians"
+    assert capfd.readouterr().err == f"mapweave: {path}: {words}\n"
+    assert not (tmp_path / "out.g2o").exists()
 
 
 def test_vertices_without_a_line_are_placed_along_edges(tmp_path: Path) -> None:
+    graph = square(0.0, 0)
     path = tmp_path / "edges.g2o"
-    write_g2o(path, square())
+    write_g2o(path, graph)
     path.write_text("\n".join(line for line in path.read_text().splitlines() if line.startswith("EDGE")))
     back = read_g2o(path)
     assert len(back.poses) == 4 and back.chi2() == pytest.approx(0.0, abs=1e-12)
@@ -240,3 +279,8 @@ def test_non_planar_graphs_are_reported_with_the_line(text: str, words: str, tmp
     path.write_text(text)
     with pytest.raises(InvalidFile, match=words):
         read_g2o(path)
+
+
+def test_pieces_are_not_optimised_as_one() -> None:
+    with pytest.raises(InvalidValue, match="in 2 pieces"):
+        optimum_of(G2oGraph({0: Pose2(), 1: Pose2()}, []))

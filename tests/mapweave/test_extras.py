@@ -104,6 +104,7 @@ CASES: list[tuple[str, str, str]] = [
     ("map explain", "{link} --map {merged} --draw {tmp}/link.png", VIZ),
     ("map route", "r0.1.1 r0.1.3 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map route", "r0.1.1 r0.1.3 --map {merged}", SERVER),
+    ("map route", "r0.1.1 r0.1.3 --map {merged} --draw {tmp}/way.png", VIZ),
     ("map history", "--connect {closed} --timeout 0.1", WITHOUT_SERVER),
     ("map history", "--map {merged}", "no joins"),
     ("map unmerge", "r0.1 r1.1 --connect {closed} --timeout 0.1", WITHOUT_SERVER),
@@ -128,6 +129,7 @@ CASES: list[tuple[str, str, str]] = [
     ("map extract", "{tmp}/none.sqlite -o {tmp}/maps", "no such file"),
     ("map from-photos", "{recording} --spacing 0.5 -o {tmp}/photos.mapweave", SERVER),
     ("map export", "{merged} --format g2o -o {tmp}/out.g2o", SERVER),
+    ("map import", "{tmp}/out.g2o -o {tmp}/optimum.g2o", SERVER),
 ]
 
 

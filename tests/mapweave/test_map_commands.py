@@ -122,18 +122,28 @@ def test_a_link_is_explained_and_drawn(files: list[Path], said: Said, tmp_path: 
     assert np.shape(values["a_from_b"]["covariance"]) == (3, 3)
 
 
-def test_a_route_is_explained(files: list[Path], said: Said, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_route_is_explained(
+    files: list[Path], said: Said, capfd: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
     start, goal = links(files[3])[0]
     values = json.loads(said("map", "route", start, goal, "--json", "--map", files[3]))
     assert values["found"] and values["hops"][0]["a"] == str(start) and values["hops"][-1]["b"] == str(goal)
     out = said("map", "route", start, goal, "--map", files[3])
     assert out.startswith(f"{start} to {goal}: the route is: {values['reason']}")
     assert len(out.splitlines()) == 1 + len(values["hops"])
+    drawn = tmp_path / "pictures" / "way.png"
+    out = said("map", "route", start, goal, "--map", files[3], "--draw", drawn)
+    assert out.endswith(f"picture   {drawn}\n")
+    image = cv2.imread(str(drawn))
+    # Start and goal are gold, and nothing else is.
+    assert image is not None and (np.abs(image.astype(int) - [0, 215, 255]).max(axis=2) < 8).sum() > 100
     barred = [word for one in links(files[3]) for word in ("--blocked", *map(str, one))]
     others = json.loads(said("map", "route", start, goal, *barred, "--json", "--map", files[3]))
     assert others["gaps"] and "reported as blocked" in others["gaps"][0]["words"]
-    assert main(["map", "route", "r0.1.1", "r2.1.1", "--map", str(files[3])]) == NO
-    out = capfd.readouterr().out
+    none = tmp_path / "none.png"
+    assert main(["map", "route", "r0.1.1", "r2.1.1", "--map", str(files[3]), "--draw", str(none)]) == NO
+    out, err = capfd.readouterr()
+    assert f"{none} is not drawn: there is no way" in err and not none.exists()
     assert "there is no way: " in out and "r0.1 and r2.1 are not one map" in out
     assert main(["map", "route", "r0.1", "r2.1.1", "--map", str(files[3])]) == USAGE
     assert "r0.1 is a map: give one of its nodes" in capfd.readouterr().err
@@ -391,6 +401,8 @@ def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Sa
         ways = [
             json.loads(said("map", "route", *pair, "--json", *where)) for where in (("--map", files[3]), at)
         ]
+        said("map", "route", *pair, "--draw", tmp_path / "way.png", *at)
+        assert (tmp_path / "way.png").stat().st_size > 10_000
         assert ways[0]["found"] and [hop["b"] for hop in ways[0]["hops"]] == [h["b"] for h in ways[1]["hops"]]
         out = said("map", "unmerge", "r0.1", "r1.1", "--because", "two kitchens", "--by", "anna", *at)
         assert "r0.1 and r1.1 are not one map: undone with all links" in out

@@ -1,4 +1,4 @@
-"""`mapweave relocalize`, against a map server over Zenoh in this process."""
+"""`mapweave relocalize` and its picture, against a map server over Zenoh in this process."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ import skimage.data
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
+from mapweave.drawing.match_picture import AGREES_PX, GREEN, Overlay, draw_matches
 from mapweave.exit_status import NO
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
@@ -98,12 +99,17 @@ def photo(tmp_path: Path) -> Path:
     return tmp_path / "moved.png"
 
 
-def test_a_photograph_is_found(served: str, photo: Path, capfd) -> None:
-    assert main(["relocalize", str(photo), "--connect", served, "--json"]) == 0
+def test_a_photograph_is_found_and_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:
+    drawn = tmp_path / "matches.png"
+    assert main(["relocalize", str(photo), "--connect", served, "--json", "--draw", str(drawn)]) == 0
     answer = json.loads(capfd.readouterr().out)
     assert answer["certainty"] == "found"
     (place,) = answer["candidates"]
     assert place["node_from_robot"]["mean"] == pytest.approx([MOVED.x, MOVED.y, MOVED.heading], abs=0.03)
+    image = cv2.imread(str(drawn))
+    assert image.shape[1] > 2 * 320
+    # Lines are smoothed.
+    assert (np.abs(image.astype(int) - GREEN) < 40).all(axis=2).sum() > 1000
     # As people read it.
     assert main(["relocalize", str(photo), "--connect", served]) == 0
     result = re.search(r"node r0\.1\.1: (\S+) m ahead", capfd.readouterr().out)
@@ -111,7 +117,7 @@ def test_a_photograph_is_found(served: str, photo: Path, capfd) -> None:
 
 
 def test_a_map_file_answers_without_a_server(node: Node, photo: Path, tmp_path: Path, capfd) -> None:
-    path = tmp_path / "place.mapweave"
+    path, drawn = tmp_path / "place.mapweave", tmp_path / "matches.png"
     write_map_file(path, MapFile("agent", "r0.1", (NodePut(node),)))
     journal = Journal(tmp_path / "r0.sqlite", "r0")
     journal.append(journal.open_map(1), [NodePut(node)], 0)
@@ -119,11 +125,13 @@ def test_a_map_file_answers_without_a_server(node: Node, photo: Path, tmp_path: 
     before = path.read_bytes()
     answers = []
     for name in ("place.mapweave", "r0.sqlite"):
-        assert main(["relocalize", str(photo), "--map", str(tmp_path / name), "--json"]) == 0
+        arguments = ["--map", str(tmp_path / name), "--json", "--draw", str(drawn)]
+        assert main(["relocalize", str(photo), *arguments]) == 0
         answers.append(json.loads(capfd.readouterr().out))
     assert answers[0] == answers[1]
     (place,) = answers[0]["candidates"]
     assert place["node_from_robot"]["mean"] == pytest.approx([MOVED.x, MOVED.y, MOVED.heading], abs=0.03)
+    assert (np.abs(cv2.imread(str(drawn)).astype(int) - GREEN) < 40).all(axis=2).sum() > 1000
     assert path.read_bytes() == before
     cv2.imwrite(str(photo), np.full((240, 320), 90, np.uint8))
     assert main(["relocalize", str(photo), "--map", str(path)]) == NO
@@ -131,10 +139,16 @@ def test_a_map_file_answers_without_a_server(node: Node, photo: Path, tmp_path: 
     assert "is neither a map file" in capfd.readouterr().err
 
 
-def test_an_image_of_nothing_is_unknown(served: str, photo: Path, capfd) -> None:
+def test_unknown_values_are_not_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:
     cv2.imwrite(str(photo), np.full((240, 320), 90, np.uint8))
-    assert main(["relocalize", str(photo), "--connect", served]) == NO
-    assert capfd.readouterr().out.startswith("unknown: ")
+    drawn = tmp_path / "matches.png"
+    assert main(["relocalize", str(photo), "--connect", served, "--draw", str(drawn)]) == NO
+    output = capfd.readouterr()
+    assert output.out.startswith("unknown: ")
+    assert output.err == f"{drawn} is not drawn: no place was recognised\n"
+    assert not drawn.exists()
+    assert main(["relocalize", str(photo), "--connect", served, "--draw", str(tmp_path / "a.jpg")]) == 2
+    assert "end its name with .png" in capfd.readouterr().err
 
 
 def test_a_busy_server_is_asked_again(served: str, photo: Path, capfd, monkeypatch) -> None:
@@ -152,3 +166,30 @@ def test_a_busy_server_is_asked_again(served: str, photo: Path, capfd, monkeypat
     monkeypatch.setattr(Services, "locate", lambda *_: (_ for _ in ()).throw(Busy(60.0)))
     assert main(["relocalize", str(photo), "--connect", served]) == 1
     assert "the map server is busy, retry after 60.0 s" in capfd.readouterr().err
+
+
+def test_matches_that_agree_are_explained_by_the_pose(node: Node) -> None:
+    """By hand, match by match; a pose that is wrong explains next to nothing."""
+    view = view_of(picture(MOVED))
+    overlay = Overlay.of(node, view, MOVED)
+    assert overlay.agreeing.sum() > 20
+    for (a, b), agrees in zip(overlay.pairs, overlay.agreeing, strict=True):
+        x, y, z = node.points_in_robot[a]
+        there = MOVED.inverse().apply(np.array([[x, y, z]]))[0]
+        u = CAMERA.cx - CAMERA.fx * there[1] / there[0]
+        v = CAMERA.cy - CAMERA.fy * (there[2] - 0.3) / there[0]
+        assert agrees == (np.hypot(*(view.pixels[b] - (u, v))) <= AGREES_PX)
+    wrong = Overlay.of(node, view, Pose2(-1.0, 0.8, -0.3))
+    assert wrong.agreeing.sum() < 0.1 * len(wrong.pairs)
+
+
+def test_wide_images_are_stacked(node: Node, tmp_path: Path) -> None:
+    view = view_of(picture(MOVED))
+    wide = Camera(640, 240, 277.0, 277.0, 319.5, 119.5, mount_height=0.3)
+    moved = View(view.pixels + np.array([160, 0], np.float32), view.codes, wide)
+    image = np.full((240, 640), 90, np.uint8)
+    broad = Node(node.id, 0, node.map_from_robot, wide, node.landmarks)
+    draw_matches(tmp_path / "wide.png", image, Lens(wide), broad, moved, MOVED)
+    drawn = cv2.imread(str(tmp_path / "wide.png"))
+    assert drawn.shape[1] == 2 * 640
+    assert drawn.shape[0] > 4 * 240
