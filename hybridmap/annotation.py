@@ -184,7 +184,8 @@ class Annotation:
     """One entry of the record.
 
     Attributes:
-        name: for the same kind and name the last entry holds.
+        name: for the same kind and name the last entry holds. Keyboards write a letter with an accent as one
+            character or as two; here it is one.
         body: what is said.
         removed: whether it is withdrawn.
         who: has said so.
@@ -201,6 +202,7 @@ class Annotation:
 
     def __post_init__(self) -> None:
         """Refuse what is no printable line, and a place called like a node or a position (InvalidValue)."""
+        object.__setattr__(self, "name", normalize("NFC", self.name))
         if not 1 <= len(self.name) <= MAX_NAME or not self.name.isprintable():
             raise InvalidValue(f"a name has 1 to {MAX_NAME} printable characters")
         if isinstance(self.body, Place):
@@ -243,18 +245,8 @@ class Annotations:
 
     def last(self, kind: str, name: str) -> Annotation | None:
         """The entry that holds; None if there is none, or it is withdrawn."""
-        entry = self._last.get((kind, self.spelled(kind, name)))
+        entry = self._last.get((kind, normalize("NFC", name)))
         return None if entry is None or entry.removed else entry
-
-    def spelled(self, kind: str, name: str) -> str:
-        """A name as the record has it, or as it is to be kept.
-
-        Keyboards and systems write a letter with an accent as one character or as two: that is one name.
-        """
-        if (kind, name) in self._last:
-            return name
-        composed = normalize("NFC", name)
-        return self._composed.get((kind, composed), composed)
 
     def in_force(self, body: type[AnyBody]) -> tuple[tuple[Annotation, AnyBody], ...]:
         """Entries of one kind that hold, with their bodies, in the order of their names."""
@@ -278,11 +270,6 @@ class Annotations:
     @cached_property
     def _last(self) -> dict[tuple[str, str], Annotation]:
         return {(entry.kind, entry.name): entry for entry in self.made}
-
-    @cached_property
-    def _composed(self) -> dict[tuple[str, str], str]:
-        """Names as they are in the record, by their composed form."""
-        return {(kind, normalize("NFC", name)): name for kind, name in self._last}
 
 
 def check_place_name(name: str) -> None:

@@ -142,8 +142,6 @@ class Annotator:
         """
         with self._turn:
             places, annotations = self._places(), self._record.annotations
-            name = annotations.spelled(annotation.kind, annotation.name)
-            annotation = replace(annotation, name=name)
             check_annotation(places.merged, annotations, annotation, self._constraints())
             check_edge(places.router, annotations, annotation)
             self._check_end(annotation)

@@ -121,8 +121,6 @@ class OfflineAnnotations:
             annotation = annotation_of_words(
                 name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
             )
-            name = self.annotations().spelled(annotation.kind, annotation.name)
-            annotation = replace(annotation, name=name)
             constraints = ManualConstraints(self._opened.content.constraints)
             check_annotation(self._router.merged, self.annotations(), annotation, constraints)
             check_edge(self._router, self.annotations(), annotation)

@@ -82,7 +82,6 @@ def insert(rows: sqlite3.Connection, table: str, values: Sequence[object]) -> No
 
 def repair(connection: sqlite3.Connection) -> None:
     """Take damaged rows out of all tables, and note which changes are to be pulled again."""
-    _complete(connection)
     bad = {table: _count_bad(connection, table) for table in TABLES}
     if not any(bad.values()):
         return
@@ -112,13 +111,6 @@ def good_rows(connection: sqlite3.Connection, table: str) -> Iterator[tuple[Any,
     # Without an order and a condition, which would trust keys that may be damaged.
     for *values, crc in connection.execute(f"SELECT * FROM {table}"):
         yield tuple(values) if checksum(values) == crc else None
-
-
-def _complete(connection: sqlite3.Connection) -> None:
-    """Make the tables that a store of an earlier program lacks."""
-    there = {name for (name,) in connection.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
-    for table in TABLES.keys() - there:
-        connection.execute(TABLES[table])
 
 
 def _count_bad(connection: sqlite3.Connection, table: str) -> int:

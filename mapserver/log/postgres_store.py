@@ -159,9 +159,6 @@ class PostgresStore(SqlStore):
                 self._put("result", (ID, fresh_id().to_bytes(8, "big")))
             else:
                 self._check_version(self._writer.connection)
-                # A store of an earlier program lacks some.
-                for table in KEYS.keys() - there.keys():
-                    self._writer.connection.execute(_table(table))
 
     def _check_version(self, connection: psycopg.Connection) -> None:
         version, there = _version(connection), _tables(connection)

@@ -110,11 +110,9 @@ def _read(connection: sqlite3.Connection, path: Path) -> Salvage:
 
 
 def _good(connection: sqlite3.Connection, table: str) -> tuple[list[list[Any]], bool]:
-    """Undamaged rows of a table, and whether all could be read; none of one that an older program lacked."""
+    """Undamaged rows of a table, and whether all could be read."""
     rows: list[list[Any]] = []
     try:
-        if not connection.execute("SELECT 1 FROM sqlite_master WHERE name = ?", (table,)).fetchone():
-            return rows, True
         for *values, crc in connection.execute(f"SELECT * FROM {table} ORDER BY 1"):
             if checksum(values) == crc:
                 rows.append(values)

@@ -157,18 +157,6 @@ def test_both_stores_give_the_same_for_the_same(
     )
 
 
-def test_a_store_of_an_earlier_program_gets_the_tables_that_it_lacks(postgres: PostgresServer) -> None:
-    address = postgres.database()
-    store = open_store(address)
-    store.apply(MAP, 5, [entry(1)])
-    store.close()
-    with psycopg.connect(address) as connection:
-        connection.execute("DROP TABLE mapweave.unverified")
-    store = open_store(address)
-    assert store.watermark(MAP) == 1 and store.unverified(MAP) is None
-    store.close()
-
-
 def test_two_servers_share_a_store(postgres: PostgresServer) -> None:
     address = postgres.database()
     one, other = PostgresStore(address, "s0"), PostgresStore(address, "s1")
