@@ -78,15 +78,27 @@ class Ways:
         factors: Mapping[frozenset[NodeId], float] | None = None,
         portals: Mapping[EdgeId, tuple[NodeId, NodeId]] | None = None,
     ) -> None:
-        """Take a map; the arguments are those of `find_route`.
+        """Take a map.
 
-        Portals join nodes, also of different frames: distances say nothing of the ways through them, so that
-        with portals A* is Dijkstra's search.
+        An edge costs the Euclidean distance of its two nodes, as in the paper, by `poses`; the heuristic is
+        the distance to the goal by the same poses, so it is admissible and consistent by the triangle
+        inequality, with any additional cost. Where no poses are given, each node's own pose in its map is
+        used; between nodes of two maps, whose frames have nothing in common, the heuristic is then zero and a
+        link costs the distance that it measured.
 
-        With factors, by pairs of nodes, edges cost so many times as much; they are positive.
-
-        With a toll the search also passes pairs that are blocked or cannot be driven; each costs the toll in
-        addition, m. The cheapest way then shows what is in the way.
+        Args:
+            hybrid_map: nodes and edges; edges to nodes that are not there lead nowhere.
+            poses: all in one frame; nodes without one cannot be on the way.
+            penalties: extra cost of edges, m; not negative, negative ones count as none.
+            blocked: pairs of nodes, in either order, between which the robot cannot drive.
+            closed: edges that cannot be driven: they only give relative poses, see
+                mapweave.hybridmap.reachability.
+            settings: what a way costs.
+            toll: then the search also passes pairs that are blocked or cannot be driven; each costs so much
+                in addition, m. The cheapest way shows what is in the way.
+            factors: by pairs of nodes, how many times as much edges cost; positive.
+            portals: join nodes, also of different frames: distances say nothing of the ways through them, so
+                that with portals A* is Dijkstra's search.
         """
         s = settings or RouteSettings()
         self._map = hybrid_map
@@ -121,7 +133,7 @@ class Ways:
         self._comparable = one_frame and not portals
 
     def find(self, start: NodeId, goal: NodeId) -> Route:
-        """The cheapest way; see `find_route`."""
+        """The cheapest way; one node and no edge if start is goal."""
         for name, node_id in (("start", start), ("goal", goal)):
             if node_id not in self._map.nodes:
                 return Route((), (), 0.0, f"{name} {node_id} is not in the map")
@@ -231,45 +243,6 @@ def joined(
                 yield b if node == a else a
 
     return goal in reached(start, neighbours)
-
-
-def find_route(
-    hybrid_map: HybridMap,
-    start: NodeId,
-    goal: NodeId,
-    *,
-    poses: Mapping[NodeId, Pose2] | None = None,
-    penalties: Mapping[EdgeId, float] | None = None,
-    blocked: Collection[tuple[NodeId, NodeId]] = (),
-    closed: Collection[EdgeId] = (),
-    settings: RouteSettings | None = None,
-) -> Route:
-    """Find the cheapest way from node to node.
-
-    An edge costs the Euclidean distance of its two nodes, as in the paper, by `poses`; the heuristic is
-    the distance to the goal by the same poses, so it is admissible and consistent by the triangle
-    inequality, with any additional cost. Where no poses are given, each node's own pose in its map is used;
-    between nodes of two maps, whose frames have nothing in common, the heuristic is then zero and a link
-    costs the distance that it measured.
-
-    Args:
-        hybrid_map: nodes and edges; edges to nodes that are not there lead nowhere.
-        start: where the robot is.
-        goal: where it shall be.
-        poses: all in one frame; nodes without one cannot be on the way.
-        penalties: extra cost of edges, m; not negative, negative ones count as none.
-        blocked: pairs of nodes, in either order, between which the robot cannot drive.
-        closed: edges that cannot be driven: they only give relative poses, see
-            mapweave.hybridmap.reachability.
-        settings: what a way costs.
-
-    Returns:
-        The way; one node and no edge if start is goal.
-    """
-    ways = Ways(
-        hybrid_map, poses=poses, penalties=penalties, blocked=blocked, closed=closed, settings=settings
-    )
-    return ways.find(start, goal)
 
 
 def edge_cost(edge: Edge, places: Mapping[NodeId, Pose2], one_frame: bool, settings: RouteSettings) -> float:

@@ -83,30 +83,23 @@ def stack_sightings(parts: Sequence[Sightings]) -> Stack:
     )
 
 
-def improve(stack: Stack, pose: Pose2, prior: PoseGaussian | None, rounds: int) -> tuple[Pose2, Array] | None:
+def improve(stack: Stack, pose: Pose2, rounds: int) -> tuple[Pose2, Array] | None:
     """Bring a pose to its best.
 
     Args:
         stack: the sightings.
         pose: where to start.
-        prior: what else is known of the pose.
         rounds: of Gauss-Newton at most.
 
     Returns:
         The pose and the points (N, 3) m at their best for it; None if the inliers do not determine a
         pose.
     """
-    sure, pose_vector, points = projection.improve(stack, pose.vector, *_mean_and_information(prior), rounds)
+    sure, pose_vector, points = projection.improve(stack, pose.vector, rounds)
     return (Pose2.from_vector(pose_vector), points) if sure else None
 
 
-def refine(
-    stack: Stack,
-    pose: Pose2,
-    scale_sigma: float,
-    prior: PoseGaussian | None,
-    shift_sigma: float = 0.0,
-) -> PlanarFix | None:
+def refine(stack: Stack, pose: Pose2, scale_sigma: float, shift_sigma: float = 0.0) -> PlanarFix | None:
     """Refine a pose and compute its covariance.
 
     The covariance is the inverse information, larger where the residuals are larger than they should be,
@@ -117,18 +110,17 @@ def refine(
         stack: the sightings.
         pose: where to start.
         scale_sigma: share by which all points, or all measured depths, may be wrong together.
-        prior: what else is known of the pose.
         shift_sigma: px by which all pixels may be off together, to either side.
 
     Returns:
         The pose, or None if the inliers do not determine one.
     """
-    improved = improve(stack, pose, prior, GAUSS_NEWTON_STEPS)
+    improved = improve(stack, pose, GAUSS_NEWTON_STEPS)
     if improved is None:
         return None
     pose, moved = improved
     linear = linearise(stack, pose.vector, moved)
-    information = normal_equations(linear)[1:, 1:] + _mean_and_information(prior)[1]
+    information = normal_equations(linear)[1:, 1:].copy()
     inliers = linear.inliers
     if not inliers.any() or not determined(information):
         return None
@@ -175,11 +167,3 @@ def _gradient(linear: Linear, residuals: Array) -> Array:
     white[:, 2] = (residuals[:, 2] - f20 * white[:, 0] - f21 * white[:, 1]) / f22
     white *= linear.weights[:, None]
     return np.asarray(white.ravel() @ linear.white[:, :, 1:].reshape(-1, 3), np.float64)
-
-
-def _mean_and_information(prior: PoseGaussian | None) -> tuple[Array, Array]:
-    """(3,) mean and (3, 3) information of what else is known; no information without a prior."""
-    if prior is None:
-        return np.zeros(3), np.zeros((3, 3))
-    information = np.linalg.inv(prior.covariance + 1e-12 * np.eye(3)).astype(np.float64, copy=False)
-    return prior.mean.vector, information

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.registration.gauss_newton import GAUSS_NEWTON_STEPS, PlanarFix, improve, refine, stack_sightings
 from mapweave.registration.minimal_poses import hypotheses
 from mapweave.registration.planar_ambiguity import mirrored
@@ -50,7 +50,6 @@ def solve_planar_pose(
     rng: np.random.Generator,
     point_covariances: NDArray[Any] | None = None,
     settings: PlanarPoseSettings | None = None,
-    prior: PoseGaussian | None = None,
 ) -> PlanarFix | None:
     """Estimate the robot's pose from matches of which some may be wrong.
 
@@ -61,7 +60,6 @@ def solve_planar_pose(
         rng: for the hypotheses.
         point_covariances: (N, 3, 3) m^2; exact points without.
         settings: how.
-        prior: what is known of the pose already; counts as a measurement.
 
     Returns:
         The pose, or None if the sightings do not determine one.
@@ -80,7 +78,7 @@ def solve_planar_pose(
         covariances=point_covariances,
         pixel_sigma=s.pixel_sigma,
     )
-    solved = solve_sightings([sightings], rng=rng, settings=s, prior=prior)
+    solved = solve_sightings([sightings], rng=rng, settings=s)
     if solved is None:
         return None
     inliers = np.zeros(len(points), dtype=bool)
@@ -99,7 +97,6 @@ def solve_sightings(
     *,
     rng: np.random.Generator,
     settings: PlanarPoseSettings,
-    prior: PoseGaussian | None = None,
 ) -> PlanarFix | None:
     """The same for sightings in either direction; `inliers` is over the concatenated parts."""
     parts = [part for part in parts if len(part)]
@@ -108,8 +105,6 @@ def solve_sightings(
         return None
     counts = [-(-HYPOTHESES * len(part) // total) for part in parts]
     poses = np.concatenate([hypotheses(part, n, rng) for part, n in zip(parts, counts, strict=True)])
-    if prior is not None:
-        poses = np.concatenate([prior.mean.vector[None], poses])
     if len(poses) == 0:
         return None
     stack = stack_sightings(parts)
@@ -118,15 +113,15 @@ def solve_sightings(
         few = [part.take(slice(None, None, total // PREVIEW)) for part in parts]
         poses = poses[np.argsort(-_scores(few, poses), kind="stable")[: max(len(poses) // 5, 10)]]
     finalists = np.argsort(-_scores(parts, poses), kind="stable")[:FINALISTS]
-    improved = [improve(stack, Pose2.from_vector(poses[k]), prior, rounds=2) for k in finalists]
+    improved = [improve(stack, Pose2.from_vector(poses[k]), rounds=2) for k in finalists]
     kept = [candidate[0] for candidate in improved if candidate is not None]
     if not kept:
         return None
     best = kept[int(_scores(parts, np.stack([pose.vector for pose in kept])).argmax())]
-    fix = refine(stack, best, settings.scale_sigma, prior)
+    fix = refine(stack, best, settings.scale_sigma)
     if fix is None or int(fix.inliers.sum()) < settings.least_inliers:
         return None
-    return _weighed(fix, parts, stack, settings, prior)
+    return _weighed(fix, parts, stack, settings)
 
 
 APART = 0.3
@@ -138,20 +133,19 @@ def _weighed(
     parts: Sequence[Sightings],
     stack: Stack,
     s: PlanarPoseSettings,
-    prior: PoseGaussian | None,
 ) -> PlanarFix:
     """The better of a pose and its mirror image, with the score of the other."""
     inliers = fix.inliers & ~stack.inverted
     if int(inliers.sum()) < s.least_inliers:
         return fix
     mean = fix.node_from_robot.mean
-    mirror = improve(stack, mirrored(mean, stack.points[inliers, :2]), prior, rounds=GAUSS_NEWTON_STEPS)
+    mirror = improve(stack, mirrored(mean, stack.points[inliers, :2]), rounds=GAUSS_NEWTON_STEPS)
     if mirror is None or mirror[0].distance(mean) < APART:
         return fix
     score, mirror_score = _scores(parts, np.stack([mean.vector, mirror[0].vector])).tolist()
     if mirror_score <= score:
         return replace(fix, rival=max(mirror_score, 0.0) / score if score > 0.0 else 1.0)
-    better = refine(stack, mirror[0], s.scale_sigma, prior)
+    better = refine(stack, mirror[0], s.scale_sigma)
     if better is None or int(better.inliers.sum()) < s.least_inliers:
         return replace(fix, rival=1.0)
     return replace(better, rival=max(score, 0.0) / mirror_score)

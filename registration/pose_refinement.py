@@ -63,7 +63,7 @@ def refine_pose(node: Node, view: View, recognition: Recognition, pose: PlanarPo
         sigma = fresh
         covariances = landmarks.covariances_in_robot(node.camera, sigma, scale_share, tilt_sigma)
         sightings = Sightings.build(points, pixels, view.camera, covariances=covariances, pixel_sigma=sigma)
-        fix = refine(stack_sightings([sightings]), best.mean, pose.scale_sigma, None, SHIFT_SIGMA)
+        fix = refine(stack_sightings([sightings]), best.mean, pose.scale_sigma, SHIFT_SIGMA)
         if fix is None or int(fix.inliers.sum()) < pose.least_inliers:
             break
         refined = of_unknown_scale(fix.node_from_robot, scale_share, node.camera, view.camera)

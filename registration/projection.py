@@ -299,34 +299,26 @@ def _move_point(n: Index, stack: Stack, linear: Linear, step: Vector, out: Matri
 
 
 @compiled
-def improve(
-    stack: Stack, start: Vector, prior: Vector, prior_information: Matrix, rounds: int
-) -> tuple[bool, Vector, Matrix]:
+def improve(stack: Stack, start: Vector, rounds: int) -> tuple[bool, Vector, Matrix]:
     """Bring a pose to its best near a first one by Gauss-Newton.
 
     Args:
         stack: the sightings.
         start: (3,) m, m, rad.
-        prior: (3,) mean of what else is known of the pose.
-        prior_information: (3, 3) of that, zero if nothing is.
         rounds: at most.
 
     Returns:
         Whether the inliers determine a pose; the pose (3,); and the points (N, 3) m that fit it best.
     """
     pose, points = start.copy(), stack.points.copy()
-    away = np.empty(3)
     for _ in range(rounds):
         linear = linearise(stack, pose, points)
         products = normal_equations(linear)
-        information = products[1:, 1:] + prior_information
+        # Copies: a compiled kernel takes and solves dense arrays.
+        information, gradient = products[1:, 1:].copy(), products[1:, 0].copy()
         c, s = math.cos(pose[2]), math.sin(pose[2])
-        dx, dy = prior[0] - pose[0], prior[1] - pose[1]
-        away[0], away[1] = c * dx + s * dy, c * dy - s * dx
-        away[2] = (prior[2] - pose[2] + math.pi) % (2.0 * math.pi) - math.pi
         if not determined(information):
             return False, pose, points
-        gradient = products[1:, 0] + prior_information @ away
         step = np.linalg.solve(information, gradient).astype(np.float64)
         pose[0] += c * step[0] - s * step[1]
         pose[1] += s * step[0] + c * step[1]

@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.pose import Pose2
 from mapweave.registration.minimal_poses import hypotheses
 from mapweave.registration.planar_pose import PlanarPoseSettings, solve_planar_pose, solve_sightings
 from mapweave.registration.sightings import Sightings
@@ -168,22 +168,6 @@ def test_pure_chance_gives_few_inliers() -> None:
         points, _ = seen_points(Pose2(), 40, rng)
         fix = solve_planar_pose(points, rng.uniform(0, [320, 240], (40, 2)), CAMERA, rng=rng)
         assert fix is None or fix.inliers.sum() < 10
-
-
-def test_a_prior_counts_as_a_measurement() -> None:
-    rng = np.random.default_rng(11)
-    true, points, covariances, pixels = noisy_problem(rng, n=10)
-    free = solve_planar_pose(points, pixels, CAMERA, rng=rng, point_covariances=covariances)
-    assert free is not None
-    sure = PoseGaussian.from_sigmas(true, 1e-4, 1e-4)
-    held = solve_planar_pose(points, pixels, CAMERA, rng=rng, point_covariances=covariances, prior=sure)
-    vague = PoseGaussian.from_sigmas(true @ Pose2(0.3, 0.3, 0.2), 1.0, 1.0)
-    same = solve_planar_pose(points, pixels, CAMERA, rng=rng, point_covariances=covariances, prior=vague)
-    assert held is not None and same is not None
-    assert error(held.node_from_robot.mean, true) < 1e-3
-    assert error(same.node_from_robot.mean, free.node_from_robot.mean) < 0.3 * np.sqrt(
-        free.node_from_robot.covariance.trace()
-    )
 
 
 def test_measured_depths_make_a_pose_more_certain() -> None:
