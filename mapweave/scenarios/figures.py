@@ -5,11 +5,8 @@ from __future__ import annotations
 import math
 import typing
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields, replace
+from dataclasses import asdict, dataclass, field, fields
 from typing import Any
-
-from mapweave.hybridmap.errors import InvalidFile, SettingsError
-from mapweave.storage.settings_file import build
 
 MORE_IS_BETTER = frozenset(
     {"link_precision", "link_recall", "explored_share", "longest_loop_m", "real_time_factor"}
@@ -150,29 +147,11 @@ class Figures:
     robots: Mapping[str, RobotFigures] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON; `from_dict` reads it back."""
+        """For JSON."""
         table = asdict(self)
         # The key is an agent's name: to be found again by eye, whatever order the robots came in.
         table["robots"] = {name: table["robots"][name] for name in sorted(table["robots"])}
         return table
-
-    @staticmethod
-    def from_dict(table: Mapping[str, Any]) -> Figures:
-        """Read what `as_dict` gave.
-
-        Raises:
-            InvalidFile: it is something else.
-        """
-        given = {name: value for name, value in table.items() if value is not None}
-        robots = given.pop("robots", {})
-        try:
-            shares = {
-                name: build(RobotFigures, {k: v for k, v in values.items() if v is not None}, f"robot {name}")
-                for name, values in robots.items()
-            }
-            return replace(build(Figures, given, "figures"), robots=shares)
-        except (AttributeError, SettingsError) as error:
-            raise InvalidFile(f"these are no figures: {error}") from None
 
 
 def kinds() -> dict[str, type]:

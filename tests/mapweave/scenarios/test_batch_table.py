@@ -68,7 +68,7 @@ def test_failures_are_named_with_their_reason(attempts):
     assert content["failed"]["12"] == ["agent r0 [it] died with status 3"]
     assert "found is no, wanted yes" in content["failed"]["7"]
     assert (content["trials"], content["passed"]) == (8, 7 - len(bad))
-    assert Figures.from_dict(content["seeds"]["5"]["figures"]) == attempts[0].figures
+    assert content["seeds"]["5"]["figures"] == attempts[0].figures.as_dict()
     assert content["seeds"]["12"]["figures"] is None
 
 

@@ -19,7 +19,6 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.scenarios import report_folder
 from mapweave.scenarios.error_plot import _labels
 from mapweave.scenarios.expectations import check, parse_expectations
-from mapweave.scenarios.figures import Figures
 from mapweave.scenarios.recording import Moment
 from mapweave.scenarios.report_folder import write_folder
 from mapweave.scenarios.score import score
@@ -68,7 +67,7 @@ def test_everything_is_there_and_nothing_half_written(written):
     assert {path.name for path in out.iterdir()} == FILES
     content = json.loads((out / "figures.json").read_text())
     assert (content["scenario"], content["seed"], content["passed"]) == ("staged", 3, False)
-    assert Figures.from_dict(content["figures"]) == figures
+    assert content["figures"] == figures.as_dict()
     assert [(v["name"], v["good"]) for v in content["verdicts"]] == [
         ("components", True),
         ("link_recall", False),
