@@ -1,7 +1,7 @@
 """The processes of a fleet: agents, two servers, two routers between them; killed, frozen, started again.
 
 Agents and servers are clients of two routers that are joined. Each has a link of its own to each of them
-(`benchmarks.chaos.lossy_link`), is at one of them, and goes to the other one when that is away.
+(`mapweave.scenarios.network_emulator`), is at one of them, and goes to the other one when that is away.
 """
 
 from __future__ import annotations
@@ -14,14 +14,15 @@ import sys
 import time
 from collections.abc import Sequence
 from dataclasses import asdict
+from itertools import chain
 from pathlib import Path
 
 from benchmarks.chaos.agent_process import ENOUGH, FLEET, Orders
-from benchmarks.chaos.lossy_link import Link, Links
 from benchmarks.chaos.schedule import Kind
 from benchmarks.fleet.drives import name_of
 from mapweave.processes import parent_watchdog
 from mapweave.scenarios.children import ChildFailed, free_port
+from mapweave.scenarios.network_emulator import NetworkEmulator
 from synthetic.postgres_server import PostgresServer
 
 SERVERS, ROUTERS, DATABASE = ("s0", "s1"), ("z0", "z1"), "pg"
@@ -53,10 +54,9 @@ class FleetProcesses:
         self._postgres = postgres
         self.folder, self._store = folder, store
         self.agents = tuple(name_of(k) for k in range(agents))
-        self._links_thread = Links().__enter__()
         self._ports = {name: free_port() for name in ROUTERS}
-        self.links: dict[str, list[Link]] = {
-            name: [self._links_thread.open(self._ports[router]) for router in ROUTERS]
+        self.links: dict[str, list[NetworkEmulator]] = {
+            name: [NetworkEmulator(self._ports[router], seed) for router in ROUTERS]
             for name in (*self.agents, *SERVERS)
         }
         self._commands = {name: self._agent(k, seed) for k, name in enumerate(self.agents)}
@@ -73,7 +73,8 @@ class FleetProcesses:
         """End all that runs."""
         for name in list(self._running):
             self.kill(name)
-        self._links_thread.__exit__()
+        for link in chain.from_iterable(self.links.values()):
+            link.close()
 
     @property
     def endpoints(self) -> tuple[str, ...]:
@@ -150,18 +151,25 @@ class FleetProcesses:
                 self.kill(target)
             case Kind.STOP:
                 self._signal(target, signal.SIGSTOP)
-            case Kind.HALF:
-                for link in self.links[target]:
-                    self._links_thread.half_close(link)
         if kind is Kind.LOSE_STORE:
             path = Path(self.store_of(target))
             for part in path.parent.glob(f"{path.name}*"):
                 part.unlink()
-        self._shape(target, kind, True)
+        for link in self.links.get(target, []):
+            match kind:
+                case Kind.CUT | Kind.FLAP:
+                    link.cut()
+                case Kind.FROZEN:
+                    link.freeze()
+                case Kind.SLOW:
+                    link.worsen(0.0, 0.3, 60e3)
+                case Kind.HALF:
+                    link.half_close()
 
     def toggle(self, target: str, cut: bool) -> None:
         """Cut the links of a process, or mend them."""
-        self._shape(target, Kind.CUT, cut)
+        for link in self.links[target]:
+            (link.cut if cut else link.restore)()
 
     def end_disturbance(self, kind: Kind, target: str) -> None:
         """As it was before."""
@@ -170,20 +178,8 @@ class FleetProcesses:
                 self.start(target)
             case Kind.STOP:
                 self._signal(target, signal.SIGCONT)
-        self._shape(target, kind, False)
-
-    def _shape(self, target: str, kind: Kind, begins: bool) -> None:
-        def how(link: Link) -> None:
-            match kind:
-                case Kind.CUT | Kind.FLAP:
-                    link.cut = begins
-                case Kind.FROZEN:
-                    link.frozen = begins
-                case Kind.SLOW:
-                    link.delay, link.rate = (0.3, 60e3) if begins else (0.0, float("inf"))
-
         for link in self.links.get(target, []):
-            self._links_thread.change(link, how)
+            link.restore()
 
     def _signal(self, name: str, number: signal.Signals) -> None:
         if name in self._running:
@@ -198,7 +194,7 @@ class FleetProcesses:
 
     def _routers_of(self, name: str) -> list[str]:
         """Half of the fleet has the one router first, half the other."""
-        endpoints = [link.endpoint for link in self.links[name]]
+        endpoints = [f"tcp/127.0.0.1:{link.port}" for link in self.links[name]]
         return endpoints if name[-1] in "02468" else endpoints[::-1]
 
     def _agent(self, robot: int, seed: int) -> Sequence[str]:

@@ -1,8 +1,12 @@
-"""A network cable between a robot and the router that can be cut: a TCP forwarder on loopback."""
+"""A network cable between a robot and the router that can be cut: a TCP forwarder on loopback.
+
+TCP loses no single bytes, so a lossy radio looks like delays and broken connections: that is what this does.
+"""
 
 from __future__ import annotations
 
 import contextlib
+import math
 import socket
 import threading
 import time
@@ -13,6 +17,8 @@ RESEND = 0.2
 """What TCP loses it sends again after about this, s."""
 
 CHUNK = 65536
+THAW = 0.05
+"""How often it is looked whether a frozen cable is one no longer, s."""
 
 
 class NetworkEmulator:
@@ -33,10 +39,12 @@ class NetworkEmulator:
         self._target = target_port
         self._random = np.random.default_rng([seed, 0xCAB1E])
         self._lock = threading.Lock()
-        self._open: set[socket.socket] = set()
+        self._open: set[tuple[socket.socket, socket.socket]] = set()
         self._cut = False
         self._loss = 0.0
         self._delay = 0.0
+        self._rate = math.inf
+        self._frozen = False
         self.carried = 0
         self._listener = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._listener.getsockname()[1])
@@ -46,21 +54,34 @@ class NetworkEmulator:
         """Break every connection and take no new one."""
         with self._lock:
             self._cut = True
-            ends = list(self._open)
+            ends = [end for pair in self._open for end in pair]
             self._open.clear()
         for end in ends:
             _break(end)
 
-    def worsen(self, loss: float, delay: float) -> None:
-        """Delay every piece; a share of them arrives only after being sent again."""
+    def worsen(self, loss: float, delay: float, rate: float = math.inf) -> None:
+        """Delay every piece; a share of them arrives only after being sent again; so many bytes a second."""
         with self._lock:
-            self._loss, self._delay = loss, delay
+            self._loss, self._delay, self._rate = loss, delay, rate
+
+    def freeze(self) -> None:
+        """Let nothing through; no end learns of it."""
+        with self._lock:
+            self._frozen = True
+
+    def half_close(self) -> None:
+        """End the way back of each connection: the robot may go on sending, and no answer comes."""
+        with self._lock:
+            robots = [robot for robot, _ in self._open]
+        for robot in robots:
+            with contextlib.suppress(OSError):
+                robot.shutdown(socket.SHUT_WR)
 
     def restore(self) -> None:
         """Forward again, at once and without losses."""
         with self._lock:
-            self._cut = False
-            self._loss = self._delay = 0.0
+            self._cut = self._frozen = False
+            self._loss, self._delay, self._rate = 0.0, 0.0, math.inf
 
     def close(self) -> None:
         """Break everything for good."""
@@ -84,15 +105,16 @@ class NetworkEmulator:
             with self._lock:
                 refused = self._cut
                 if not refused:
-                    self._open |= {robot, router}
+                    self._open.add((robot, router))
             if refused:
                 _break(robot)
                 _break(router)
                 continue
-            for source, sink in ((robot, router), (router, robot)):
-                threading.Thread(target=self._pump, args=(source, sink), daemon=True).start()
+            for back in (False, True):
+                threading.Thread(target=self._pump, args=((robot, router), back), daemon=True).start()
 
-    def _pump(self, source: socket.socket, sink: socket.socket) -> None:
+    def _pump(self, pair: tuple[socket.socket, socket.socket], back: bool) -> None:
+        source, sink = pair[::-1] if back else pair
         while True:
             try:
                 data = source.recv(CHUNK)
@@ -105,15 +127,18 @@ class NetworkEmulator:
                 pause = self._delay
                 if self._loss:
                     pause += RESEND * float(self._random.geometric(1.0 - self._loss) - 1)
+                pause += len(data) / self._rate
             if pause:
                 time.sleep(pause)
+            while self._frozen and not self._cut:
+                time.sleep(THAW)
             try:
                 sink.sendall(data)
             except OSError:
                 break
         with self._lock:
-            self._open -= {source, sink}
-        for end in (source, sink):
+            self._open.discard(pair)
+        for end in pair:
             _break(end)
 
 

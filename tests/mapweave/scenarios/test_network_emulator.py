@@ -96,6 +96,36 @@ def test_a_bad_network_is_slow_but_loses_nothing(cable):
         assert best < 0.04, "not even there and back is delayed"
 
 
+def test_a_frozen_link_holds_everything_back_until_restored(cable):
+    with socket.create_connection(("127.0.0.1", cable.port), 2) as one:
+        assert talk(one, b"hello") == b"hello"
+        cable.freeze()
+        one.sendall(b"hello")
+        one.settimeout(0.3)
+        with pytest.raises(TimeoutError):
+            one.recv(10)
+        cable.restore()
+        one.settimeout(2)
+        assert one.recv(10) == b"hello"
+
+
+def test_a_half_closed_link_gives_no_answer(cable):
+    with socket.create_connection(("127.0.0.1", cable.port), 2) as one:
+        assert talk(one, b"hello") == b"hello"
+        cable.half_close()
+        assert one.recv(10) == b""
+    with socket.create_connection(("127.0.0.1", cable.port), 2) as two:
+        assert talk(two, b"hello") == b"hello"
+
+
+def test_a_slow_link_takes_its_time(cable):
+    cable.worsen(0.0, 0.0, rate=100e3)
+    with socket.create_connection(("127.0.0.1", cable.port), 2) as one:
+        began = time.monotonic()
+        assert talk(one, bytes(20_000)) == bytes(20_000)
+        assert time.monotonic() - began > 0.3
+
+
 def test_without_a_router_connections_end(cable):
     lonely = NetworkEmulator(1, seed=0)
     try:
