@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from mapweave.agent.mission import Carried
 from mapweave.agent.observation import Observation, Odometry
@@ -19,9 +20,11 @@ from tests.agent.conftest import CAMERA, DESCRIPTION, PhotoWalls
 REVERSED, DEGREES = "the other way", "in degrees"
 
 
-def drive(walls: PhotoWalls, times: float, every: int = 1, step: float = 0.01) -> list[Observation]:
+def drive(
+    walls: PhotoWalls, times: float, every: int = 1, step: float = 0.01, count: int = 90
+) -> list[Observation]:
     """Swings to both sides and drives ahead; wheels that report so many times the turn."""
-    poses = [Pose2(step * k, 0.0, 0.25 * math.sin(0.15 * k)) for k in range(0, 90, every)]
+    poses = [Pose2(step * k, 0.0, 0.25 * math.sin(0.15 * k)) for k in range(0, count, every)]
     seen, before = [], poses[0]
     for k, pose in enumerate(poses):
         moved = before.inverse() @ pose
@@ -107,3 +110,76 @@ def test_a_robot_says_it_once(walls: PhotoWalls, times: float, word: str) -> Non
         pipeline.step(one)
     lines = pipeline.complaints
     assert (len(lines) == 1 and word in lines[0]) if word else not lines
+
+
+def sideways(image: NDArray[np.uint8], times: int) -> NDArray[np.uint8]:
+    """Turned by so many times 90 degrees to the left, and cut to its old size."""
+    turned = np.rot90(image, times)
+    height, width = turned.shape
+    rows, columns = min(height, image.shape[0]), min(width, image.shape[1])
+    out = np.full(image.shape, 128, np.uint8)
+    out[:rows, 40 : 40 + columns] = turned[40 : 40 + rows, :columns]
+    return out
+
+
+def furnished(rng: np.random.Generator, shape: tuple[int, ...]) -> NDArray[np.uint8]:
+    """A grey image of a few boxes that are not where they are in any other."""
+    image = np.full(shape, 128, np.uint8)
+    for _ in range(25):
+        (x, y), (width, height) = rng.integers(0, shape[::-1]), rng.integers(20, 80, 2)
+        image[y : y + height, x : x + width] = rng.integers(0, 256)
+    return image
+
+
+def spoilt(seen: list[Observation], how: str) -> list[Observation]:
+    """A drive of which something is wrong."""
+    rows = [(one.odometry.forward, one.odometry.turn) for one in seen]
+    images: list[NDArray[np.uint8]] = [one.image for one in seen if one.image is not None]
+    late, rng = [(0.0, 0.0)] * 10, np.random.default_rng(0)
+    if how == "late":
+        rows = [*late, *rows[:-10]]
+    elif how == "early":
+        rows = [*rows[10:], *late]
+    elif how == "exchanged":
+        rows = [(turn, forward) for forward, turn in rows]
+    elif how == "rates":
+        rows = [(10.0 * forward, 10.0 * turn) for forward, turn in rows]
+    elif how == "centimetres":
+        rows = [(100.0 * forward, turn) for forward, turn in rows]
+    elif how.startswith("to the"):
+        images = [sideways(image, 1 if how == "to the left" else 3) for image in images]
+    elif how == "another drive":
+        images = [furnished(rng, image.shape) for image in images]
+    elif how == "dark":
+        images = [rng.poisson(4.0, image.shape).astype(np.uint8) for image in images]
+    odometry = [Odometry(*row) for row in rows]
+    return [replace(a, odometry=b, image=c) for a, b, c in zip(seen, odometry, images, strict=True)]
+
+
+@pytest.mark.parametrize(
+    ("how", "words"),
+    [
+        ("right", ()), ("dark", ()),
+        ("late", ("the odometry turns 1.0 s after the images",)),
+        ("early", ("the images turn 1.0 s after the odometry",)),
+        ("exchanged", ("columns of ways and turns are exchanged",)),
+        ("rates", ("turns 10 times as far", "in rad/s and must be in radians since the", "speeds?")),
+        ("centimetres", ("times as low as the floor", "in centimetres")),
+        ("to the left", ("turned by 90 degrees",)), ("to the right", ("turned by 90 degrees",)),
+        ("another drive", ("show nothing in common", "in the wrong order")),
+    ],
+)  # fmt: skip
+def test_the_likeliest_cause_is_named_and_no_other(
+    walls: PhotoWalls, how: str, words: tuple[str, ...]
+) -> None:
+    line = complaint(spoilt(drive(walls, 1.0, count=150), how))
+    assert all(word in line for word in words), line
+    assert bool(line) is bool(words)
+    causes = (REVERSED, DEGREES, "exchanged", "90 degrees", "one clock", "common", "centimetres", "rad/s")
+    assert sum(cause in line for cause in causes) <= max(len(words), 1), line
+
+
+def test_a_clock_that_goes_back_begins_again(walls: PhotoWalls) -> None:
+    seen = spoilt(drive(walls, 1.0, count=150), "late")
+    assert not complaint([*seen[:40], *seen[:40]])
+    assert "1.0 s after" in complaint([*seen[:40], *seen])
