@@ -20,6 +20,7 @@ from mapweave.agent.drivers.ros2_topics import Mounts, Ros2Camera, Topic
 from mapweave.agent.drivers.settings import CameraSettings, Geometry, RobotSettings
 from mapweave.agent.drivers.wheeled import STALE, WheeledRobot
 from mapweave.agent.observation import Command, RobotDescription
+from mapweave.agent.recordings.camera_info_check import doubts
 from mapweave.agent.ros_messages import making
 from mapweave.agent.ros_messages.images import grey_of
 from mapweave.agent.ros_messages.values import (
@@ -244,7 +245,7 @@ class Ros2Base:
             c, lens, distortion = camera_of(received.message, self._rectified)
         except DeviceError as error:
             raise DeviceError(f"{info.name}: {error}; calibrate it, or give [robot.camera]") from None
-        height, forward = self._options.height_m, self._options.forward_m
+        height, forward, mount = self._options.height_m, self._options.forward_m, None
         if height is None:
             frame = str(received.message.header.frame_id) or frame
             mount = self._mounts.camera(frame, end - time.monotonic())
@@ -254,8 +255,8 @@ class Ros2Base:
                     "give [robot.options] height_m and forward_m"
                 )
             height, forward = mount.up, mount.forward
-            if abs(mount.heading) > math.radians(3.0):
-                log.warning("%s looks %.0f deg to the left", frame, math.degrees(mount.heading))
+        for line in doubts(received.message, mount, self._rectified):
+            log.warning("%s: %s", info.name, line)
         try:
             return CameraSettings(
                 c.width, c.height, c.fx, c.fy, c.cx, c.cy, height, forward, lens, distortion

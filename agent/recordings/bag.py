@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import weakref
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.recordings.camera_info_check import doubts
 from mapweave.agent.recordings.damaged_bag import DamagedBag, standard_messages
 from mapweave.agent.recordings.geometry_file import LIMITS
 from mapweave.agent.recordings.incomplete import CameraGiven, Incomplete, complete
@@ -45,8 +45,6 @@ POSE_TYPES = (
 )
 TRUTH = ("truth", "gt", "amcl", "mocap", "vicon")
 """Parts of names of topics that are never taken for odometry."""
-MOST_OFF = math.radians(3.0)
-"""A camera that looks so far from straight ahead by tf is named."""
 DEPTH = "depth"
 """Part of names of topics whose images show distances: taken only where there are no others."""
 
@@ -390,18 +388,7 @@ def _camera(opened: Bag, image: str, options: RecordingOptions, notes: list[str]
         notes.append(f"camera {mount.forward:.2f} m ahead of the axle and {mount.up:.2f} m high, by tf")
         if not high and options.camera_height is None:
             notes.append("a camera is above the floor: tf does not say how high")
-        if abs(mount.left) > 0.05:
-            notes.append(f"the camera is {mount.left:.2f} m to the left, which is not taken into account")
-        if abs(mount.heading) > MOST_OFF:
-            notes.append(
-                f"the camera looks {math.degrees(mount.heading):.0f} deg to the left: it should look ahead"
-            )
-        if abs(mount.pitch) > MOST_OFF:
-            way = "down" if mount.pitch > 0.0 else "up"
-            notes.append(
-                f"the camera looks {math.degrees(abs(mount.pitch)):.0f} deg {way} by tf, which is not taken "
-                "into account: give --camera FILE with pitch_deg"
-            )
+    notes += doubts(message, mount)
     return options.camera_of(given, high)
 
 

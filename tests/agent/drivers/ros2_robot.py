@@ -54,6 +54,7 @@ class Ros2Robot:
         axle: m.
         clock_ns: how far its clock is ahead of this computer's.
         silent: names of topics without messages.
+        camera: quaternion of its camera's frame, x ahead.
     """
 
     def __init__(
@@ -64,6 +65,7 @@ class Ros2Robot:
         lens: Mapping[str, Any] | None = None,
         pose: Sequence[float] = (0.0, 0.0, 0.0),
         encoding: str = "rgb8",
+        camera: tuple[float, ...] = UPRIGHT,
     ) -> None:
         self.endpoint = f"tcp/127.0.0.1:{free_port()}"
         self.wheels, self.axle, self.stamped, self.bridge = TwoWheels(), 0.25, stamped, bridge
@@ -76,7 +78,7 @@ class Ros2Robot:
         self.silent = set(silent)
         self.lens = {"width": WIDTH, "height": HEIGHT, "focal": 60.0, **(lens or {})}
         self.pose = list(pose)
-        self.encoding = encoding
+        self.encoding, self.camera = encoding, camera
         self._before = (0.0, 0.0)
         self._noise = np.random.default_rng(0)
         self._router: ZenohBus | None = None
@@ -116,7 +118,7 @@ class Ros2Robot:
 
     def _serve(self) -> None:
         self._publish("tf_static", peer.transforms(
-            (0, "base_link", "camera_link", (0.07, 0.0, 0.2), UPRIGHT),
+            (0, "base_link", "camera_link", (0.07, 0.0, 0.2), self.camera),
             (0, "camera_link", "camera_optical_frame", (0.0, 0.0, 0.01), OPTICAL),
             (0, "base_link", "base_scan", (-0.03, 0.0, 0.15), (0.0, 0.0, 1.0, 0.0)),
             (0, "base_link", "front", (0.12, 0.0, 0.1), UPRIGHT),

@@ -281,6 +281,27 @@ def test_without_a_router_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> N
         robot.close()
 
 
+@pytest.mark.parametrize(
+    ("degrees", "lens", "words"),
+    [
+        (0.0, {}, ""), (2.0, {}, ""),
+        (12.0, {}, "the camera looks 12 deg down by tf"), (-12.0, {}, "the camera looks 12 deg up by tf"),
+        (0.0, {"lens": (-0.1, 0.02, 0.001)}, "3 coefficients of distortion"),
+    ],
+)  # fmt: skip
+def test_what_is_not_taken_into_account_of_a_camera_is_said(
+    start: Start, caplog: pytest.LogCaptureFixture, degrees: float, lens: dict[str, Any], words: str
+) -> None:
+    """Its heading was said alone, and the pitch of recordings."""
+    half = math.radians(degrees) / 2.0
+    robot = start(Ros2Robot(camera=(0.0, math.sin(half), 0.0, math.cos(half)), lens=lens))
+    with caplog.at_level(logging.WARNING):
+        robot.describe()
+    lines = [record.message for record in caplog.records]
+    assert len(lines) == bool(words)
+    assert all(line.startswith("/camera/camera_info: ") and words in line for line in lines)
+
+
 def test_that_odometry_has_two_publishers_is_said(start: Start, caplog: pytest.LogCaptureFixture) -> None:
     """The steps between their poses were taken for slip, or the robot for one that stands."""
     emulator = Ros2Robot()

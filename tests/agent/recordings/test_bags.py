@@ -24,10 +24,12 @@ from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.recordings import bag
+from mapweave.agent.recordings.camera_info_check import doubts
 from mapweave.agent.recordings.incomplete import Incomplete
 from mapweave.agent.recordings.mcap_writer import FLUSH_S, McapWriter
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
+from mapweave.agent.ros_messages.values import Mount
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Pose2
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive, between
@@ -432,3 +434,31 @@ def test_what_a_bag_lacks_is_said_with_what_is_in_it(drive: Drive, tmp_path: Pat
     assert found.bag is not None and found.bag.seconds == pytest.approx((COUNT - 1) * STEP_NS * 1e-9)
     counts = {topic.name: topic.count for topic in found.bag.topics}
     assert counts == {"/cam/image_raw": COUNT, "/cam/camera_info": COUNT, "/ground_truth/odom": 4 * COUNT - 3}
+
+
+def test_three_coefficients_of_distortion_are_named(
+    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The third was taken for p1, without a word."""
+    made = camera_info
+    lens = np.array([0.1, 0.02, 0.001])
+    monkeypatch.setitem(globals(), "camera_info", lambda *given: replace(made(*given), d=lens))
+    write_bag(tmp_path / "drive", drive)
+    recording = open_recording(tmp_path / "drive", RecordingOptions(camera_height=0.3))
+    assert any("3 coefficients of distortion" in note for note in recording.notes)
+
+
+@pytest.mark.parametrize(
+    ("mount", "words"),
+    [
+        (Mount(0.1, 0.04, 0.3, 0.04, -0.04), ""),
+        (Mount(0.1, 0.2, 0.3, 0.0), "0.20 m to the left"),
+        (Mount(0.1, 0.0, 0.3, 0.3), "17 deg to the left"),
+        (Mount(0.1, 0.0, 0.3, 0.0, 0.3), "17 deg down by tf"),
+        (Mount(0.1, 0.0, 0.3, 0.0, -0.3), "17 deg up by tf"),
+        (None, ""),
+    ],
+)
+def test_a_camera_that_does_not_look_ahead_is_named(mount: Mount | None, words: str) -> None:
+    lines = doubts(SimpleNamespace(d=[0.0] * 3), mount)
+    assert len(lines) == bool(words) and words in "".join(lines)
