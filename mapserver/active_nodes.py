@@ -103,17 +103,13 @@ def _misplaced(merged: MergedMap) -> Iterator[NodeId]:
     """Nodes of maps with wrong geometry, of implausible maps and of fragments that show places of other maps.
 
     Each is at the same place as the node that it is linked to, seen by a robot whose map has it elsewhere: it
-    is no second place where a robot could be. Unlinked nodes of such a map are still used, unless its robot
-    has left very many: so many views of one place would be all that a question is compared with.
+    is no second place where a robot could be. Unlinked nodes of such a map are still used.
     """
     maps = {map_id: one for map_id, one in merged.maps.items() if map_id not in merged.constraints.retired}
     wrong = {*merged.wrong, *merged.implausible, *fragments(maps, merged.pruned.maps)}
-    unreliable = unreliable_robots(maps, merged.wrong, merged.pruned.maps)
-    for some in unreliable.values():
-        yield from (node for map_id in some for node in merged.maps[map_id].nodes)
-    for refusal in merged.refused if wrong or unreliable else ():
+    for refusal in merged.refused if wrong else ():
         if refusal.link is not None and not refusal.link.within:
-            ends = [node for node in refusal.pair if node.map in wrong or node.agent in unreliable]
+            ends = [node for node in refusal.pair if node.map in wrong]
             if len(ends) == 1:
                 yield ends[0]
 
