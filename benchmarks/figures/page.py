@@ -33,6 +33,8 @@ def _shown(figures: Mapping[str, Any], path: str, form: str) -> str:
         value = value[key]
     if value is None:
         return "none"
+    if isinstance(value, list):
+        return ", ".join(map(str, value)) or "none"
     if form[-1:] in SCALES:
         return format(value * SCALES[form[-1]], form[:-1] + "f")
     return format(value, form)

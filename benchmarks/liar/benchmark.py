@@ -1,6 +1,7 @@
 """Fleets of four robots of which one lies, in many ways: what becomes of the other three.
 
     python -m benchmarks.liar [--seed N] [--ways NAME ...] [--without RULE] [--json]
+    python -m benchmarks.liar --rules [--seed N] [--ways NAME ...] [--jobs N] [--json]
 
 Nothing is rendered (see `synthetic.wrong_geometry`); server, ingest, merge and relocalization are the real
 ones, and all that robots send and ask goes over a bus. Three robots map a house. A fourth one then sends its
@@ -10,22 +11,28 @@ and the answers to lost robots; views to which an honest fourth robot changes th
 is contained if links and answers are the same and no node has moved by more than 5 cm: an honest fourth one
 moves them by 2 to 3 cm. It is named if the history that the page shows holds it against the robot. Some ways
 cannot be found out (`UNDECIDABLE`): they are measured, and not counted.
+
+With `--rules` all ways that can be found out are tried with all rules, and without each.
 """
 
 from __future__ import annotations
 
+import argparse
 import json
 import logging
 import resource
 import tempfile
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 from rich.console import Console
 from rich.progress import Progress
 
 from benchmarks.command_line import command_line
-from benchmarks.rules.switches import Switch, switched_off
+from benchmarks.rules.switches import ALL, Switch, switched_off
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver import active_nodes, answers
 from mapweave.mapserver.log import entry
@@ -33,16 +40,19 @@ from mapweave.mapserver.merging import implausible_maps
 from mapweave.mapserver.merging.copies import Copies
 from mapweave.merge.mutual_exclusion import trajectories
 from mapweave.merge.outlier_rejection import distinctness, wrong_geometry
+from mapweave.merge.outlier_rejection.fleet_chance import FleetChance
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
+from mapweave.merge.pose_graph.staged_optimization import StagedOptimization
 from mapweave.merge.torn_maps import TornMapSearch
-from mapweave.scenarios.liar.lies import EVERY, Map
+from mapweave.scenarios.liar.lies import EVERY, WAYS, Map
 from mapweave.scenarios.liar.trial import Outcome, Trial, row, totals
 from synthetic.wrong_geometry import ODD, SCENES, Fault, Fleet, draw_fleet, lost_views
 
 SCENE = "house"
 CLOCK, RADIUS, APART_S = "utc", 0.16, 10_000
 """All robots have one clock; the honest ones drive one after the other."""
-
+HONEST = "(an honest fourth robot)"
+"""What becomes of the three beside it."""
 
 RULES: dict[str, tuple[Switch, ...]] = {
     "two sources of aliasing": ((distinctness, "ENOUGH", 1),),
@@ -68,11 +78,13 @@ RULES: dict[str, tuple[Switch, ...]] = {
         (implausible_maps, "contradict_themselves", lambda _: {}),
         (implausible_maps, "contradict_each_other", lambda _: {}),
     ),
+    "false places of one robot": ((FleetChance, "_all_at_one_robot", lambda *_: False),),
+    "optimisation in two stages": ((StagedOptimization, "solved", lambda _self, merged, _maps: merged),),
     "torn maps": ((TornMapSearch, "torn", lambda *_: {}),),
     "answers without implausible maps": ((answers, "doubted", lambda _: []),),
-    "fragments": ((active_nodes, "fragments", lambda _: []),),
-    "unmeasurable edges": ((entry, "unmeasurable", lambda _: ""),),
-    "clocks that run backwards": ((trajectories, "runs_backwards", lambda _: False),),
+    "fragments": ((active_nodes, "fragments", lambda *_: []),),
+    "unmeasurable edges": ((entry, "unmeasurable", lambda *_: ""),),
+    "clocks that run backwards": ((trajectories, "runs_backwards", lambda *_: False),),
 }
 """What contains lies, each with what takes its place when it is switched off."""
 
@@ -98,31 +110,63 @@ def drawn_trial(seed: int, queries: int, folder: Path) -> Trial:
     return Trial(ODD, maps, views, honest_truth, seed, folder)
 
 
+def tried(seed: int, queries: int, ways: Sequence[str], rule: str) -> Iterator[tuple[str, Outcome]]:
+    """What becomes of an honest fourth robot and of each way to lie, without a rule; with all for `ALL`."""
+    with switched_off(RULES.get(rule, ())), tempfile.TemporaryDirectory() as folder:
+        trial = drawn_trial(seed, queries, Path(folder))
+        yield HONEST, trial.beside
+        for name in ways:
+            yield name, trial.outcome(EVERY[name])
+
+
+def _without(seed: int, queries: int, ways: Sequence[str], rule: str) -> dict[str, Any]:
+    logging.disable(logging.WARNING)
+    return totals(dict(tried(seed, queries, ways, rule)))
+
+
 def main() -> None:
     """Run and print."""
     parser = command_line("liar", __doc__, "of the fleet")
     parser.add_argument("--queries", type=int, default=12, help="of lost robots (default 12)")
     parser.add_argument("--ways", nargs="+", default=list(EVERY), choices=list(EVERY), metavar="NAME")
     parser.add_argument("--without", choices=list(RULES), metavar="RULE", help="switch a rule off: see RULES")
+    parser.add_argument("--rules", action="store_true", help="all rules, and without each of them")
+    parser.add_argument("--jobs", type=int, default=1, help="processes, with --rules (default 1)")
     arguments = parser.parse_args()
-    if arguments.queries < 1:
-        parser.error("--queries must be at least 1")
+    if min(arguments.queries, arguments.jobs) < 1:
+        parser.error("--queries and --jobs must be at least 1")
+    if arguments.rules and arguments.without:
+        parser.error("--rules switches each rule off: leave out --without")
     logging.disable(logging.WARNING)
     console = Console(stderr=arguments.json)
-    outcomes: dict[str, Outcome] = {}
-    off = switched_off(RULES.get(arguments.without, ()))
-    with off, tempfile.TemporaryDirectory() as folder, Progress(console=console) as progress:
-        task = progress.add_task("ways", total=len(arguments.ways) + 1)
-        trial = drawn_trial(arguments.seed, arguments.queries, Path(folder))
-        beside = trial.beside
-        console.print(row("(an honest fourth robot)", beside))
-        for name in arguments.ways:
-            progress.advance(task)
-            outcomes[name] = trial.outcome(EVERY[name])
-            console.print(row(name, outcomes[name]))
-        peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    with Progress(console=console) as progress:
+        if arguments.rules:
+            found = _by_rule(arguments, progress)
+        else:
+            outcomes: dict[str, Outcome] = {}
+            rule = arguments.without or ALL
+            each = tried(arguments.seed, arguments.queries, arguments.ways, rule)
+            for name, one in progress.track(each, len(arguments.ways) + 1, description="ways"):
+                outcomes[name] = one
+                console.print(row(name, one))
+            peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+            found = {
+                "without": arguments.without, **totals(outcomes), "peak_rss_mb": round(peak_mb),
+                "honest": asdict(outcomes.pop(HONEST)),
+                "by_way": {name: asdict(one) for name, one in outcomes.items()},
+            }  # fmt: skip
     if arguments.json:
-        print(json.dumps({"seed": arguments.seed, "without": arguments.without, **totals(outcomes),
-            "peak_rss_mb": round(peak_mb), "honest": asdict(beside),
-            "by_way": {name: asdict(one) for name, one in outcomes.items()},
-        }))  # fmt: skip
+        print(json.dumps({"seed": arguments.seed, **found}))
+
+
+def _by_rule(arguments: argparse.Namespace, progress: Progress) -> dict[str, Any]:
+    """What becomes of the ways that can be found out, with all rules and without each."""
+    ways = [name for name in arguments.ways if name in WAYS]
+    found = {}
+    with ProcessPoolExecutor(arguments.jobs) as pool:
+        given = arguments.seed, arguments.queries, ways
+        each = {rule: pool.submit(_without, *given, rule) for rule in (ALL, *RULES)}
+        for rule, future in progress.track(each.items(), description="rules"):
+            found[rule] = future.result()
+            progress.console.print(f"{rule}: {found[rule]}")
+    return found

@@ -1,5 +1,6 @@
 """docs/figures.md and docs/scale.md: they are what their generator makes of the stored results."""
 
+import inspect
 import json
 from pathlib import Path
 
@@ -9,6 +10,7 @@ from benchmarks.figures.benchmark import written_pages
 from benchmarks.figures.measurements import MEASUREMENTS
 from benchmarks.figures.page import filled
 from benchmarks.figures.results import FOLDER, load, run, store
+from benchmarks.liar.benchmark import RULES as LIE_RULES
 from benchmarks.rules.switches import MERGE_RULES, PLACE_RULES, TRIAL_RULES
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 
@@ -24,9 +26,9 @@ def test_each_stored_result_is_of_the_command_that_is_named() -> None:
 
 
 def test_figures_are_filled_in() -> None:
-    figures = {"a": {"b c": 0.0123, "80": None}, "n": 7}
-    template = "{a/b c:.1m} mm, {a/b c:.1%}, {n} of {n:.2f}, {a/80:.0f}"
-    assert filled(template, figures) == "12.3 mm, 1.2%, 7 of 7.00, none"
+    figures = {"a": {"b c": 0.0123, "80": None}, "n": 7, "some": ["one", "two"], "no": []}
+    template = "{a/b c:.1m} mm, {a/b c:.1%}, {n} of {n:.2f}, {a/80:.0f}; {some}; {no}"
+    assert filled(template, figures) == "12.3 mm, 1.2%, 7 of 7.00, none; one, two; none"
     with pytest.raises(InvalidValue, match="no figure a/x"):
         filled("{a/x}", figures)
 
@@ -55,7 +57,10 @@ def test_a_command_without_figures_is_said(tmp_path: Path, text: str, why: str) 
 
 
 def test_what_is_switched_off_is_there() -> None:
-    """A rule that has gone or was renamed is named here too."""
-    for name, switches in {**MERGE_RULES, **TRIAL_RULES, **PLACE_RULES}.items():
-        for where, function, _ in switches:
+    """A rule that has gone or was renamed is named here too, and one that takes more than its replacement."""
+    for name, switches in {**MERGE_RULES, **TRIAL_RULES, **PLACE_RULES, **LIE_RULES}.items():
+        for where, function, instead in switches:
             assert hasattr(where, function), name
+            if callable(instead):
+                given = inspect.signature(getattr(where, function)).parameters
+                inspect.signature(instead).bind(*given)
