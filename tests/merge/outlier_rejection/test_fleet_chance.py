@@ -15,7 +15,7 @@ from mapweave.merge.merging import merge_maps
 from mapweave.merge.pose_graph.links import Link
 from synthetic.fleet import FleetSettings, SyntheticFleet, draw_fleet, link_between, map_of
 
-MAPS, STRETCHES, LONG = 20, 4, 3
+MAPS, STRETCHES, LONG = 12, 3, 3
 """Maps of the robot, stretches of its way in each of these, and nodes of each stretch."""
 
 
