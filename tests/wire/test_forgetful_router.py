@@ -100,6 +100,7 @@ def test_a_client_that_was_forgotten_connects_again(
             return {b"up", b"down"} <= set(heard)
 
         eventually(both_ways)
+        eventually(lambda: alive == [True])
         link.forget()
         heard.clear()
         with caplog.at_level(logging.WARNING):
