@@ -13,9 +13,12 @@ from tests.registration.test_projection import scene
 
 pytest.importorskip("numba")
 
+LEAST_SOLVED = 10
+"""Landmarks; a recognition needs as many."""
+
 
 @settings(max_examples=30, deadline=None)
-@given(st.integers(0, 2**32 - 1), st.integers(10, 40))
+@given(st.integers(0, 2**32 - 1), st.integers(3, 40))
 def test_both_forms_are_the_same_to_rounding(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     (forward, true), (backward, _) = scene(n, rng, False), scene(max(n // 2, 1), rng, True)
@@ -25,10 +28,13 @@ def test_both_forms_are_the_same_to_rounding(seed: int, n: int) -> None:
 
     def everything() -> list[np.ndarray]:
         linear = linearise(stack, near, stack.points)
-        improved = improve(stack, near, 3)
-        assert improved[0]
-        ratios = [forward.log_ratios(poses), backward.log_ratios(poses)]
-        return [*ratios, *linear, normal_equations(linear), *improved]
+        arrays = [forward.log_ratios(poses), backward.log_ratios(poses), *linear, normal_equations(linear)]
+        # Fewer leave a pose that rounding decides.
+        if n >= LEAST_SOLVED:
+            improved = improve(stack, near, 3)
+            assert improved[0]
+            arrays += improved
+        return arrays
 
     compiled = everything()
     with in_numpy():
