@@ -78,6 +78,36 @@ class LastShown:
             for name in sorted(heard.keys() | known.keys())
         ]
 
+    def unheard_on(self, merged: MergedMap, fleet: FleetStatus) -> list[dict[str, Any]]:
+        """The robots that the server has not heard of, by the nearest node that its own map has, too.
+
+        Args:
+            merged: the server's own map.
+            fleet: who is heard of.
+        """
+        heard = {entry.robot for entry in fleet.robots if entry.status is not None}
+        return [self._placed_on(merged, robot) for robot in self.unheard if str(robot["robot"]) not in heard]
+
+    def _placed_on(self, merged: MergedMap, robot: dict[str, Any]) -> dict[str, Any]:
+        nowhere = {**robot, "merged_from_robot": None, "component": -1}
+        if not robot["merged_from_robot"]:
+            return nowhere
+        pose = Pose2(*robot["merged_from_robot"])
+        common = [
+            (here.distance(pose), node, here)
+            for node, (here, component) in self._poses.items()
+            if component == robot["component"] and merged.component_of(node) is not None
+        ]
+        if not common:
+            return nowhere
+        _, nearest, here = min(common, key=lambda one: one[0])
+        moved = merged.pose(nearest) @ here.inverse() @ pose
+        return {
+            **robot,
+            "merged_from_robot": moved.vector.tolist(),
+            "component": merged.component_of(nearest),
+        }
+
     def _placed(self, entry: RobotEntry, merged: MergedMap) -> dict[str, Any]:
         """An entry with its pose by the nearest node that this map has, too; without one it has no pose."""
         values = {**json_values(entry), "merged_from_robot": None, "component": -1}

@@ -20,7 +20,7 @@ from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.agent_status import LONGEST_STATUS_PERIOD, FleetStatus
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.ids import MapId
@@ -91,6 +91,7 @@ class Live:
         """
         self._server, self._access = server, access
         self._before = before
+        self._unheard, self._unheard_until = NOTHING, -math.inf
         self._turn = threading.Lock()
         self._map = LiveMap()
         self._shown: MergedMap | None = None
@@ -198,7 +199,7 @@ class Live:
         self._count(dict.fromkeys(self._server.history()))
         self._tell(
             {name: status[name] for name in SERVER_FIELDS if name in status},
-            json_values(self._server.robots())["robots"],
+            self._robots(merged),
         )
         return merged is not self._rated and time.monotonic() >= self._rest_until
 
@@ -206,9 +207,23 @@ class Live:
         """Whether the map of before is shown still, or none: maps that are not merged yet lie apart."""
         if status.get("loading"):
             return True
-        if status.get("merged", True):
-            self._before = NOTHING
+        if status.get("merged", True) and self._before:
+            # A robot that is there reports by then.
+            self._unheard, self._before = self._before, NOTHING
+            self._unheard_until = time.monotonic() + LONGEST_STATUS_PERIOD
         return bool(self._before)
+
+    def _robots(self, merged: MergedMap) -> list[Mapping[str, Any]]:
+        """All robots; for a moment those of before, too, that the server may not have heard of yet."""
+        fleet = self._server.robots()
+        robots: list[Mapping[str, Any]] = json_values(fleet)["robots"]
+        if time.monotonic() >= self._unheard_until:
+            self._unheard = NOTHING
+        elif unheard := self._unheard.unheard_on(merged, fleet):
+            names = {robot["robot"] for robot in unheard}
+            heard = (robot for robot in robots if robot["robot"] not in names)
+            robots = sorted((*heard, *unheard), key=lambda robot: str(robot["robot"]))
+        return robots
 
     def _hold(self, loading: bool) -> None:
         """Show what was there before, with the robots and events that are known by now."""

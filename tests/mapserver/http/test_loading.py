@@ -99,6 +99,9 @@ def test_all_is_shown_as_before_until_the_server_has_merged() -> None:
         assert web.shown() == NOTHING, "nor is what is not merged yet worth more than the map of before"
         server.holds = {"summary": "12 nodes", "settled": False, "merged": True}
         assert person.until("map")["whole"] and same(person.nodes(), expected(two_maps()))
+        heard, unheard = person.until("state")["robots"]
+        assert (unheard["robot"], unheard["before"]) == ("r1", True) and "before" not in heard
+        assert np.allclose(unheard["merged_from_robot"], [1.0, 0.0, 0.0], atol=2e-3), "on the server's map"
         while len(person.until("state")["robots"]) != 1:
             pass
         assert person.last["state"]["server"] == {"summary": "12 nodes", "settled": False}
