@@ -15,7 +15,7 @@ import socket
 import ssl
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import TracebackType
 from typing import Any
@@ -40,6 +40,10 @@ MAX_VIEWER_BYTES = 1024
 """Of a message by a viewer, which has nothing to say."""
 GRACE = 1.0
 """s in which requests in work may end when the server ends."""
+ARRIVAL = 0.05
+"""s in which a request may still arrive then, of a client that has connected before."""
+STEP = 0.005
+"""s between two looks at whether that has happened."""
 START = 10.0
 """s in which the thread has to be there."""
 POLICY = (
@@ -185,7 +189,7 @@ class _Loop(asyncio.SelectorEventLoop):
     def __init__(self, handshake: float) -> None:
         super().__init__()
         self._handshake = handshake
-        self._shaking: dict[asyncio.Future[None], asyncio.Transport] = {}
+        self.shaking: dict[asyncio.Future[None], asyncio.Transport] = {}
 
     async def create_server(self, *arguments: Any, **named: Any) -> asyncio.Server:
         if named.get("ssl") is not None:
@@ -196,20 +200,20 @@ class _Loop(asyncio.SelectorEventLoop):
         """Begin a handshake, in the place of the oldest if there are too many."""
         transport: asyncio.Transport = super()._make_ssl_transport(*arguments, **named)  # type: ignore[misc]
         waiter: asyncio.Future[None] = named["waiter"]
-        self._shaking[waiter] = transport
-        waiter.add_done_callback(lambda done: self._shaking.pop(done, None))
-        if len(self._shaking) > MAX_WAITING:
+        self.shaking[waiter] = transport
+        waiter.add_done_callback(lambda done: self.shaking.pop(done, None))
+        if len(self.shaking) > MAX_WAITING:
             # Later: in a burst the oldest has no socket yet.
-            self.call_soon(self._shaking.pop(next(iter(self._shaking))).abort)
+            self.call_soon(self.shaking.pop(next(iter(self.shaking))).abort)
         return transport
 
 
 class _Server(uvicorn.Server):
     """Ends as soon as it is to and no request is in work; uvicorn itself looks ten times a second."""
 
-    def __init__(self, config: uvicorn.Config) -> None:
+    def __init__(self, config: uvicorn.Config, arriving: Callable[[], bool]) -> None:
         super().__init__(config)
-        self._ending = asyncio.Event()
+        self._ending, self._arriving = asyncio.Event(), arriving
 
     def end(self) -> None:
         """Stop serving. In the server's loop."""
@@ -222,20 +226,32 @@ class _Server(uvicorn.Server):
             await self._ending.wait()
 
     async def shutdown(self, sockets: list[socket.socket] | None = None) -> None:
-        """End every connection, also those of peers that take nothing; requests in work have a moment."""
+        """End every connection, also those of peers that take nothing; requests in work have a moment.
+
+        With its port a connection is reset that has not been accepted, and one that was, a moment before, is
+        not among the connections yet and would stay open without an answer.
+        """
+        await asyncio.sleep(STEP)
         for listening in (*self.servers, *(sockets or ())):
             listening.close()
+        await _while(self._arriving, ARRIVAL)
         state = self.server_state
         for connection in list(state.connections):
             connection.shutdown()
-        end = time.monotonic() + GRACE
-        while (state.connections or state.tasks) and time.monotonic() < end:
-            await asyncio.sleep(0.005)
+        await _while(lambda: bool(state.connections or state.tasks), GRACE)
         for task in state.tasks:
             task.cancel()
         for connection in list(state.connections):
             connection.transport.abort()
         await asyncio.sleep(0)
+
+
+async def _while(holds: Callable[[], bool], seconds: float) -> None:
+    """Wait at least one step, and at most so many seconds."""
+    end = time.monotonic() + seconds
+    await asyncio.sleep(STEP)
+    while holds() and time.monotonic() < end:
+        await asyncio.sleep(STEP)
 
 
 class HttpThread:
@@ -264,7 +280,7 @@ class HttpThread:
         self._socket = _listen(address)
         self.port = int(self._socket.getsockname()[1])
         limits = limits or Limits()
-        protocol = type("Connection", (Connection,), {"limits": limits, "waiting": {}})
+        protocol: type[Connection] = type("Connection", (Connection,), {"limits": limits, "waiting": {}})
         viewer = type("Viewer", (WebSocketConnection,), {"stall": limits.stall})
         config = uvicorn.Config(
             app,
@@ -290,8 +306,8 @@ class HttpThread:
         )
         config.load()
         config.ssl = tls
-        self._server = _Server(config)
-        self._loop = _Loop(limits.head)
+        self._loop = loop = _Loop(limits.head)
+        self._server = _Server(config, lambda: bool(protocol.waiting or loop.shaking))
         self._thread = threading.Thread(target=self._run, name=name, daemon=True)
         self._thread.start()
         end = time.monotonic() + START

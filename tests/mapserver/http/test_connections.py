@@ -7,6 +7,7 @@ import socket
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 
 import numpy as np
 import pytest
@@ -252,6 +253,24 @@ def test_a_request_in_work_is_answered_when_the_server_ends(services: StubServic
         assert begun.wait(10.0)
         served.close()
         assert answer.result()[0] == 200 and b"late" in answer.result()[2]
+
+
+def test_requests_that_come_as_the_server_ends_are_answered(served: Web) -> None:
+    """They were reset, or got neither an answer nor an end until the process had ended."""
+    with ExitStack() as stack:
+
+        def connect() -> socket.socket:
+            return stack.enter_context(socket.create_connection(("127.0.0.1", served.port), timeout=20))
+
+        connected = [connect() for _ in range(3)]
+        eventually(lambda: served.connections == 3)
+        # It does nothing while they come.
+        served._loop.call_soon_threadsafe(time.sleep, 0.5)
+        clients = [*connected, *(connect() for _ in range(3))]
+        for client in clients:
+            client.sendall(b"GET /status HTTP/1.1\r\nHost: localhost\r\n\r\n")
+        served.close()
+        assert [client.recv(12) for client in clients] == [b"HTTP/1.1 200"] * 6
 
 
 def test_noise_instead_of_http(served: Web) -> None:
