@@ -136,9 +136,11 @@ def test_the_map_is_corrected_on_the_page(browser: Browser, server: MapServer, t
     assert isinstance(closure, Closure) and closure.begin_ns == int(zone.timestamp()) * 10**9
     assert closure.end_ns == closure.begin_ns + int(6.5 * 3600) * 10**9
     person.fill("edit-nodes", f"{A}.1 {LAST}")
+    assert f"no edge joins {A}.1 and {LAST}" in person.edit("preference", "carpet", factor=0.5)
+    person.fill("edit-nodes", f"{A}.3 {LAST}")
     person.edit("preference", "carpet", factor=0.5)
     person.apply()
-    assert annotation(server).body == Preference(0.5, (NodeId(*A, 1), LAST))
+    assert annotation(server).body == Preference(0.5, (NodeId(*A, 3), LAST))
     person.fill("edit-nodes", str(FIRST))
     person.edit("floor", "upstairs", label="upper")
     person.apply()
