@@ -48,6 +48,7 @@ from mapweave.mapserver.node_views import NodeViews
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.plan_service import PlanService
 from mapweave.mapserver.pose_broadcast import PoseBroadcast
+from mapweave.mapserver.prompt_reading import PromptReading
 from mapweave.mapserver.quotas import Quotas, QuotaSettings
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.roster import Roster
@@ -159,7 +160,10 @@ class MapServer:
         )
         self._blockages = Blockages()
         self._quotas = Quotas(s.quotas, clock.monotonic)
-        self._traffic, self._lost = self._store.traffic(), self._damaged()
+        self._counting = clock.executor(1)
+        self._counts = PromptReading(
+            lambda: (self._store.traffic(), self._damaged()), self._counting, clock.monotonic
+        )
 
     def __enter__(self) -> MapServer:
         """Begin to serve."""
@@ -237,6 +241,7 @@ class MapServer:
         self._broadcast.close()
         self._cluster.close()
         self._worker.close()
+        self._counting.shutdown()
         self._store.close()
 
     def summary(self) -> str:
@@ -264,18 +269,13 @@ class MapServer:
     def status(self) -> dict[str, Scalar]:
         """What the server holds and does, by name."""
         merged = self._worker.answers.merged
-        failure = self._ingest.failure
-        try:
-            self._traffic, self._lost = self._store.traffic(), self._damaged()
-        except InvalidFile as error:
-            failure = str(error)
-        traffic = self._traffic
+        (traffic, damaged), unread = self._counts.newest()
         return {
             **merged.counts(),
             **({"leads": self._store.leads} if self._store.shared else {}),
             "over_quota": ", ".join(self._quotas.over())[:1000],
-            "damaged": self._lost,
-            "event": failure or self._worker.event,
+            "damaged": damaged,
+            "event": self._ingest.failure or unread or self._worker.event,
             "settled": self._worker.settled,
             "merged": self._worker.begun,
             "bytes": traffic.payload_bytes,

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import logging
+import os
 import re
 import secrets
+import socket
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -61,6 +63,10 @@ NOISE = re.compile(
     r"| Is the server running .*?\?"
 )
 """What libpq says around a reason, when host and port are named already."""
+LOST = re.compile(
+    r"^consuming input failed: | This probably means the server terminated abnormally before or while .*\."
+)
+"""And around one that says all: the server closed the connection unexpectedly."""
 NO_PASSWORD = "no password supplied"
 
 # It logs what it ignores when a connection is lost; the error itself is raised and reported.
@@ -152,8 +158,44 @@ class PostgresSession:
         self._prepare = prepare
         self._mark = ""
         self._connection: psycopg.Connection | None = None
+        self._socket: socket.socket | None = None
+        """The connection's, once more: it is still open when another thread ends what it carries."""
+        self._uses, self._used_since = 0, 0.0
+        self._place, self._given_up = "", False
         self._failure, self._retry_at = "", 0.0
         self._closed = False
+
+    @property
+    def used_since(self) -> float | None:
+        """Since when it is in use, s of the monotonic clock; None if it is not. From any thread."""
+        since = self._used_since
+        return since if self._uses else None
+
+    @property
+    def machine(self) -> str:
+        """For libpq: the one of the address's hosts that it is connected to; empty if it is to none.
+
+        From any thread.
+        """
+        connection = self._connection
+        try:
+            if connection is None or connection.closed:
+                return ""
+            at = connection.info
+            address = at.hostaddr or None
+            return make_conninfo(
+                self._conninfo, host=at.host, hostaddr=address, port=at.port, target_session_attrs="any"
+            )
+        except psycopg.Error:
+            return ""  # it was closed just now
+
+    def give_up(self) -> None:
+        """End the connection, from any thread: what waits for an answer gets an error."""
+        end = self._socket
+        self._given_up = True
+        with suppress(OSError):
+            if end is not None:
+                end.shutdown(socket.SHUT_RDWR)
 
     @property
     def is_open(self) -> bool:
@@ -178,6 +220,10 @@ class PostgresSession:
                 # A prepared statement is known by a number: with a pooler it could be another session's. Who
                 # uses transactions of `transaction` only may prepare some.
                 self._connection = psycopg.connect(self._conninfo, autocommit=True, prepare_threshold=None)
+                self._socket = socket.socket(fileno=os.dup(self._connection.pgconn.socket))
+                at = self._connection.info
+                (self._place,) = _places([at.host], [str(at.port)])
+                self._given_up = False
                 with self._connection.transaction():
                     self._claim(self._connection)
                     self._prepare(self._connection)
@@ -190,12 +236,20 @@ class PostgresSession:
     @contextmanager
     def guard(self) -> Iterator[None]:
         """Turn PostgreSQL's errors into InvalidFile with one line; what is broken is not used again."""
+        if not self._uses:
+            self._used_since = time.monotonic()
+        self._uses += 1
         try:
             yield
         except psycopg.Error as error:
+            reason = _reason(error)
             if self._connection is not None and self._connection.broken:
+                if self._given_up:
+                    reason = f"{self._place}: PostgreSQL answers nothing"
                 self._drop()
-            raise self._unusable(_reason(error)) from None
+            raise self._unusable(reason) from None
+        finally:
+            self._uses -= 1
 
     @contextmanager
     def transaction(self) -> Iterator[psycopg.Connection]:
@@ -236,9 +290,12 @@ class PostgresSession:
 
     def _drop(self) -> None:
         connection, self._connection = self._connection, None
+        end, self._socket = self._socket, None
         if connection is not None:
             with suppress(psycopg.Error):
                 connection.close()
+        if end is not None:
+            end.close()
 
 
 def _places(hosts: list[str], ports: list[str]) -> list[str]:
@@ -254,7 +311,7 @@ def _reason(error: psycopg.Error) -> str:
         return "another session holds what is to be changed; perhaps it waits for a standby"
     if isinstance(error, psycopg.errors.DivisionByZero):
         return SHARED
-    reason = " ".join(str(error).split())
+    reason = LOST.sub("", " ".join(str(error).split()))
     if reason.endswith(NO_PASSWORD):
         reason += ": ~/.pgpass (PGPASSFILE) has none for this host, port, database and user"
     _, *attempts = ATTEMPT.split(reason)

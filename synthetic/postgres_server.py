@@ -98,12 +98,21 @@ class PostgresServer:
             assert time.monotonic() < end, (self.folder / "log").read_text()
             time.sleep(0.02)
 
-    def kill(self) -> None:
-        """As a loss of power ends it: with every session, each of which has a process group of its own."""
-        postmaster = self.process.pid
+    def freeze(self) -> None:
+        """Have it stand still with every session, each of which has a process group of its own."""
         self.process.send_signal(signal.SIGSTOP)  # starts no more
-        children = Path(f"/proc/{postmaster}/task/{postmaster}/children").read_text().split()
-        sessions = [os.pidfd_open(int(child)) for child in children]
+        for child in self._children():
+            os.kill(child, signal.SIGSTOP)
+
+    def thaw(self) -> None:
+        """Go on after `freeze`."""
+        for process in (*self._children(), self.process.pid):
+            os.kill(process, signal.SIGCONT)
+
+    def kill(self) -> None:
+        """As a loss of power ends it: with every session."""
+        self.process.send_signal(signal.SIGSTOP)
+        sessions = [os.pidfd_open(child) for child in self._children()]
         self.process.kill()
         for session in sessions:
             with suppress(ProcessLookupError):
@@ -165,6 +174,10 @@ class PostgresServer:
             for (schema,) in schemas:
                 connection.execute(f"DROP SCHEMA {schema} CASCADE")
         return True
+
+    def _children(self) -> list[int]:
+        postmaster = self.process.pid
+        return [*map(int, Path(f"/proc/{postmaster}/task/{postmaster}/children").read_text().split())]
 
     def _environment(self) -> dict[str, str]:
         return {"PATH": os.environ["PATH"], "LC_ALL": "C", "PGHOST": str(self.folder), "PGUSER": ROLE}

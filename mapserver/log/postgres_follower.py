@@ -13,6 +13,7 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.store import EVERYTHING, News
 from mapweave.storage.postgres_session import RETRY, PostgresAddress, PostgresSession
+from mapweave.storage.postgres_watchdog import PostgresWatchdog
 
 log = logging.getLogger(__name__)
 
@@ -50,6 +51,7 @@ class PostgresFollower:
         name: str,
         own_session: Callable[[], int],
         changed: Callable[[News], None],
+        watchdog: PostgresWatchdog,
     ) -> None:
         """Begin to follow.
 
@@ -59,10 +61,12 @@ class PostgresFollower:
             own_session: PostgreSQL's number of the session with which this server writes.
             changed: called from the thread with what others have written; at the start, at least every few
                 seconds, and before this server leads, with everything.
+            watchdog: gives up the session if PostgreSQL stands still.
         """
         self._own_session, self._changed = own_session, changed
         ends = dict.fromkeys(("idle_session_timeout", "idle_in_transaction_session_timeout"), FROZEN)
         self._session = PostgresSession(address, f"mapweave {name} follows", ends, prepare=self._listen)
+        watchdog.add(self._session)
         self._leads = False
         self._failure = ""
         self._polled_at = 0.0

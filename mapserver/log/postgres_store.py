@@ -22,6 +22,7 @@ from mapweave.mapserver.log.postgres_name import ServerName
 from mapweave.mapserver.log.sql_store import SqlStore
 from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, ID, News, Run, fresh_id
 from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
+from mapweave.storage.postgres_watchdog import PostgresWatchdog
 
 log = logging.getLogger(__name__)
 
@@ -110,6 +111,7 @@ class PostgresStore(SqlStore):
             PostgresSession(self.address, self._server_name.session, options, not read_only, prepare)
             for prepare in (self._check_version if read_only else self._prepare_reader, self._prepare)
         )
+        self._watchdog = PostgresWatchdog(self._reader, self._writer)
         try:
             if not read_only:
                 self._take_name()
@@ -131,7 +133,9 @@ class PostgresStore(SqlStore):
 
     def follow(self, changed: Callable[[News], None]) -> None:
         """Have what other servers write reported; see `Store`."""
-        self._follower = PostgresFollower(self.address, self._name, lambda: self._session_id, changed)
+        self._follower = PostgresFollower(
+            self.address, self._name, lambda: self._session_id, changed, self._watchdog
+        )
 
     def close(self) -> None:
         """End the sessions. Idempotent."""
@@ -140,6 +144,7 @@ class PostgresStore(SqlStore):
         for lock, session in ((self._write_lock, self._writer), (self._read_lock, self._reader)):
             with lock:
                 session.close()
+        self._watchdog.close()
 
     def _take_name(self) -> None:
         # A pooler of transactions would keep the lock: it is found out by the second session.

@@ -118,3 +118,18 @@ def test_a_connection_that_is_lost_in_a_pipeline_says_no_more_than_its_error(
         session.connection.execute("SELECT 1").fetchone()
     session.close()
     assert not caplog.records
+
+
+def test_a_server_that_was_killed_is_named_without_guesses() -> None:
+    servers = started()
+    server = next(servers)
+    session = PostgresSession(PostgresAddress.read(server.address()), "test")
+    try:
+        connection = session.connection
+        server.kill()
+        with pytest.raises(InvalidFile) as lost, session.guard():
+            connection.execute("SELECT 1")
+        assert str(lost.value).endswith("cannot be used (server closed the connection unexpectedly)")
+    finally:
+        session.close()
+        servers.close()
