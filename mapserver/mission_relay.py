@@ -70,6 +70,7 @@ class MissionRelay:
         store: Store,
         places: Callable[[], Places],
         time_ns: Callable[[], int],
+        later: Callable[[Callable[[], None]], None],
     ) -> None:
         """Go on with the record of the store.
 
@@ -79,12 +80,15 @@ class MissionRelay:
             store: keeps the record.
             places: of the newest merged map.
             time_ns: the present time.
+            later: has something done soon, and does not wait for it.
         """
+        self._later = later
         self._bus, self._keys, self._store, self._places, self._time_ns = bus, keys, store, places, time_ns
         self.roster: Roster | None = None
-        self._turn = threading.RLock()
+        # A commit may wait for a standby of PostgreSQL: what is known is never held up by it.
+        self._turn, self._writing = threading.RLock(), threading.Lock()
         self._reports: dict[_Key, MissionReport] = {}
-        self._overwritten = False
+        self._overwritten = self._unwritten = self._write_is_due = False
         self.reload()
 
     def reload(self) -> None:
@@ -109,6 +113,10 @@ class MissionRelay:
                 or (report.state is not held.state and report.supersedes(held))
                 for report in self.missions().reports
             )
+
+    def close(self) -> None:
+        """Write what is not written yet."""
+        self._write()
 
     def missions(self) -> Missions:
         """All that are known, oldest first."""
@@ -176,15 +184,21 @@ class MissionRelay:
         # That one is on its way only the server can say: it would try to hand it on.
         if report is None or report.state is MissionState.SENT:
             return
-        self._note(report)
-        self._replace_older(report.order)
+        self._take(report)
+        self._take_replaced(report.order)
+        with self._turn:
+            if not self._unwritten or self._write_is_due:
+                return
+            self._write_is_due = True
+        # This is called where questions of lost robots are taken.
+        self._later(self._write)
 
     def retry(self) -> None:
         """Try to hand on what robots could not be reached for, and write what is not in the record."""
         with self._turn:
-            if self._overwritten:
-                self._keep()
+            self._unwritten |= self._overwritten
             waiting = [report for report in self._reports.values() if report.state is MissionState.SENT]
+        self._write()
         orders: list[MissionOrder] = []
         for report in waiting:
             robot, age = report.order.robot, (self._time_ns() - report.order.stamp_ns) * 1e-9
@@ -216,6 +230,11 @@ class MissionRelay:
         return MissionReport(order, MissionState.SENT)
 
     def _replace_older(self, order: MissionOrder, *states: MissionState) -> None:
+        """See `_take_replaced`; it is on the disk then."""
+        self._take_replaced(order, *states)
+        self._write()
+
+    def _take_replaced(self, order: MissionOrder, *states: MissionState) -> None:
         """A robot's mission ends those that it replaces, of these states or of all that are open."""
         with self._turn:
             older = [
@@ -227,7 +246,7 @@ class MissionRelay:
             ]
         for report in older:
             reason = f"by mission {order.id} of {order.by}"
-            self._note(replace(report, state=MissionState.REPLACED, reason=reason))
+            self._take(replace(report, state=MissionState.REPLACED, reason=reason))
 
     def _hand_on(self, order: MissionOrder) -> MissionReport:
         return self._answered(order, self._give(order))
@@ -254,7 +273,13 @@ class MissionRelay:
         return self._note(MissionReport(order, MissionState.SENT, 0.0, reason))
 
     def _note(self, report: MissionReport) -> MissionReport:
-        """Keep a report, on the disk if the state is new; returns what holds.
+        """See `_take`; what is new is on the disk then."""
+        taken = self._take(report)
+        self._write()
+        return taken
+
+    def _take(self, report: MissionReport) -> MissionReport:
+        """Keep a report, to be written if the state is new; returns what holds.
 
         Raises:
             InvalidValue: no message may hold it.
@@ -269,17 +294,21 @@ class MissionRelay:
                 # A robot says what has become of an order, and not what was ordered, or by whose name.
                 report = replace(report, order=before.order)
             self._reports[_key(report.order)] = report
-            if before is not None and before.state is report.state:
-                return report
-            self._keep()
+            if before is None or before.state is not report.state:
+                self._unwritten = True
+                if len(self._reports) > MAX_KEPT:
+                    self._reports = {_key(one.order): one for one in self.missions().reports}
             return report
 
-    def _keep(self) -> None:
-        """Write the record, with the turn."""
-        kept, self._overwritten = self.missions(), False
-        if len(self._reports) > MAX_KEPT:
-            self._reports = {_key(report.order): report for report in kept.reports}
-        try:
-            self._store.put_result(KEPT, encode(kept))
-        except InvalidFile as error:
-            log.warning("the record of missions is not on the disk: %s", error)
+    def _write(self) -> None:
+        """Write the record if there is anything new."""
+        with self._writing:
+            with self._turn:
+                self._write_is_due = False
+                if not self._unwritten:
+                    return
+                kept, self._unwritten, self._overwritten = self.missions(), False, False
+            try:
+                self._store.put_result(KEPT, encode(kept))
+            except InvalidFile as error:
+                log.warning("the record of missions is not on the disk: %s", error)

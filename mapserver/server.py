@@ -182,7 +182,9 @@ class MapServer:
         self._cluster.start()
         worker.start()
         base = self._base
-        self._missions = MissionRelay(self._bus, self._keys, self._store, self._named_places, clock.time_ns)
+        self._missions = MissionRelay(
+            self._bus, self._keys, self._store, self._named_places, clock.time_ns, clock.post
+        )
         self._roster = Roster(
             self._bus, self._keys, clock.monotonic, self._hear, self._quotas, lambda: self._ingest.lags()
         )
@@ -241,6 +243,7 @@ class MapServer:
         self._broadcast.close()
         self._cluster.close()
         self._worker.close()
+        self._missions.close()
         self._counting.shutdown()
         self._store.close()
 

@@ -201,7 +201,9 @@ def test_two_servers_that_write_at_once_lose_no_mission_of_each_other() -> None:
     record: Any = SharedRecord()
 
     def relay() -> MissionRelay:
-        return MissionRelay(MemoryBus(MemoryHub()), KEYS, record, pytest.fail, time.time_ns)
+        return MissionRelay(
+            MemoryBus(MemoryHub()), KEYS, record, pytest.fail, time.time_ns, lambda job: job()
+        )
 
     first, second = relay(), relay()
     for one, robot in ((first, "r1"), (second, "r2")):
@@ -213,6 +215,28 @@ def test_two_servers_that_write_at_once_lose_no_mission_of_each_other() -> None:
         one.retry()
     assert record.writes == 3, "once each, and again what the second wrote over"
     assert [report.order.robot for report in relay().missions().reports] == ["r1", "r2"]
+
+
+def test_a_record_that_cannot_be_written_now_holds_up_no_robot_and_no_reader(house: House) -> None:
+    """As with a PostgreSQL whose standby is away: the commit waits until there is one."""
+    link, _ = house.robot()
+    eventually(lambda: house.entry("r0").alive)
+    store, writes = house.server._store, threading.Event()
+    write = store.put_result
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(store, "put_result", lambda name, value: writes.wait(20.0) and write(name, value))
+        order = MissionOrder.new("r0", MissionKind.EXPLORE, "anna")
+        status = Status("standing", "", 0, 0, Pose2(), False)
+        began = time.monotonic()
+        house.server._missions.hear(
+            AgentStatus(status, 1, "r0", 1, mission=MissionReport(order, MissionState.RUNNING))
+        )
+        assert [one.order for one in house.server.missions().reports] == [order]
+        assert time.monotonic() < began + 5.0
+        assert store.result(mission_relay.KEPT) is None
+        writes.set()
+        eventually(lambda: store.result(mission_relay.KEPT) is not None)
+    link.close()
 
 
 def test_a_mission_for_a_robot_that_stays_away_expires(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
