@@ -225,9 +225,9 @@ def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
             )
             eventually(lambda: ": linked: " in page.run(TEXT.format("result")))
             assert page.run("return document.querySelectorAll('#result svg .agree').length") >= 10
-            assert page.run("return mapweave.painter.link") >= 0
-            # It is undone, and taken back.
             a, b = page.run("return ['a', 'b'].map(name => document.getElementById(name).value)")
+            assert page.run("return mapweave.painter.ways") == [{"a": a, "b": b, "dashed": False}]
+            # It is undone, and taken back.
             standing = f"explain?a={a}&b={b}"
             page.run(
                 "[...document.querySelectorAll('#result button')]"

@@ -40,6 +40,7 @@ export async function listCorrections() {
   show();
 }
 function show() {
+  const focus = [...list.querySelectorAll("button")].indexOf(document.activeElement);
   list.textContent = "";
   byId("corrected").hidden = !entries.length;
   for (const { words, time, in_force: holds, after, undo } of entries) {
@@ -58,6 +59,8 @@ function show() {
     });
     back.setAttribute("aria-label", `${does}: ${words}`);
   }
+  const buttons = list.querySelectorAll("button");
+  if (focus >= 0) buttons[Math.min(focus, buttons.length - 1)]?.focus();
 }
 onPermission(permission => { allowed = permission.allowed; show(); });
 document.addEventListener("mapchanged", listCorrections);

@@ -10,6 +10,7 @@ export function add(parent, name, text, kind) {
   if (kind) child.className = kind;
   return child;
 }
+export function made(name, text, kind) { return add(document.createDocumentFragment(), name, text, kind); }
 export function draw(parent, name, values) {
   const child = parent.appendChild(document.createElementNS(SVG, name));
   for (const key in values) child.setAttribute(key, values[key]);
@@ -21,6 +22,24 @@ export function button(parent, text, act) {
   made.addEventListener("click", act);
   return made;
 }
+// A list with a button in each item, `{ text, key, act, before, after }`: what stays is the same element, so that a press and
+// the focus hold while the rest changes. An item is known by its key, the text unless it is given.
+export function listed(list, items) {
+  const there = new Map([...list.children].map(one => [one.dataset.key, one]));
+  const kept = items.map(({ text, key = text, act, before = [], after = [] }) => {
+    const item = there.get(key) || document.createElement("li");
+    there.delete(key);
+    const choice = item.querySelector("button") || button(item, text, () => {});
+    choice.onclick = act;
+    for (const part of [...item.childNodes]) if (part !== choice) part.remove();
+    choice.before(...before);
+    choice.after(...after);
+    item.dataset.key = key;
+    return item;
+  });
+  for (const one of [...list.children]) if (!kept.includes(one)) one.remove();
+  kept.forEach((one, k) => { if (list.children[k] !== one) list.insertBefore(one, list.children[k] || null); });
+}
 export function facts(parent, rows) {
   const list = add(parent, "dl");
   for (const [name, value, kind] of rows) {
@@ -30,7 +49,8 @@ export function facts(parent, rows) {
   }
   return list;
 }
-export const degrees = rad => `${(rad * 180 / Math.PI).toFixed(0)}\u00b0`;
+// No -0.
+export const degrees = rad => `${Math.round(rad * 180 / Math.PI) + 0}\u00b0`;
 export const percent = share => share > 0.9999 ? "over 99.99 %" : `${(100 * share).toFixed(share > 0.99 ? 2 : 0)} %`;
 export const metres = ([x, y, turn]) =>
   `${x.toFixed(3)} m ahead, ${y.toFixed(3)} m left, ${(turn * 180 / Math.PI).toFixed(1)}\u00b0`;

@@ -39,7 +39,7 @@ export async function showNode(name, { select, why, send, edit }) {
     ["in its own map", pose(node.map_from_robot)],
     ["landmarks", `${node.landmarks}, ${node.with_depth} with a depth, ${node.faded.length} faded`],
     ["on the wire", `${node.bytes} bytes`],
-    ["taken", node.stamp_ns > 1e18 ? when(node.stamp_ns) : `${(node.stamp_ns / 1e9).toFixed(1)} s`],
+    ["taken", node.stamp_ns > 1e18 ? when(node.stamp_ns) : `at ${(node.stamp_ns / 1e9).toFixed(1)} s of its robot's clock`],
     ["superseded", fate ? `by ${fate.by}, ${fate.distance.toFixed(2)} m off, ${counted(fate.found, "landmark")} found again` : "no"],
   ]);
   const actions = add(box, "div", "", "actions");

@@ -1,5 +1,5 @@
 // The page: what comes over the WebSocket goes to the map and the panels, what is chosen on one shows on all.
-import { add, button, byId, counted, draw } from "./dom.js";
+import { add, button, byId, counted, draw, listed, made } from "./dom.js";
 import { colours, edgeColour, followTheme, hue } from "./colours.js";
 import { drawAnnotations, loadAnnotations } from "./annotations.js";
 import { permit } from "./changes.js";
@@ -39,7 +39,7 @@ window.mapweave = { model, viewport, painter, page, selection, drawing, planEdit
 
 function selectNode(name, move = true) {
   const row = model.rowOf(name);
-  page.node = name; page.robot = painter.robot = ""; painter.link = -1;
+  page.node = name; page.robot = painter.robot = ""; painter.ways = [];
   leaveRobot();
   painter.selected = row ?? -1;
   if (row !== undefined && move) viewport.show(model.x[row], model.y[row]);
@@ -78,15 +78,22 @@ function selectRobot(name, goal = page.node) {
 }
 function showWhy(question) {
   openTab("why");
-  markLink(question.a, question.b);
   return explain(question);
 }
-function markLink(a, b) {
-  const [i, j] = [a, b].map(name => model.rowOf(name));
-  painter.link = model.links.find(row => {
-    const [p, q] = [model.edges.a[row], model.edges.b[row]];
-    return (p === i && q === j) || (p === j && q === i);
-  }) ?? -1;
+// On the map: the two nodes that are explained, or the steps of a route; dashed what joins none. All of it is in view.
+function markWays({ a, b, standing, hops = [], gaps = [] }) {
+  painter.ways = a?.id ? [{ a: a.id, b: b.id, dashed: !["linked", "own"].includes(standing) }]
+    : [...hops, ...gaps.map(gap => ({ ...gap, dashed: true }))];
+  const rows = painter.ways.flatMap(way => [way.a, way.b]).map(name => model.rowOf(name)).filter(row => row !== undefined);
+  const seen = row => {
+    const [u, v] = viewport.toScreen(model.x[row], model.y[row]);
+    return u >= 0 && v >= 0 && u <= viewport.width && v <= viewport.height;
+  };
+  if (!rows.every(seen)) {
+    const xs = rows.map(row => model.x[row]), ys = rows.map(row => model.y[row]);
+    viewport.fit([Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)]);
+    viewport.touched = true;
+  }
   painter.ask();
 }
 function chosen(u, v, shift) {
@@ -130,15 +137,14 @@ function find(text) {
 function fit() { viewport.fit(model.bounds()); viewport.touched = false; painter.ask(); }
 
 function listComponents() {
-  const list = byId("components");
-  list.textContent = "";
-  model.components.forEach(({ anchor, nodes, maps, floor }, k) => {
-    const item = add(list, "li");
-    add(item, "span", "", "swatch").style.background = hue(anchor);
-    button(item, `component ${k}`, () => { viewport.fit(model.bounds(model.members[k])); painter.ask(); });
+  listed(byId("components"), model.components.map(({ anchor, nodes, maps, floor }, k) => {
+    const swatch = made("span", "", "swatch");
+    swatch.style.background = hue(anchor);
     const some = maps.length > 6 ? `${maps.slice(0, 6).join(", ")} and ${maps.length - 6} more` : maps.join(", ");
-    item.append(` ${floor ? `floor ${floor}, ` : ""}${counted(nodes, "node")} of ${some}`);
-  });
+    return { text: `component ${k}`, before: [swatch],
+      act: () => { viewport.fit(model.bounds(model.members[k])); painter.ask(); },
+      after: [` ${floor ? `floor ${floor}, ` : ""}${counted(nodes, "node")} of ${some}`] };
+  }));
 }
 function listNames() {
   const robots = page.robots.map(one => one.robot);
@@ -169,7 +175,7 @@ function drawLegend() {
 painter.underlays.push(drawPlans);
 // Where the photo may have been taken.
 painter.overlays.push(drawAnnotations, (c, v) => {
-  selection.draw(c, v);
+  if (isOpen("edit")) selection.draw(c, v);
   drawing.draw(c, v);
   planEditor.drawMarks(c, v);
   if (isOpen("edit") && (drawing.shape || planEditor.open) && byId("canvas").matches(":focus-visible")) crosshair(c, v);
@@ -205,7 +211,6 @@ watch({
     byId("empty").hidden = model.order.length > 0;
     if (!viewport.touched) viewport.fit(model.bounds());
     if (selected) painter.selected = model.rowOf(selected) ?? -1;
-    painter.link = -1;
     panel.counts();
     listComponents();
     listNames();
@@ -248,11 +253,11 @@ async function loadSaid() {
 setInterval(loadSaid, SAID_EVERY);
 
 document.addEventListener("mapchanged", loadSaid);
-document.addEventListener("tabopened", openPlan);
+document.addEventListener("tabopened", () => { openPlan(); moved(); });
 byId("opacity").addEventListener("input", moved);
 
 explanation.edit = edit;
-explanation.shown = answer => { if (answer.a?.id) markLink(answer.a.id, answer.b.id); };
+explanation.shown = markWays;
 followTheme(() => { drawLegend(); listComponents(); painter.changed(); planEditor.draw(); });
 drawLegend();
 listenToTabs(name => { if (name === "why" && !byId("result").textContent) explain({}, false); });

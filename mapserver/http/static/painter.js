@@ -15,7 +15,7 @@ const words = robot => robot.name + (robot.doing ? `: ${robot.doing}` : "");
 
 export class Painter {
   constructor(canvas, model, viewport) {
-    Object.assign(this, { canvas, model, viewport, robots: [], underlays: [], overlays: [], selected: -1, link: -1, robot: "" });
+    Object.assign(this, { canvas, model, viewport, robots: [], underlays: [], overlays: [], selected: -1, ways: [], robot: "" });
     this.bitmap = this.drawn = null; this.stale = this.waiting = this.asked = false; this.kept = [];
     this.worker = new Worker(new URL("map_bitmap.js", import.meta.url));
     this.worker.onmessage = ({ data: { bitmap, view } }) => {
@@ -94,13 +94,15 @@ export class Painter {
   }
   marks(c) {
     const { model: m, viewport: v } = this;
-    if (this.link >= 0 && m.edges.kind[this.link]) {
-      c.strokeStyle = colours.select; c.lineWidth = 3;
-      c.beginPath();
-      c.moveTo(...v.toScreen(m.x[m.edges.a[this.link]], m.y[m.edges.a[this.link]]));
-      c.lineTo(...v.toScreen(m.x[m.edges.b[this.link]], m.y[m.edges.b[this.link]]));
-      c.stroke();
+    c.strokeStyle = colours.select; c.lineWidth = 3;
+    for (const { a, b, dashed } of this.ways) {
+      const [i, j] = [m.rowOf(a), m.rowOf(b)];
+      // Components lie beside each other as there is room.
+      if (i === undefined || j === undefined || m.nodes.component[i] !== m.nodes.component[j]) continue;
+      c.setLineDash(dashed ? [6, 5] : []);
+      c.beginPath(); c.moveTo(...v.toScreen(m.x[i], m.y[i])); c.lineTo(...v.toScreen(m.x[j], m.y[j])); c.stroke();
     }
+    c.setLineDash([]);
     if (this.selected >= 0 && m.nodes.state?.[this.selected]) {
       const [u, w] = v.toScreen(m.x[this.selected], m.y[this.selected]);
       c.strokeStyle = colours.select; c.lineWidth = 2;

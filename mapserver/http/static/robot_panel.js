@@ -1,5 +1,5 @@
 // Robots: the list of all, and one with its missions. POST /robots/...
-import { add, ask, button, byId, counted, degrees, facts, percent, seconds } from "./dom.js";
+import { add, ask, button, byId, counted, degrees, facts, listed, made, percent, seconds } from "./dom.js";
 import { wordsOf } from "./names.js";
 
 const QUIET = 5; // s without a status
@@ -26,21 +26,15 @@ function missionWords(mission) {
   return `${order.kind}${goal ? " to " + goal : ""}, ${state}${share}${why} (by ${order.by})`;
 }
 export function listRobots(robots, select, none) {
-  const list = byId("robots"), focus = document.activeElement?.dataset?.robot;
-  list.textContent = "";
-  if (!robots.length) add(list, "li", none, "soft");
-  for (const robot of robots) {
-    const item = add(list, "li"), [word, kind] = life(robot), status = robot.status;
-    const choice = button(item, robot.robot, () => select(robot.robot));
-    choice.dataset.robot = robot.robot;
-    add(item, "span", ` ${word}`, kind);
-    if (robot.over_quota) add(item, "span", ", over its quota", "bad");
-    if (robot.accusation) add(item, "span", " not trusted", "bad").title = robot.accusation;
+  listed(byId("robots"), robots.map(robot => {
+    const [word, kind] = life(robot), status = robot.status, after = [made("span", ` ${word}`, kind)];
+    if (robot.over_quota) after.push(made("span", ", over its quota", "bad"));
+    if (robot.accusation) after.push(Object.assign(made("span", " not trusted", "bad"), { title: robot.accusation }));
     const parts = [status?.status.doing, status?.battery != null ? `battery ${percent(status.battery)}` : "",
       robot.component < 0 ? "not on the map" : "", robot.place && `at ${robot.place}`, robot.floor && `floor ${robot.floor}`];
-    item.append(" " + parts.filter(Boolean).join(", "));
-    if (focus === robot.robot) choice.focus();
-  }
+    return { text: robot.robot, act: () => select(robot.robot), after: [...after, " " + parts.filter(Boolean).join(", ")] };
+  }));
+  if (!robots.length) add(byId("robots"), "li", none, "soft");
 }
 // The frame of the panel is made once, so that a goal can be typed while statuses come.
 export function showRobot(name, whyNot, goal) {

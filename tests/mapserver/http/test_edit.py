@@ -17,6 +17,7 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.wall_time import utc_words
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.server import MapServer
@@ -141,6 +142,10 @@ def test_the_map_is_corrected_on_the_page(browser: Browser, server: MapServer, t
     person.edit("preference", "carpet", factor=0.5)
     person.apply()
     assert annotation(server).body == Preference(0.5, (NodeId(*A, 3), LAST))
+    # In the list with their figures: a closure that does not hold yet must not look like one that does.
+    between = f"from {utc_words(closure.begin_ns)} until {utc_words(closure.end_ns)}"
+    eventually(lambda: f"paint closure {between}" in person.text("places"))
+    eventually(lambda: f"{A}.3 {LAST} preferred: cost times 0.5" in person.text("places"))
     person.fill("edit-nodes", str(FIRST))
     person.edit("floor", "upstairs", label="upper")
     person.apply()

@@ -150,6 +150,17 @@ def test_the_page_shows_the_route_of_its_form_and_of_its_address(served: Web, br
     browser.run("document.querySelector('[name=route]').click()")
     eventually(lambda: f"{start} to {goal}: the route is: {explanation.reason}" in browser.run(RESULT))
     assert browser.run(LINKS) == [f"{hop.a} - {hop.b}" for hop in explanation.hops]
+    # On the map, too, all of it in view; a step is there alone once it is asked about.
+    steps = "return mapweave.painter.ways.map(way => `${way.a} - ${way.b}`)"
+    assert browser.run(steps) == [f"{hop.a} - {hop.b}" for hop in explanation.hops]
+    browser.run("mapweave.viewport.show(99, 99)")
+    browser.run("document.querySelector('[name=route]').click()")
+    inside = (
+        "const m = mapweave.model, v = mapweave.viewport; return mapweave.painter.ways.every(({ a }) => {"
+        "const row = m.rowOf(a), [x, y] = v.toScreen(m.x[row], m.y[row]);"
+        "return x > 0 && y > 0 && x < v.width && y < v.height })"
+    )
+    eventually(lambda: browser.run(inside))
     address = browser.run("return location.href")
     assert address.endswith(f"/why?a={start}&b={goal}&route=1")
     browser.open(f"http://127.0.0.1:{served.port}/why")
@@ -157,6 +168,7 @@ def test_the_page_shows_the_route_of_its_form_and_of_its_address(served: Web, br
     eventually(lambda: f"{start} to {goal}: the route is" in browser.run(RESULT))
     browser.run("document.querySelector('#result a').click()")
     eventually(lambda: f"{explanation.hops[0].a} and {explanation.hops[0].b}: " in browser.run(RESULT))
+    assert browser.run(steps) == [f"{explanation.hops[0].a} - {explanation.hops[0].b}"]
 
 
 @pytest.mark.slow

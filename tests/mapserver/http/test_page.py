@@ -15,7 +15,9 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, SimilarPlace
 from mapweave.mapserver.http.web import Web
 from tests.browser import PROGRAMS, Browser, there_is_none
-from tests.mapserver.stub_services import PLACE, StubServices, picture
+from tests.mapserver.http.person import Person
+from tests.mapserver.http.test_live import less
+from tests.mapserver.stub_services import PLACE, StubServices, picture, two_maps
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
@@ -256,3 +258,44 @@ def test_a_map_without_room_is_drawn_when_it_has_some(page: Browser) -> None:
     drawn = "const p = mapweave.painter; return !p.stale && !p.waiting && p.drawn.scale === p.viewport.scale"
     eventually(lambda: page.run(drawn))
     assert page.run("return document.getElementById('undrawn').hidden")
+
+
+def test_an_angle_is_never_minus_nothing(page: Browser) -> None:
+    degrees = "return import('/static/dom.js').then(({ degrees }) => [-0.001, 0.5, -3.2].map(degrees))"
+    assert page.run(degrees) == ["0°", "29°", "-183°"]
+
+
+def test_lists_that_change_keep_what_is_pressed_or_has_the_focus(
+    page: Browser, services: StubServices
+) -> None:
+    """Each status made all of them again: a click that a status came into was lost, and so was the focus."""
+    services.said = Annotations((Annotation("hall", Place(NodeId("r0", 1, 1)), False, "anna", 1),))
+    services.fleet = FleetStatus((RobotEntry("r0", True), RobotEntry("r1", True)))
+    person = Person(page)
+    eventually(lambda: "r1" in person.text("robots") and "hall" in person.text("places"))
+    x, y = page.run(
+        "const box = document.querySelector('#robots li:nth-child(2) button').getBoundingClientRect();"
+        "return [box.left + 5, box.top + 5]"
+    )
+    mouse = {"x": x, "y": y, "button": "left", "buttons": 1, "clickCount": 1}
+    page.devtools("Input.dispatchMouseEvent", type="mousePressed", **mouse)
+    services.fleet = FleetStatus(tuple(RobotEntry(name, True) for name in ("r0", "r1", "r2")))
+    eventually(lambda: "r2" in person.text("robots"))
+    page.devtools("Input.dispatchMouseEvent", type="mouseReleased", **mouse)
+    eventually(lambda: "Robot r1" in person.text("selected"))
+    services.fleet = FleetStatus((RobotEntry("r1", False), RobotEntry("r3", True)))
+    eventually(lambda: person.text("robots") == "r1 gone not on the mapr3 alive not on the map")
+    # With the keyboard.
+    person.press("tab-fleet")
+    focused = "return document.activeElement.textContent"
+    page.run("document.querySelector('#components button').focus()")
+    services.map = less(two_maps())
+    eventually(lambda: "12 nodes" not in person.text("components"))
+    assert page.run(focused) == "component 0"
+    page.run("document.querySelector('#places button').focus()")
+    services.said = Annotations(
+        (Annotation("attic", Place(NodeId("r0", 1, 1)), False, "anna", 1), *services.said.made)
+    )
+    page.run("document.dispatchEvent(new CustomEvent('mapchanged'))")
+    eventually(lambda: "attic" in person.text("places"))
+    assert page.run(focused) == "hall"
