@@ -65,6 +65,7 @@ export class PlanEditor {
     this.changed();
   }
   shown() {
+    this.pane.sha256 = this.image.sha256;
     this.pane.image = imageOf(this.image.sha256, () => this.pane.fit());
     this.show();
     this.pane.fit();

@@ -1,12 +1,13 @@
 // The image of a floor plan beside the map: moved and zoomed as the map is, with the pixels of the pairs.
 import { colours } from "./colours.js";
 import { listen } from "./input.js";
+import { inTheme } from "./plans.js";
 import { Viewport } from "./viewport.js";
 
 // The viewport's plane is that of the pixels: x is u, y is -v.
 export class PlanPane {
   constructor(canvas, clicked) {
-    Object.assign(this, { canvas, viewport: new Viewport(), image: null, marks: { pairs: [], pixel: null } });
+    Object.assign(this, { canvas, viewport: new Viewport(), image: null, sha256: "", marks: { pairs: [], pixel: null } });
     const toPixel = (u, v) => { const [x, y] = this.viewport.toPlane(u, v); return [x, -y]; };
     listen(canvas, this.viewport, { moved: () => this.draw(), fit: () => this.fit(),
       chosen: (u, v) => { if (this.image) clicked(...toPixel(u, v)); } });
@@ -34,7 +35,7 @@ export class PlanPane {
     if (this.image?.complete && this.image.naturalWidth) {
       const [left, top] = v.toScreen(0, 0);
       c.imageSmoothingEnabled = v.scale < 4;
-      c.drawImage(this.image, left, top, this.image.naturalWidth * v.scale, this.image.naturalHeight * v.scale);
+      c.drawImage(inTheme(this.sha256, this.image), left, top, this.image.naturalWidth * v.scale, this.image.naturalHeight * v.scale);
     }
     this.marks.pairs.forEach((pair, k) => mark(c, ...v.toScreen(pair.u, -pair.v), k + 1));
     if (this.marks.pixel) mark(c, ...v.toScreen(this.marks.pixel.u, -this.marks.pixel.v), "");

@@ -30,8 +30,9 @@ export function imageOf(sha256, loaded = () => {}) {
   if (!image.complete) image.addEventListener("load", loaded);
   return image;
 }
-// Black on white becomes white on black: on white the colours of the dark theme could not be read.
-function inDark(sha256, image) {
+// In the dark theme black on white becomes white on black: on white its colours could not be read.
+export function inTheme(sha256, image) {
+  if (!isDark()) return image;
   const { naturalWidth: width, naturalHeight: height } = image;
   if (width * height > LARGEST) return image;
   if (!inverted.has(sha256)) {
@@ -57,7 +58,7 @@ export function drawPlans(c, viewport, model) {
       c.save();
       // The page's v points down, the plane's y up.
       c.transform(s * a, -s * b, s * e, -s * d, u, v);
-      c.drawImage(isDark() ? inDark(plan.image.sha256, image) : image, 0, 0);
+      c.drawImage(inTheme(plan.image.sha256, image), 0, 0);
       c.restore();
       drawn = true;
     }

@@ -256,6 +256,12 @@ def test_a_plan_is_laid_under_the_map_on_the_page(
         person.fill("opacity", 100)
         browser.look(1280, 800, "dark")
         eventually(lambda: browser.run(pixel) == 255 - 215)
+        # As in the pane beside it.
+        paper = (
+            "const canvas = document.getElementById('plan-canvas'), c = canvas.getContext('2d');"
+            "return c.getImageData(canvas.width / 2 + 30, canvas.height / 2 + 30, 1, 1).data[0]"
+        )
+        eventually(lambda: browser.run(paper) == 255 - 215)
         browser.look(1280, 800)
         person.fill("plan-because", "by the architect")
         person.press("plan-save")
