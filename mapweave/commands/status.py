@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import math
+import re
 import sys
 import time
 from contextlib import nullcontext
@@ -122,7 +123,7 @@ def _shown(status: FleetStatus, width: int, plan: PlacedPlan | None) -> Renderab
 
 def apart(status: FleetStatus) -> list[str]:
     """Lines that say why maps are not merged: at most `MOST_APART`, and how many more there are."""
-    lines = [f"{one.robot} is not merged: {one.apart}" for one in status.robots if one.apart]
+    lines = [f"{one.robot} is not merged: {one.apart}" for one in _in_order(status) if one.apart]
     more = len(lines) - MOST_APART
     return [*lines[:MOST_APART], *([f"and {more} more"] if more > 0 else [])]
 
@@ -138,7 +139,7 @@ def table(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> Ta
     from rich.markup import escape
     from rich.table import Table
 
-    rows = [cells(robot, plan) for robot in status.robots]
+    rows = [cells(robot, plan) for robot in _in_order(status)]
     # A column in which no robot has anything is left out: most have no battery, and no trouble.
     shown = [k for k, name in enumerate(COLUMNS) if name not in MAY_LACK or any(row[k] for row in rows)]
     widest = {k: max(len(row[k]) for row in (COLUMNS, *rows)) for k in shown}
@@ -170,7 +171,9 @@ def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
     from mapweave.hybridmap.agent_status import SILENT
 
     status = robot.status
-    age = "gone" if not robot.alive else f"{robot.age:.1f} s" + (" silent" if robot.age > SILENT else "")
+    age = f"{robot.age:.1f} s" + (" silent" if robot.age > SILENT else "")
+    if not robot.alive:
+        age = "gone" if status is None else f"gone {_roughly(robot.age)}"
     if status is None:
         known = _newest(robot), _links(robot), "", "", "", _lag(robot), age
         return robot.robot, "", "", "", *known, robot.over_quota or robot.accusation
@@ -193,6 +196,23 @@ def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
         age,
         robot.over_quota or robot.accusation or _own_trouble(robot),
     )
+
+
+def _in_order(status: FleetStatus) -> list[RobotEntry]:
+    """Robots by name, r2 before r10."""
+
+    def order(robot: RobotEntry) -> list[tuple[int, str]]:
+        parts = re.split("([0-9]+)", robot.robot)
+        return [(int(part), "") if k % 2 else (0, part) for k, part in enumerate(parts)]
+
+    return sorted(status.robots, key=order)
+
+
+def _roughly(seconds: float) -> str:
+    for unit, size in (("d", 86_400.0), ("h", 3600.0), ("min", 60.0)):
+        if seconds >= 2 * size:
+            return f"{seconds / size:.0f} {unit}"
+    return f"{seconds:.0f} s"
 
 
 def _own_trouble(robot: RobotEntry) -> str:

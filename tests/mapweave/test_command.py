@@ -230,6 +230,8 @@ def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
         "no map server answered (for 61 s)",
     )  # fmt: skip
     assert cells(replace(entry, alive=False))[-1] == "", "what a robot said before it went need not hold"
+    for age, words in ((7.04, "gone 7 s"), (119.0, "gone 119 s"), (180.0, "gone 3 min"), (9e4, "gone 25 h")):
+        assert cells(replace(entry, alive=False, age=age))[-2] == words
     lies = RobotEntry("r1", False, accusation="map r1.1 is implausible: its clock utc runs backwards")
     assert cells(lies)[-1] == lies.accusation
     assert cells(RobotEntry("r1", False))[0] == "r1" and "gone" in cells(RobotEntry("r1", False))
@@ -239,6 +241,16 @@ def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
         _, line = printed.getvalue().splitlines()
         assert len(line) <= width and "go to r1.1.5 (kitchen) running 25%" in line and "7.0 s silent" in line
         assert ("0.4 m to node r1.1.5" in line) is (width == 240)
+
+
+def test_robots_are_listed_by_their_numbers() -> None:
+    names = ("anna", "r1", "r10", "r11", "r2", "r2b", "zed")
+    status = FleetStatus(tuple(RobotEntry(name, True, apart="it is alone") for name in names))
+    lines = Console(width=100, file=(printed := io.StringIO()))
+    lines.print(table(status, 100))
+    order = ["anna", "r1", "r2", "r2b", "r10", "r11", "zed"]
+    assert [line.split()[0] for line in printed.getvalue().splitlines()[1:]] == order
+    assert [line.split()[0] for line in status_command.apart(status)] == order
 
 
 def answer_with(monkeypatch: pytest.MonkeyPatch, found: list[FleetStatus | NotConnected]) -> None:
