@@ -226,7 +226,7 @@ watch({
     if (page.loading && !server.loading) listCorrections();
     page.loading = Boolean(server.loading);
     // Lists are shown once they are filled, so that nothing jumps.
-    if (!server.loading || robots.length) byId("fleet").classList.remove("waiting");
+    if (!server.loading || robots.length || model.components.length) byId("fleet").classList.remove("waiting");
     if (!page.readOnly) byId("connection").textContent = server.loading ? server.summary : "live";
     painter.ask();
   },

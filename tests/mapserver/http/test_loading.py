@@ -26,8 +26,10 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.recorded_fleet.recording import DEMO_PAGE
 from synthetic.recorded_fleet import TOURS, page
+from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.http.test_live import expected, less, same, viewer
 from tests.mapserver.stub_services import StubServices, two_maps
+from tests.waiting import eventually
 
 JOINED = MapEvent(10**18, MapEventKind.JOINED, "r0.1 and r1.1 are one map now")
 
@@ -141,6 +143,16 @@ def test_without_a_map_of_before_the_page_says_that_the_server_loads() -> None:
     with Web(("127.0.0.1", 0), LoadingServer()) as web, viewer(web) as person:
         assert person.until("state")["server"]["summary"] == "loading"
         assert "map" not in person.last
+
+
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+def test_the_page_lists_a_map_of_before_without_robots(browser: Browser) -> None:
+    """The panel beside the map was empty until the server had merged."""
+    with Web(("127.0.0.1", 0), LoadingServer(), before=replace(before(), robots=())) as web:
+        browser.open(f"http://127.0.0.1:{web.port}/")
+        eventually(lambda: NOT_THERE in browser.run("return document.getElementById('connection').innerText"))
+        listed = "return document.getElementById('components').checkVisibility({ visibilityProperty: true })"
+        assert browser.run(listed)
 
 
 def test_what_was_shown_is_kept_or_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
