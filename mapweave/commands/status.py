@@ -16,6 +16,8 @@ from mapweave.commands.plan import add_plan_option
 from mapweave.hybridmap.errors import NotConnected
 
 if TYPE_CHECKING:
+    from collections.abc import Sequence
+
     from rich.console import RenderableType
     from rich.table import Table
 
@@ -28,6 +30,7 @@ COLUMNS = (
     "trouble",
 )  # fmt: skip
 MAY_LACK = ("last node", "links", "battery", "lag", "trouble")
+TROUBLE = COLUMNS.index("trouble")
 SPARE = ("links", "last node", "battery")
 """Left out, the first first, of a terminal on which even cut columns find no room."""
 NUMBERS = ("links", "nodes", "battery", "unsent", "lag")
@@ -38,7 +41,7 @@ EVERY = 0.5
 TABLE_EVERY = 5.0
 """Between two tables where there is no terminal, s."""
 MOST_APART = 10
-"""Robots that are listed below the table with the reason why their maps are not merged."""
+"""Robots that are listed below the table with the reason why their maps are not merged, or with a trouble."""
 
 
 def add_to(commands: Any) -> None:
@@ -118,7 +121,7 @@ def _shown(status: FleetStatus, width: int, plan: PlacedPlan | None) -> Renderab
 
     if not status.robots:
         return "no robot is there"
-    return Group(table(status, width, plan), *map(Text, apart(status)))
+    return Group(table(status, width, plan), *map(Text, (*troubles(status, width, plan), *apart(status))))
 
 
 def apart(status: FleetStatus) -> list[str]:
@@ -126,6 +129,15 @@ def apart(status: FleetStatus) -> list[str]:
     lines = [f"{one.robot} is not merged: {one.apart}" for one in _in_order(status) if one.apart]
     more = len(lines) - MOST_APART
     return [*lines[:MOST_APART], *([f"and {more} more"] if more > 0 else [])]
+
+
+def troubles(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> list[str]:
+    """Lines with the whole of each trouble that the table cuts: at most `MOST_APART`, and how many more."""
+    rows = [cells(robot, plan) for robot in _in_order(status)]
+    room = _widths(rows, width).get(TROUBLE, 0)
+    lines = [f"{row[0]}: {row[TROUBLE]}" for row in rows if len(row[TROUBLE]) > room]
+    more = len(lines) - MOST_APART
+    return [*lines[:MOST_APART], *([f"and {more} more with a trouble"] if more > 0 else [])]
 
 
 def table(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> Table:
@@ -140,6 +152,23 @@ def table(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> Ta
     from rich.table import Table
 
     rows = [cells(robot, plan) for robot in _in_order(status)]
+    widths = _widths(rows, width)
+    lines = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
+    for column, room in widths.items():
+        lines.add_column(
+            COLUMNS[column],
+            justify="right" if COLUMNS[column] in NUMBERS else "left",
+            no_wrap=True,
+            width=room,
+            overflow="ellipsis",
+        )
+    for row in rows:
+        lines.add_row(*(escape(row[column]) for column in widths))
+    return lines
+
+
+def _widths(rows: Sequence[tuple[str, ...]], width: int) -> dict[int, int]:
+    """Which columns are shown, and how wide."""
     # A column in which no robot has anything is left out: most have no battery, and no trouble.
     shown = [k for k, name in enumerate(COLUMNS) if name not in MAY_LACK or any(row[k] for row in rows)]
     widest = {k: max(len(row[k]) for row in (COLUMNS, *rows)) for k in shown}
@@ -149,21 +178,10 @@ def table(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> Ta
             cut = min(max(over, 0), max(widest[column] - LEAST, 0))
             widest[column], over = widest[column] - cut, over - cut
     for column in (COLUMNS.index(name) for name in SPARE):
-        if over > 0:
+        if over > 0 and column in shown:
             shown.remove(column)
             over -= widest[column] + 1
-    lines = Table(box=None, pad_edge=False, padding=(0, 1, 0, 0))
-    for column in shown:
-        lines.add_column(
-            COLUMNS[column],
-            justify="right" if COLUMNS[column] in NUMBERS else "left",
-            no_wrap=True,
-            width=widest[column],
-            overflow="ellipsis",
-        )
-    for row in rows:
-        lines.add_row(*(escape(row[column]) for column in shown))
-    return lines
+    return {column: widest[column] for column in shown}
 
 
 def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:

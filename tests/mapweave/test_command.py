@@ -243,6 +243,21 @@ def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
         assert ("0.4 m to node r1.1.5" in line) is (width == 240)
 
 
+def test_a_trouble_that_a_narrow_terminal_cuts_is_below_the_table_as_a_whole() -> None:
+    doing = AgentStatus(
+        Status("driving along the route", "0.4 m to r1.1.5", 12, 40, Pose2(), False), 1, "r0", 1
+    )
+    over = "over its quota: 10792 beacons"
+    status = FleetStatus((RobotEntry("r0", True, 0.1, doing), RobotEntry("r1", True, 0.1, over_quota=over)))
+    # The robots have neither a battery nor nodes on the server: such columns cannot be left out once more.
+    assert [table(status, width).row_count for width in (80, 50, 30, 10)] == [2] * 4
+    assert status_command.troubles(status, 160) == []
+    assert status_command.troubles(status, 80) == [f"r1: {over}"]
+    many = FleetStatus(tuple(RobotEntry(f"r{k}", True, 0.1, doing, over_quota=over) for k in range(14)))
+    (*lines, more) = status_command.troubles(many, 80)
+    assert lines == [f"r{k}: {over}" for k in range(10)] and more == "and 4 more with a trouble"
+
+
 def test_robots_are_listed_by_their_numbers() -> None:
     names = ("anna", "r1", "r10", "r11", "r2", "r2b", "zed")
     status = FleetStatus(tuple(RobotEntry(name, True, apart="it is alone") for name in names))
