@@ -245,7 +245,7 @@ class Roster:
 def whereabouts(status: AgentStatus, merged: MergedMap) -> tuple[Pose2 | None, int]:
     """`merged_from_robot` and its component; None if the robot, or its map, is not placed."""
     reported = status.status
-    if reported.fix_node is not None and reported.mission == "goto":
+    if reported.fix_node is not None:
         node, node_from_robot = reported.fix_node, reported.node_from_robot
     elif reported.located and (nearest := _nearest(status.map, reported.map_from_robot, merged)) is not None:
         node, node_from_robot = nearest

@@ -336,6 +336,19 @@ def test_a_robot_that_says_it_is_very_far_away_hides_no_other(house: House) -> N
     link.close()
 
 
+def test_a_robot_that_was_stopped_on_its_way_is_shown_where_it_stands(house: House) -> None:
+    link, _ = house.robot()
+    bus, aside = house.bus(), Pose2(0.1, 0.0, 0.2)
+    node = min(house.mapped.truth)  # the merged frame is that of the smallest node
+    bus.announce(KEYS.agent_alive(MapId("r1", 1)))
+    stands = Status("idle", "no mission", 0, 0, Pose2(), False, "idle", fix_node=node, node_from_robot=aside)
+    bus.publish(KEYS.agent_status("r1"), encode(AgentStatus(stands, 1, "r1", 1)))
+    eventually(lambda: house.entry("r1").merged_from_robot is not None)
+    known = house.entry("r1").merged_from_robot
+    assert known is not None and known.vector == pytest.approx(aside.vector)
+    link.close()
+
+
 def test_a_robot_does_not_say_what_was_ordered(house: House) -> None:
     link, _ = house.robot()
     report = house.person.explore("r0")
