@@ -51,8 +51,8 @@ export const EDITORS = [
     } },
   { id: "unmerge", group: "What is merged", label: "Undo a link",
     hint: "Two nodes, or two maps, that do not show one place. They are not linked again.",
-    fields: [{ name: "scope", label: "Undo", options: [["nodes", "the link of these two nodes"],
-      ["maps", "every link between their two maps"]] }],
+    fields: [{ name: "scope", label: "Undo", options: [["nodes", "the link of both nodes"],
+      ["maps", "all links of both maps"]] }],
     request(selection, { scope }) {
       const both = nodes(selection, 2, "What is undone");
       return constraint({ unmerge: scope === "maps" ? both.map(mapOf) : both });
@@ -60,7 +60,7 @@ export const EDITORS = [
   { id: "retire", group: "What is merged", label: "Retire",
     hint: "It takes no part in the merge, in routes and in answers any more. Nothing is deleted. Times are this device's.",
     fields: [{ name: "scope", label: "Retire", options: [["selected", "the nodes or the area"],
-      ["map", "the whole map of the node"], ["window", "its map between times"]] },
+      ["map", "the node's whole map"], ["window", "its map between times"]] },
       { ...BEGIN, step: 1, when: windowed }, { ...END, step: 1, when: windowed }],
     whole: ({ scope }) => scope !== "selected",
     request(selection, { scope, begin, end }) {

@@ -218,11 +218,8 @@ watch({
     loadSaid();
   },
   state({ server, robots }) {
-    page.robots = robots;
-    painter.robots = robots.map(robot => poseOf(robot, model)).filter(Boolean);
+    showRobots(robots);
     byId("summary").textContent = server.summary + (server.settled === false ? ", still merging" : "");
-    listRobots(robots, name => selectRobot(name), page.readOnly ? "A map file has none." : "None has been heard of.");
-    updateRobot(robots);
     if (page.loading && !server.loading) listCorrections();
     page.loading = Boolean(server.loading);
     // Lists are shown once they are filled, so that nothing jumps.
@@ -241,7 +238,16 @@ watch({
   if (!up) permit(false, "The map server does not answer: nothing can be changed until it does. What you have typed stays.");
   byId("connection").className = up ? "" : "lost";
   byId("connection").textContent = up ? "live" : "no server, trying again";
+  // Nothing is known of them any more.
+  if (!up && !page.readOnly) showRobots(page.robots.map(robot => ({ ...robot, alive: false, lost: true })));
 }, admitted);
+function showRobots(robots) {
+  page.robots = robots;
+  painter.robots = robots.map(robot => poseOf(robot, model)).filter(Boolean);
+  listRobots(robots, name => selectRobot(name), page.readOnly ? "A map file has none." : "None has been heard of.");
+  updateRobot(robots);
+  painter.ask();
+}
 async function loadSaid() {
   loadPlans(() => { planEditor.list(); painter.ask(); });
   const places = await loadAnnotations(selectNode);

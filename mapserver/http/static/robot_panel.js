@@ -18,7 +18,7 @@ function ellipseOf(covariance) {
   return { major: Math.sqrt(middle + reach), minor: Math.sqrt(Math.max(middle - reach, 0)),
     angle: Math.atan2(2 * xy, xx - yy) / 2 };
 }
-const life = robot => robot.before ? ["as last shown", "soft"] : !robot.alive ? ["gone", "bad"] : robot.age > QUIET ? ["silent", "warn"] : ["alive", "good"];
+const life = robot => robot.before || robot.lost ? ["as last shown", "soft"] : !robot.alive ? ["gone", "bad"] : robot.age > QUIET ? ["silent", "warn"] : ["alive", "good"];
 function missionWords(mission) {
   if (!mission) return "";
   const { order, state, progress, reason } = mission, goal = order.goal || order.node || "";
@@ -36,13 +36,14 @@ export function listRobots(robots, select, none) {
   }));
   if (!robots.length) add(byId("robots"), "li", none, "soft");
 }
-// The frame of the panel is made once, so that a goal can be typed while statuses come.
+// The frame of the panel is made once, so that a goal can be typed while statuses come. Stop is above all that changes
+// its height, and in view on a phone.
 export function showRobot(name, whyNot, goal) {
   const box = byId("selected");
   box.textContent = "";
   add(box, "h2", `Robot ${name}`);
-  panel = { name, facts: add(box, "div"), portal: null };
-  if (whyNot) { add(box, "p", whyNot, "soft"); return; }
+  panel = { name, facts: document.createElement("div"), portal: null };
+  if (whyNot) { add(box, "p", whyNot, "soft"); box.append(panel.facts); return; }
   const form = add(box, "form", "", "actions"), input = add(form, "input"), via = add(form, "input");
   input.id = "goal"; input.value = goal; input.placeholder = "node, x,y, place or home"; input.setAttribute("list", "names");
   input.setAttribute("aria-label", `Where to send ${name}`);
@@ -66,6 +67,7 @@ export function showRobot(name, whyNot, goal) {
   button(actions, "Stop", () => give("stop?by=page"));
   panel.portal = button(actions, "Taken through", () => give("portal-done?by=page"));
   panel.portal.hidden = true;
+  box.append(panel.facts);
 }
 export const leaveRobot = () => { panel = null; };
 export function updateRobot(robots) {
@@ -81,7 +83,7 @@ export function updateRobot(robots) {
   facts(panel.facts, [
     ["state", word, kind],
     ["held against it", robot.accusation, "bad"],
-    ["last heard", robot.before ? "before the server began" : `${seconds(robot.age)} ago`],
+    ["last heard", robot.lost ? "before the map server was gone" : robot.before ? "before the server began" : `${seconds(robot.age)} ago`],
     ["doing", status && `${status.status.doing}${status.status.detail ? ": " + status.status.detail : ""}`],
     ["mission", status && missionWords(status.mission)],
     ["on the map", pose ? `${pose[0].toFixed(2)}, ${pose[1].toFixed(2)} m, ${degrees(pose[2])}${spread}` : "not known"],

@@ -260,6 +260,49 @@ def test_a_map_without_room_is_drawn_when_it_has_some(page: Browser) -> None:
     assert page.run("return document.getElementById('undrawn').hidden")
 
 
+def test_robots_of_a_server_that_is_gone_are_not_alive(browser: Browser, services: StubServices) -> None:
+    """They stayed green, and their arrows on the map as where they are."""
+    services.fleet = FleetStatus((RobotEntry("r0", True, 0.2),))
+    person = Person(browser)
+    with Web(("127.0.0.1", 0), services) as served:
+        browser.open(f"http://127.0.0.1:{served.port}/")
+        eventually(lambda: "r0 alive" in person.text("robots"))
+        browser.run("document.querySelector('#robots button').click()")
+        # What stops it lies above all that changes its height.
+        above = (
+            "const top = one => one.getBoundingClientRect().top;"
+            "const buttons = document.querySelectorAll('#selected button');"
+            "return top([...buttons].find(one => one.textContent === 'Stop'))"
+            " < top(document.querySelector('#selected dl'))"
+        )
+        assert browser.run(above)
+    eventually(lambda: "r0 as last shown" in person.text("robots"))
+    assert "alive" not in person.text("selected")
+    assert "last heardbefore the map server was gone" in person.text("selected")
+
+
+def test_no_choice_of_a_form_is_cut_off(page: Browser) -> None:
+    page.look(1280, 800)
+    page.run("document.getElementById('tab-edit').click()")
+    cut = """
+const c = document.createElement('canvas').getContext('2d'), cut = [];
+const kinds = document.getElementById('edit-kind');
+for (const kind of [...kinds.options].map(one => one.value)) {
+  kinds.value = kind;
+  kinds.dispatchEvent(new Event('change'));
+  for (const one of document.querySelectorAll('#edit select')) {
+    if (!one.checkVisibility()) continue;
+    const style = getComputedStyle(one), px = name => parseFloat(style[name]);
+    const room = one.clientWidth - px('paddingLeft') - px('paddingRight');
+    c.font = style.font;
+    // The arrow takes some of it.
+    for (const { text } of one.options) if (c.measureText(text).width > room - 16) cut.push(text);
+  }
+}
+return cut"""
+    assert page.run(cut) == []
+
+
 def test_an_angle_is_never_minus_nothing(page: Browser) -> None:
     degrees = "return import('/static/dom.js').then(({ degrees }) => [-0.001, 0.5, -3.2].map(degrees))"
     assert page.run(degrees) == ["0°", "29°", "-183°"]
