@@ -13,7 +13,7 @@ from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, opened
@@ -31,6 +31,9 @@ from mapweave.commands.usage import UsageError
 from mapweave.connection import SOON
 from mapweave.extras import need
 from mapweave.hybridmap.errors import InvalidFile
+
+if TYPE_CHECKING:
+    from mapweave.mapserver.server import MapServer
 
 DATA = Path("out/server")
 DEMO_HTTP = "8080"
@@ -209,11 +212,17 @@ def run(arguments: argparse.Namespace) -> int:
                 raise InvalidFile(server.displaced)
             if renewal is not None:
                 renewal.check()
-            now = server.summary()
+            now = summary_of(server)
             if now != last_line:
                 print(stamped(now), flush=True)
                 last_line = now
     return 0
+
+
+def summary_of(server: MapServer) -> str:
+    """One line for the log; after a start maps lie apart, without a link, until the first merge is done."""
+    status = server.status()
+    return str(status["summary"]) + ("" if status["merged"] or not status["nodes"] else ", still merging")
 
 
 def _stores_beside(path: Path) -> list[str]:

@@ -17,10 +17,12 @@ import pytest
 from websockets.sync.client import connect
 
 from mapweave.agent.replication.journal import Journal
+from mapweave.commands.server import summary_of
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.http.live import LOADING, NOT_THERE
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.storage.map_file import MapFile, write_map_file
+from mapweave.wire.log_messages import Scalar
 from synthetic.maps import looked_around
 from tests.waiting import eventually, free_port
 
@@ -37,6 +39,24 @@ def server(http: int, *arguments: str) -> Iterator[None]:
     finally:
         running.send_signal(signal.SIGINT)
         assert running.wait(30) == 0
+
+
+class Started:
+    """A server that has read its store, and has merged or not."""
+
+    def __init__(self, nodes: int, merged: bool) -> None:
+        self.nodes, self.merged = nodes, merged
+
+    def status(self) -> dict[str, Scalar]:
+        summary = f"{self.nodes} nodes, 2 maps, 2 components, 0 links, 0 refused"
+        return {"summary": summary, "nodes": self.nodes, "merged": self.merged}
+
+
+@pytest.mark.parametrize(("nodes", "merged", "said"), [(9, False, True), (9, True, False), (0, False, False)])
+def test_the_log_says_that_maps_are_not_merged_yet(nodes: int, merged: bool, said: bool) -> None:
+    """The first line after a start was that of maps without any link, as if they had come apart."""
+    words = summary_of(Started(nodes, merged))  # type: ignore[arg-type]
+    assert words.endswith(", still merging") == said
 
 
 def first_messages(http: int) -> dict[str, dict]:
