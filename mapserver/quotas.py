@@ -15,6 +15,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import Busy
 
 log = logging.getLogger(__name__)
@@ -124,8 +125,8 @@ class Quotas:
             excess.last = self.clock()
             self._totals[what] = self._totals.get(what, 0) + 1
         if before.bit_length() != after.bit_length():
-            words = "%s is over its quota: %d %s held back so far"
-            log.warning(words, robot, after, what, extra={"robot": robot})
+            held = counted(after, what.removesuffix("s"))
+            log.warning("%s is over its quota: %s held back so far", robot, held, extra={"robot": robot})
 
     def ask(self, robot: str) -> None:
         """A robot asks something. People (no name) have no quota here: HTTP has its own limits.
@@ -163,7 +164,7 @@ class Quotas:
         with self._lock:
             return {
                 name: "over its quota: "
-                + ", ".join(f"{n} {what}" for what, n in sorted(excess.counts.items()))
+                + ", ".join(counted(n, what.removesuffix("s")) for what, n in sorted(excess.counts.items()))
                 for name, excess in sorted(self._robots.items())
                 if excess.counts and now <= excess.last + REMEMBERED
             }

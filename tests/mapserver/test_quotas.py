@@ -59,7 +59,7 @@ def test_a_robot_that_asks_too_much_is_refused_and_shown_and_others_are_answered
     assert entry.over_quota == cells(entry)[-1] == f"over its quota: {len(refused)} questions"
     assert "r7" in str(house.server.status()["over_quota"])
     lines = [record.message for record in caplog.records if "over its quota" in record.message]
-    assert lines[0] == "r7 is over its quota: 1 questions held back so far" and len(lines) < 12
+    assert lines[0] == "r7 is over its quota: 1 question held back so far" and len(lines) < 12
 
 
 def test_a_robot_reserves_and_says_where_it_is_for_itself_alone(house: House) -> None:
