@@ -15,15 +15,10 @@ from collections import Counter, defaultdict
 from collections.abc import Sequence
 from random import Random
 
-import numpy as np
-
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Node
 from mapweave.merge.mutual_exclusion.collision import is_exclusion
-from mapweave.merge.outlier_rejection.bent_maps import AGREEING, nearly_there
-from mapweave.merge.outlier_rejection.lines_of_sight import tears
-from mapweave.merge.outlier_rejection.wrong_geometry import UNSOLVABLE, link_sets
+from mapweave.merge.outlier_rejection.wrong_geometry import UNSOLVABLE, is_torn
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
@@ -84,30 +79,6 @@ class TornMapSearch:
             return is_torn(links, *pieces, nodes, self._s)
         except UNSOLVABLE:
             return False
-
-
-def is_torn(
-    links: Sequence[Link], placed: Fragment, fixed: Fragment, nodes: Sequence[Node], s: ConsistencySettings
-) -> bool:
-    """Whether a map shows places of others in another arrangement: its own nodes see through each other.
-
-    In a map that is right they do not, wherever it is, and whatever looks like it elsewhere.
-
-    Args:
-        links: from `placed` to `fixed`, at least one.
-        placed: piece of map.
-        fixed: piece of map that several robots agree on.
-        nodes: of `placed`, in its order.
-        s: when links agree.
-    """
-    best = link_sets(links, placed, fixed, s)[0]
-    if len(best) >= AGREEING * len(links):
-        return False  # a place that looks the same, as a whole
-    first, agreeing = {link.a for link in best}, {link.key for link in best}
-    near = nearly_there(links, placed, fixed)[[k for k, link in enumerate(links) if link.key in agreeing]]
-    # Nodes that are a little off are of the same place: its others confirm them, which tells of no tear.
-    second = {link.a for link in links} - {links[k].a for k in np.flatnonzero(near.any(axis=0)).tolist()}
-    return tears(sorted(first), sorted(second), placed.graph, nodes)
 
 
 def _excluded(merged: MergedMap) -> Excluded:

@@ -58,6 +58,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     "two sources of aliasing": ((distinctness, "ENOUGH", 1),),
     "wrong geometry": ((WrongGeometrySearch, "wrong", lambda *_: {}),),
     "bent maps": ((wrong_geometry, "is_bent", lambda *_: False),),
+    "shuffled maps": ((wrong_geometry, "is_shuffled", lambda *_: False),),
     "unreliable robots": ((active_nodes, "unreliable_robots", lambda *_: {}),),
     "copies": ((Copies, "maps", lambda *_: {}),),
     "implausible maps": (

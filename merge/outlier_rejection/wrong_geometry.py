@@ -14,7 +14,8 @@ So a map is wrong if lines of sight refute every placement among several maps th
 two other robots or of its own: no robot alone makes the map of another one seem wrong.
 Clutter and wrong depths are seen through at true places too. Their share is measured on the same nodes, each
 placed by its own links. Unobserved placements are not refuted, and the map may be right: it may have a room
-that only looks like theirs.
+that only looks like theirs. If it has their places in another arrangement than theirs, its own nodes see
+through each other, wherever it is placed.
 
 A map that is only a little wrong is seen through nowhere: see `mapweave.merge.outlier_rejection.bent_maps`.
 """
@@ -34,7 +35,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
-from mapweave.merge.outlier_rejection.bent_maps import AGREEING, is_bent
+from mapweave.merge.outlier_rejection.bent_maps import AGREEING, is_bent, nearly_there
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.lines_of_sight import (
     LEAST_NODES,
@@ -44,8 +45,10 @@ from mapweave.merge.outlier_rejection.lines_of_sight import (
     REACH,
     more_than_usual,
     seen_through,
+    tears,
 )
 from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances2
+from mapweave.merge.outlier_rejection.shuffled_maps import is_shuffled
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
@@ -262,6 +265,30 @@ def link_sets(
     return sorted(sets, key=len, reverse=True)
 
 
+def is_torn(
+    links: Sequence[Link], placed: Fragment, fixed: Fragment, nodes: Sequence[Node], s: ConsistencySettings
+) -> bool:
+    """Whether a map shows places of others in another arrangement: its own nodes see through each other.
+
+    In a map that is right they do not, wherever it is, and whatever looks like it elsewhere.
+
+    Args:
+        links: from `placed` to `fixed`, at least one.
+        placed: piece of map.
+        fixed: piece of map that several robots agree on.
+        nodes: of `placed`, in its order.
+        s: when links agree.
+    """
+    best = link_sets(links, placed, fixed, s)[0]
+    if len(best) >= AGREEING * len(links):
+        return False  # a place that looks the same, as a whole
+    first, agreeing = {link.a for link in best}, {link.key for link in best}
+    near = nearly_there(links, placed, fixed)[[k for k, link in enumerate(links) if link.key in agreeing]]
+    # Nodes that are a little off are of the same place: its others confirm them, which tells of no tear.
+    second = {link.a for link in links} - {links[k].a for k in np.flatnonzero(near.any(axis=0)).tolist()}
+    return tears(sorted(first), sorted(second), placed.graph, nodes)
+
+
 def all_refuted(
     links: Sequence[Link],
     placed: Fragment,
@@ -280,7 +307,9 @@ def all_refuted(
     """
     if not _nodes_agree(links, fixed):
         return False
-    if is_bent(links, placed, fixed):
+    if is_bent(links, placed, fixed) or is_shuffled(links, placed, fixed):
+        return True
+    if is_torn(links, placed, fixed, [nodes[node_id] for node_id in placed.nodes], s):
         return True
     sets = link_sets(links, placed, fixed, s)
     sets = [some_links for some_links in sets if len(some_links) >= LEAST_SHARE * len(sets[0])]
