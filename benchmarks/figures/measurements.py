@@ -26,6 +26,9 @@ MEASUREMENTS: dict[str, str] = {
     "--json",
     "rules_trials": "python -m benchmarks.rules --trials warehouse twin-corridor --runs 2 --seed 722 --json",
     "rules_places": "python -m benchmarks.rules --places 1000 --seed 708 --json",
+    "rules_lies": "python -m benchmarks.liar --rules --jobs 2 --seed 757 --ways 'node at 1e9 m' "
+    "'edges of 1e5 m' 'covariance of zero' 'greatest covariance' 'contradicting clocks' 'many epochs' "
+    "'shuffled maps' 'copied places' 'half copied landmarks' --json",
     "wrong_geometry": "python -m benchmarks.wrong_geometry --runs 1 --kinds slip carried --scenes room "
     "--seed 723 --json",
     "agent": "python -m benchmarks.agent --seed 724 --json",

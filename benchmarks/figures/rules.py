@@ -53,6 +53,34 @@ def _places(rule: str) -> tuple[str, str]:
     return words, "rules_places"
 
 
+def _lies(rule: str) -> tuple[str, str]:
+    """The ways to lie that a rule contains, and those for which it names the robot."""
+    words = (
+        f"ways in which one robot of four lies, not contained: {{{rule}/not_contained}} instead of "
+        f"{{all rules/not_contained}}; not named: {{{rule}/not_named}} instead of {{all rules/not_named}}"
+    )
+    return words, "rules_lies"
+
+
+AGAINST_LIES = {
+    "copies": "mapserver/merging/copies.py",
+    "refused changes": "mapserver/merging/implausible_maps.py",
+    "unmeasurable edges": "hybridmap/edge_limits.py",
+    "implausible maps": "mapserver/plausibility.py",
+    "maps that contradict themselves": "mapserver/plausibility.py",
+    "fragments": "mapserver/plausibility.py",
+    "unreliable robots": "mapserver/plausibility.py",
+    "answers without implausible maps": "mapserver/active_nodes.py",
+    "optimisation in two stages": "merge/pose_graph/staged_optimization.py",
+    "clocks that run backwards": "merge/mutual_exclusion/trajectories.py",
+    "bent maps": "merge/outlier_rejection/bent_maps.py",
+    "shuffled maps": "merge/outlier_rejection/shuffled_maps.py",
+    "torn maps": "merge/torn_maps.py",
+    "two sources of aliasing": "merge/outlier_rejection/distinctness.py",
+    "false places of one robot": "merge/outlier_rejection/fleet_chance.py",
+}
+"""File by rule."""
+
 RULES = (
     Rule(
         "independent support",
@@ -134,6 +162,8 @@ RULES = (
                 "{with_the_map/fleets}",
                 "wrong_geometry",
             ),
+            _lies("wrong geometry"),
         ),
     ),
+    *(Rule(name, file, (_lies(name),)) for name, file in AGAINST_LIES.items()),
 )
