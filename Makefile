@@ -46,7 +46,8 @@ test: setup
 
 slow: setup $(AUDIT)/.installed
 	@$(COMPILE)
-	$(BIN)/python -m pytest -m slow -n 2 --dist worksteal
+	$(BIN)/python -m pytest -m "slow and not alone" -n 2 --dist worksteal
+	$(BIN)/python -m pytest -m "slow and alone"
 
 # About three quarters of an hour on two cores: every scenario, in real processes, and the longest tests.
 scenarios: setup
