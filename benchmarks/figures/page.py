@@ -68,10 +68,14 @@ def _rules(rules: Sequence[Rule], results: Mapping[str, Result]) -> str:
         "A rule that rejects links, answers or frames is switched off by itself; everything else stays.", "",
         "| rule | file | what fails without it | command |", "|---|---|---|---|",
     ]  # fmt: skip
+    before = ""
     for rule in rules:
         reasons = "; ".join(filled(words, _of(results, source).figures) for words, source in rule.fails)
         commands = ", ".join(dict.fromkeys(_command(_of(results, source)) for _, source in rule.fails))
-        lines.append(f"| {rule.name} | `{rule.file}` | {reasons} | {commands} |")
+        lines.append(
+            f"| {rule.name} | `{rule.file}` | {reasons} | {'same' if commands == before else commands} |"
+        )
+        before = commands
     return "\n".join(lines)
 
 
