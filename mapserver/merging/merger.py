@@ -232,52 +232,56 @@ class Merger:
         Args:
             use: what is made of a merged map that is new; a map with which that fails is set apart as well.
         """
-        if self._dirty:
-            self.search_pairs()
-            # A server merges before it has read its store if manual constraints come first.
-            if self.maps:
-                self._comparisons.take_over()
-            for pair, verdict in self._comparisons.changes():
-                self._touched |= {pair[0].map, pair[1].map}
-                self._stale.add((pair[0].map, pair[1].map))
-                self._copies.forget(pair)
-                if isinstance(verdict, Link):
-                    self._copies.compare(*(self.maps[node.map].nodes[node] for node in pair))
-                if verdict is None:
-                    self._verdicts.drop(pair)
-                else:
-                    self._verdicts.put(pair, self._counted(verdict))
-            for map_id in self._changed:
-                # Copies: a merged map stays as it was when later changes come. What did not change is not
-                # copied: all that a merge remembers of a map it remembers of this very copy.
-                self._kept[map_id] = HybridMap(self.maps[map_id].contents())
-                self._implausible.changed(map_id, self._kept[map_id])
-            self._isolation.changed(self._changed)
-            before = self._copied.keys()
-            linked = {frozenset((a.map, b.map)) for a, b in self._constraints.links}
-            self._copied = self._copies.maps(self._suspects, linked)
-            self._touched |= before - self._copied.keys()
-            try:
-                self._find_wrong_geometry()
-            except Exception:  # a defect with one map must not hold up the merge
-                log.exception("the search for maps with wrong geometry failed")
-            self._leave_unlinked()
-            apart = self._set_apart()
-            maps = [kept_id for kept_id in self._kept if kept_id not in apart]
-            try:
-                merged = self._made(self._pipeline, self._verdicts, maps, self._touched, use)
-            except Exception as error:  # any error is of one map or a few, and not of all
-                log.exception("the merge fails; looking for the map with which it does")
-                merged = self._made_without_bad(maps, error, use)
-            self._resumed = None
-            self._leave_out(merged.superseded)
-            if self._merged.implausible.keys() - merged.implausible.keys():
-                self.alike.forget()
-            self._merged = merged
-            self.counters.merges += 1
-            self._touched, self._changed = set(), set()
-            self._dirty = False
+        while self._dirty:
+            self._merge(use)
+            # Nodes that have returned to the index may be like others with which they were never compared.
+            self._dirty = self._comparisons.waiting
         return self._merged
+
+    def _merge(self, use: Callable[[MergedMap], object] | None) -> None:
+        self.search_pairs()
+        # A server merges before it has read its store if manual constraints come first.
+        if self.maps:
+            self._comparisons.take_over()
+        for pair, verdict in self._comparisons.changes():
+            self._touched |= {pair[0].map, pair[1].map}
+            self._stale.add((pair[0].map, pair[1].map))
+            self._copies.forget(pair)
+            if isinstance(verdict, Link):
+                self._copies.compare(*(self.maps[node.map].nodes[node] for node in pair))
+            if verdict is None:
+                self._verdicts.drop(pair)
+            else:
+                self._verdicts.put(pair, self._counted(verdict))
+        for map_id in self._changed:
+            # Copies: a merged map stays as it was when later changes come. What did not change is not
+            # copied: all that a merge remembers of a map it remembers of this very copy.
+            self._kept[map_id] = HybridMap(self.maps[map_id].contents())
+            self._implausible.changed(map_id, self._kept[map_id])
+        self._isolation.changed(self._changed)
+        before = self._copied.keys()
+        linked = {frozenset((a.map, b.map)) for a, b in self._constraints.links}
+        self._copied = self._copies.maps(self._suspects, linked)
+        self._touched |= before - self._copied.keys()
+        try:
+            self._find_wrong_geometry()
+        except Exception:  # a defect with one map must not hold up the merge
+            log.exception("the search for maps with wrong geometry failed")
+        self._leave_unlinked()
+        apart = self._set_apart()
+        maps = [kept_id for kept_id in self._kept if kept_id not in apart]
+        try:
+            merged = self._made(self._pipeline, self._verdicts, maps, self._touched, use)
+        except Exception as error:  # any error is of one map or a few, and not of all
+            log.exception("the merge fails; looking for the map with which it does")
+            merged = self._made_without_bad(maps, error, use)
+        self._resumed = None
+        self._leave_out(merged.superseded)
+        if self._merged.implausible.keys() - merged.implausible.keys():
+            self.alike.forget()
+        self._merged = merged
+        self.counters.merges += 1
+        self._touched, self._changed = set(), set()
 
     def _made(
         self,

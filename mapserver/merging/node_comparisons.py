@@ -92,6 +92,11 @@ class NodeComparisons:
         """Nodes that were read and whose similar nodes are not searched yet."""
         return len(self._uncompared)
 
+    @property
+    def waiting(self) -> bool:
+        """Whether pairs are chosen, or no longer chosen, that `changes` has not told."""
+        return self._pairs.waiting
+
     # Nodes come and go.
 
     def pairs_of(self, node_id: NodeId) -> list[Pair]:

@@ -88,11 +88,15 @@ class PairTable:
         pairs = ((min(node, neighbour), max(node, neighbour)) for neighbour in overlaps)
         return sorted(pair for pair in pairs if self._votes[pair] > 0)
 
+    @property
+    def waiting(self) -> bool:
+        """Whether there are pairs that `changed` will give."""
+        self._choose_stale()
+        return bool(self._changed)
+
     def changed(self) -> list[Pair]:
         """Pairs that were chosen, left out or forgotten since this was asked last, in the order of ids."""
-        for node in self._stale:
-            self._choose(node, self._ranked(node))
-        self._stale = set()
+        self._choose_stale()
         changed, self._changed = self._changed, set()
         return sorted(changed)
 
@@ -112,6 +116,11 @@ class PairTable:
                 pair = (node, neighbour) if node < neighbour else (neighbour, node)
                 by_map.setdefault(neighbour.map, []).append((-value, pair))
         return frozenset(pair for best in by_map.values() for _, pair in sorted(best)[: self._most_per_map])
+
+    def _choose_stale(self) -> None:
+        for node in self._stale:
+            self._choose(node, self._ranked(node))
+        self._stale = set()
 
     def _choose(self, node: NodeId, pairs: frozenset[Pair]) -> None:
         """Let a node vote for these pairs, and for no others."""

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.change import Change, ChangeBody, NodePut, NodeRetired
@@ -109,6 +109,8 @@ WAYS = ["altered copies that tear", "places seen from aside", "altered copied pl
     order=st.lists(st.integers(0, 23), min_size=1, max_size=40),
     steps=st.lists(st.integers(5, 60), min_size=1, max_size=3),
 )
+# With shuffled maps, the last merge takes nodes in again that were never compared with newer ones.
+@example(order=[0, 13, 0, 14, 0, 0, 0, 0, 17, 2, 11, 0, 11, 0], steps=[42])
 def test_a_merge_in_steps_is_the_merge_of_the_record(
     way: str, order: list[int], steps: list[int], monkeypatch: pytest.MonkeyPatch
 ) -> None:
