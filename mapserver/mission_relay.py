@@ -88,7 +88,7 @@ class MissionRelay:
         # A commit may wait for a standby of PostgreSQL: what is known is never held up by it.
         self._turn, self._writing = threading.RLock(), threading.Lock()
         self._reports: dict[_Key, MissionReport] = {}
-        self._overwritten = self._unwritten = self._write_is_due = False
+        self._overwritten = self._unwritten = self._write_is_due = self._write_fails = False
         self.reload()
 
     def reload(self) -> None:
@@ -301,7 +301,7 @@ class MissionRelay:
             return report
 
     def _write(self) -> None:
-        """Write the record if there is anything new."""
+        """Write the record if there is anything new; where that fails, `retry` writes it again."""
         with self._writing:
             with self._turn:
                 self._write_is_due = False
@@ -311,4 +311,11 @@ class MissionRelay:
             try:
                 self._store.put_result(KEPT, encode(kept))
             except InvalidFile as error:
-                log.warning("the record of missions is not on the disk: %s", error)
+                if not self._write_fails:
+                    log.warning("the record of missions is not on the disk, and is tried again: %s", error)
+                with self._turn:
+                    self._unwritten = self._write_fails = True
+            else:
+                if self._write_fails:
+                    log.info("the record of missions is on the disk again")
+                self._write_fails = False

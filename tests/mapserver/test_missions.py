@@ -5,7 +5,6 @@ from __future__ import annotations
 import threading
 import time
 from dataclasses import replace
-from typing import Any
 
 import pytest
 
@@ -26,8 +25,6 @@ from mapweave.hybridmap.mission_order import (
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver import mission_relay
 from mapweave.mapserver.http.web import Web
-from mapweave.mapserver.mission_relay import MissionRelay
-from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import encode
 from tests.mapserver.house import KEYS, ROBOT, House, ask
 from tests.waiting import eventually
@@ -180,62 +177,6 @@ def test_a_robot_whose_map_is_retired_hears_why_it_has_no_home(house: House) -> 
         InvalidValue, match=r'^r0 has no home: map r0\.1 is retired by .*: "before the move"$'
     ):
         house.person.go("r0", "home")
-    link.close()
-
-
-class SharedRecord:
-    """The results of a store of two servers, one of which writes before it has heard of the other's."""
-
-    def __init__(self) -> None:
-        self.value: bytes | None = None
-        self.writes = 0
-
-    def result(self, _: str) -> bytes | None:
-        return self.value
-
-    def put_result(self, _: str, value: bytes) -> None:
-        self.value, self.writes = value, self.writes + 1
-
-
-def test_two_servers_that_write_at_once_lose_no_mission_of_each_other() -> None:
-    record: Any = SharedRecord()
-
-    def relay() -> MissionRelay:
-        return MissionRelay(
-            MemoryBus(MemoryHub()), KEYS, record, pytest.fail, time.time_ns, lambda job: job()
-        )
-
-    first, second = relay(), relay()
-    for one, robot in ((first, "r1"), (second, "r2")):
-        report = MissionReport(MissionOrder.new(robot, MissionKind.EXPLORE, "anna"), MissionState.RUNNING)
-        status = Status("standing", "", 0, 0, Pose2(), False)
-        one.hear(AgentStatus(status, 1, robot, 1, mission=report))
-    for one in (first, second) * 2:
-        one.reload()
-        one.retry()
-    assert record.writes == 3, "once each, and again what the second wrote over"
-    assert [report.order.robot for report in relay().missions().reports] == ["r1", "r2"]
-
-
-def test_a_record_that_cannot_be_written_now_holds_up_no_robot_and_no_reader(house: House) -> None:
-    """As with a PostgreSQL whose standby is away: the commit waits until there is one."""
-    link, _ = house.robot()
-    eventually(lambda: house.entry("r0").alive)
-    store, writes = house.server._store, threading.Event()
-    write = store.put_result
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(store, "put_result", lambda name, value: writes.wait(20.0) and write(name, value))
-        order = MissionOrder.new("r0", MissionKind.EXPLORE, "anna")
-        status = Status("standing", "", 0, 0, Pose2(), False)
-        began = time.monotonic()
-        house.server._missions.hear(
-            AgentStatus(status, 1, "r0", 1, mission=MissionReport(order, MissionState.RUNNING))
-        )
-        assert [one.order for one in house.server.missions().reports] == [order]
-        assert time.monotonic() < began + 5.0
-        assert store.result(mission_relay.KEPT) is None
-        writes.set()
-        eventually(lambda: store.result(mission_relay.KEPT) is not None)
     link.close()
 
 
