@@ -35,7 +35,7 @@ export function nodeNamed(word, model) {
     const node = place.body.area ? nodeInArea(place.body.area, model) : nodeOf(place);
     return model.rowOf(node) === undefined ? { lacks: `No node of the map is at place ${word} now.` } : { node };
   }
-  if (!POSITION.test(word)) return { lacks: `There is no ${word} on this map.` };
+  if (!POSITION.test(word)) return { lacks: `Neither a node nor a place is called \u201c${word}\u201d.` };
   const [dx, dy] = model.offset(0), [x, y] = word.split(",").map(Number);
   const row = model.nearest(x + dx, y + dy, REACH, model.members?.[0] || []);
   return row < 0 ? { lacks: `Nothing is mapped within ${REACH} m of ${word}.` } : { node: model.name(row) };

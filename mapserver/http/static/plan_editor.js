@@ -118,11 +118,20 @@ export class PlanEditor {
     this.words();
     this.report();
     if (!this.image || this.pairs.length < LEAST) { this.drafted(); return; }
-    const answer = await change("annotations", { ...this.content(byId("plan-name").value.trim() || "plan"), check: true });
+    const name = byId("plan-name").value.trim() || "plan", kept = planNamed(name);
+    // The server refuses what it has already, which fits as before.
+    if (kept && this.isOf(kept.plan)) { this.fit = kept; this.report(); this.drafted(); return; }
+    const answer = await change("annotations", { ...this.content(name), check: true });
     if (number !== this.number) return;
     this.fit = answer.error ? { reason: answer.error, parts: [] } : answer.plan;
     this.report();
     this.drafted();
+  }
+  // Whether a plan that is kept is the one of the form.
+  isOf({ image, pairs, metres_per_pixel: scale }) {
+    const words = list => list.map(({ node, x, y, u, v }) => [node, x || 0, y || 0, u, v].join()).join("\n");
+    return image.sha256 === this.image.sha256 && (scale || 0) === Number(byId("plan-scale").value)
+      && words(pairs) === words(this.pairs);
   }
   // The plan as it is fitted now, under the map.
   drafted() {

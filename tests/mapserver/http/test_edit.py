@@ -276,6 +276,12 @@ def test_a_plan_is_laid_under_the_map_on_the_page(
         person.fill("edit-kind", "plan")
         person.fill("plan-choice", "map")
         eventually(lambda: "m/px as given" in person.text("plan-fit"))
+        # Back to a scale that is kept already: it fits as before, and is still drawn.
+        for scale in (str(1.01 * SCALE), str(SCALE)):
+            person.fill("plan-scale", scale)
+            eventually(lambda: "m/px as given" in person.text("plan-fit"))
+        assert "known already" not in person.text("plan-fit")
+        assert browser.run("return mapweave.planEditor.fit.parts.length") == 1
         browser.run("document.querySelector('#plan-pairs button').click()")
         eventually(lambda: browser.run("return document.querySelectorAll('#plan-pairs span').length") == 4)
         person.fill("plan-because", "a door that was moved")

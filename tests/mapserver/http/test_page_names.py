@@ -48,7 +48,7 @@ def test_a_name_that_is_not_known_leaves_nothing_to_apply(person: Person, server
     assert "only checked" in person.edit("retire", "dark")
     assert page.run(DISABLED) == [False, False]
     for word, says in (
-        ("kitchen", "There is no kitchen on this map."),
+        ("kitchen", "Neither a node nor a place is called \u201ckitchen\u201d."),
         ("90,90", "Nothing is mapped within 2 m"),
     ):
         person.fill("edit-nodes", word)
