@@ -94,7 +94,7 @@ class NodeComparisons:
 
     @property
     def waiting(self) -> bool:
-        """Whether pairs are chosen, or no longer chosen, that `changes` has not told."""
+        """Whether there is anything for `changes` to give."""
         return self._pairs.waiting
 
     # Nodes come and go.
