@@ -14,6 +14,7 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstra
 from mapweave.hybridmap.portal import Portal
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.route_rules import RouteRules
+from mapweave.merge.floors import parted_by
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.retired_nodes import retired_nodes
 
@@ -40,13 +41,8 @@ def effects_of(annotation: Annotation, places: Places) -> Iterator[str]:
             verb = "closes" if isinstance(body, Closure) else "holds for"
             yield f"it {verb} {counted(len(rules.closed or rules.factors), 'way')} of robots"
         case Floor(node, label):
-            floors = {**places.annotations.floors, node.map: label}
-            apart = sum(
-                node.map in link.maps and floors.get(link.a.map, label) != floors.get(link.b.map, label)
-                for link in places.merged.links
-            )
-            if apart:
-                yield f"{counted(apart, 'link')} between this map and maps on other floors"
+            if words := parted_by(places.merged, places.annotations.floors, node, label).words:
+                yield words
     before = places.annotations.last(annotation.kind, annotation.name)
     if before is not None:
         yield f"it takes the place of: {before.words}"

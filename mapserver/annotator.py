@@ -23,7 +23,7 @@ from mapweave.mapserver.places import Places, why_left_out
 from mapweave.mapserver.portals import Portals, check_portal
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.services import guarded
-from mapweave.merge.floors import floor_of, held_together
+from mapweave.merge.floors import floor_of, held_together, parted_by
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
@@ -210,7 +210,7 @@ def check_annotation(
         case Portal():
             check_portal(merged, annotations, name, body)
         case Floor():
-            _check_floor(merged, annotations, body, constraints)
+            _check_floor(merged, annotations, body, constraints, annotation.because)
 
 
 def check_edge(router: Router, annotations: Annotations, annotation: Annotation) -> None:
@@ -238,14 +238,28 @@ def check_edge(router: Router, annotations: Annotations, annotation: Annotation)
 
 
 def _check_floor(
-    merged: MergedMap, annotations: Annotations, floor: Floor, constraints: ManualConstraints
+    merged: MergedMap, annotations: Annotations, floor: Floor, constraints: ManualConstraints, because: str
 ) -> None:
-    """Refuse a label that contradicts links by hand, drives, or a lift (InvalidValue)."""
+    """Refuse a label that contradicts links by hand, drives, or a lift; or that parts a map without a reason.
+
+    Links that robots have found are no evidence against a label, since twin rooms look the same. But a label
+    for the wrong map tears what is right, so who parts maps must say why, as with a link without the images.
+
+    Raises:
+        InvalidValue: the evidence, and what to do.
+    """
     which, label = floor.node.map, floor.label
     floors = {**annotations.floors, which: label}
     if against := held_together(merged, constraints, floors, which):
         raise InvalidValue(
             f"map {which} cannot be on floor {label}: {against}; first take back the other label or the link"
+        )
+    parting = parted_by(merged, annotations.floors, floor.node, label)
+    if parting.parts and not because:
+        here = floor_of(merged, annotations.floors, floor.node)
+        raise InvalidValue(
+            f"map {which} is on floor {here} with maps that it has links with. On floor {label}, "
+            f"{parting.words}. If that is right, as of twin floors that look the same, it needs a reason"
         )
     for entry, portal in annotations.in_force(Portal):
         first, second = (floor_of(merged, floors, node) for node in (portal.a, portal.b))

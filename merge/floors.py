@@ -8,10 +8,11 @@ have most landmarks in common, directly or over others.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from itertools import pairwise
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, NamedTuple
 
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import EdgeKind
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
     from mapweave.merge.pose_graph.merged_map import MergedMap
 
 MapPair = tuple[MapId, MapId]
+MOST_NAMED = 4
+"""Of the maps of a part that comes apart, so many are named."""
 
 
 def labels_of(merged: MergedMap, floors: Mapping[MapId, str], component: int | None) -> tuple[str, ...]:
@@ -84,6 +87,62 @@ def held_together(
     return ""
 
 
+class FloorParting(NamedTuple):
+    """What labels of floors do to the links of a merged map.
+
+    Attributes:
+        links: so many fall that hold without the new label.
+        parts: for each component that falls apart the maps of its parts, those of the new label first.
+    """
+
+    links: int
+    parts: tuple[tuple[tuple[MapId, ...], ...], ...]
+
+    @property
+    def words(self) -> str:
+        """For people, in one phrase; empty if no link falls."""
+        if not self.links:
+            return ""
+        fall = f"{counted(self.links, 'link')} {'falls' if self.links == 1 else 'fall'}"
+        return " and ".join((fall, *map(_parting_words, self.parts)))
+
+
+def parted_by(merged: MergedMap, floors: Mapping[MapId, str], node: NodeId, label: str) -> FloorParting:
+    """What falls when the map of a node gets a label, also where others have theirs only by inference.
+
+    Links by hand do not fall, so they hold their maps together.
+
+    Args:
+        merged: the map.
+        floors: labels of maps without the new one.
+        node: of the map.
+        label: the new one.
+    """
+    import networkx as nx
+
+    by_hand = merged.constraints.links
+    links = [link for link in merged.links if not link.within and link.pair not in by_hand]
+    before, after = (across_floors(links, some) for some in (floors, {**floors, node.map: label}))
+    ties = [(a.map, b.map) for a, b in by_hand]
+    parts = []
+    for graph in merged.graphs:
+        inside = {MapId(*map_id) for map_id in graph.maps}
+        held = []
+        for apart in (before, after):
+            joined: nx.Graph = nx.Graph()
+            joined.add_nodes_from(inside)
+            joined.add_edges_from(link.maps for link in links if link.maps not in apart)
+            joined.add_edges_from(ties)
+            groups = nx.connected_components(joined.subgraph(inside))
+            held.append(
+                sorted((tuple(sorted(group)) for group in groups), key=lambda g: (node.map not in g, g))
+            )
+        if len(held[1]) > len(held[0]):
+            parts.append(tuple(held[1]))
+    fallen = sum(link.maps in after and link.maps not in before for link in links)
+    return FloorParting(fallen, tuple(parts))
+
+
 def across_floors(links: Iterable[Link], floors: Mapping[MapId, str]) -> dict[MapPair, str]:
     """Pairs of maps, the smaller first, that are not linked since they are on different floors, and why.
 
@@ -117,6 +176,19 @@ def across_floors(links: Iterable[Link], floors: Mapping[MapId, str]) -> dict[Ma
         if one != other:
             excluded[a, b] = f"{_where(a, one, floors)} and {_where(b, other, floors)}"
     return excluded
+
+
+def _parting_words(parts: Sequence[Sequence[MapId]]) -> str:
+    names = [_some(part) for part in parts]
+    return f"{names[0]} {'parts' if len(parts[0]) == 1 else 'part'} from {' and from '.join(names[1:])}"
+
+
+def _some(maps: Sequence[MapId]) -> str:
+    """Names of maps, of many the first."""
+    named = [str(which) for which in maps[:MOST_NAMED]]
+    if len(maps) > MOST_NAMED:
+        named.append(f"{len(maps) - MOST_NAMED} more")
+    return " and ".join(filter(None, (", ".join(named[:-1]), named[-1])))
 
 
 def _where(map_id: MapId, floor: str, floors: Mapping[MapId, str]) -> str:

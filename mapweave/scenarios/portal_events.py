@@ -37,7 +37,8 @@ class PortalEvents:
         for number, robot in enumerate(self._stage.robots, start=1):
             clear = self._clear_nodes(whole, robot)
             which = clear[0].id
-            self._person.annotate("floor", str(which.map), node=str(which), label=str(number))
+            why = "each robot has a floor of its own"
+            self._person.annotate("floor", str(which.map), why, node=str(which), label=str(number))
             sides.append(clear)
         a, b = sides[0][0].id, sides[1][0].id
         self._person.annotate("portal", "lift", a=str(a), b=str(b), means="lift")

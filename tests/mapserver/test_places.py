@@ -381,9 +381,15 @@ def test_a_floor_parts_maps_and_answers_name_it(tmp_path: Path, capsys: pytest.C
                     person.annotate("floor", "r0.1", node="r1.1.1", label="upper")
                 upper = Annotation("r1.1", Floor(NodeId("r1", 1, 1), "upper"), False, "anna", 1)
                 count = len(server.merged().links)
-                said = server.annotate(upper, check=True)
-                assert said.endswith(f"; {count} links between this map and maps on other floors"), said
-                person.annotate("floor", "r1.1", node="r1.1.1", label="upper")
+                falls = f"{count} links fall and r1.1 parts from r0.1"
+                for check in (True, False):
+                    with pytest.raises(InvalidValue, match=rf"{falls}\. If that is right, .* needs a reason"):
+                        server.annotate(upper, check=check)
+                assert server.annotations().floors.keys() == {maps[0]}
+                said = server.annotate(replace(upper, because="twin rooms"), check=True)
+                assert said.endswith(f"; {falls}"), said
+                said = person.annotate("floor", "r1.1", "twin rooms", node="r1.1.1", label="upper")
+                assert said.endswith(f"; {falls}"), said
                 eventually(lambda: server.status()["components"] == 2)
             answer = server.locate(lambda: view, 1).result(20.0)
             assert {candidate.floor for candidate in answer.candidates} <= {"ground", "upper"}

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,7 +15,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.merge.floors import across_floors
+from mapweave.merge.floors import across_floors, parted_by
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.offline_merge import merge_parts
@@ -74,6 +75,28 @@ def test_a_map_without_a_label_goes_with_those_it_has_most_in_common_with() -> N
         (b, d): "b.1 is on floor second and d.1 is on floor first, by what it has in common with others",
     }
     assert across_floors(links, {a: "first", b: "first"}) == {}
+
+
+@pytest.mark.parametrize(
+    ("ties", "words"),
+    [
+        ({(0, 1): 30, (1, 2): 20, (0, 2): 12}, "2 links fall and c.1 parts from a.1 and b.1"),
+        ({(0, 1): 20, (1, 2): 30, (0, 2): 12}, "2 links fall and b.1 and c.1 part from a.1"),
+        ({(0, 1): 30, (1, 2): 20}, "1 link falls and c.1 parts from a.1 and b.1"),
+        ({(0, 1): 30}, ""),
+    ],
+)
+def test_what_a_label_parts_counts_maps_that_are_on_a_floor_by_inference(ties, words) -> None:
+    """A map without a label goes with the better supported side, and its links with the other one fall."""
+    links = tuple(link(NAMES[a], NAMES[b], shared) for (a, b), shared in ties.items())
+    which = [tuple(NAMES[k]) for k in sorted({end for pair in ties for end in pair})]
+    graphs = (SimpleNamespace(maps=which),)
+    merged = SimpleNamespace(links=links, graphs=graphs, constraints=ManualConstraints())
+    (a, _, c), label = NAMES[:3], "first"
+    parting = parted_by(merged, {a: "ground"}, NodeId(*c, 1), label)  # type: ignore[arg-type]
+    assert parting.words == words and bool(parting.parts) == bool(words)
+    known = parted_by(merged, {a: "ground", c: label}, NodeId(*c, 1), label)  # type: ignore[arg-type]
+    assert known.words == "", "what has fallen before does not fall once more"
 
 
 @pytest.fixture(scope="module")

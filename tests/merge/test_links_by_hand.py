@@ -288,10 +288,13 @@ def test_a_drive_from_map_to_map_is_evidence_against_labels_and_likeness_is_not(
     second = Annotation(str(B), Floor(node(B, 1), "2"), False, "anna", 2)
     merged = scene.merger.merged()
     assert len(merged.components) == 1, "they look the same"
-    check_annotation(merged, Annotations((first,)), second, ManualConstraints())
+    with pytest.raises(InvalidValue, match=rf"on floor 1 .* fall and {B} parts from {A}\. .* needs a reason"):
+        check_annotation(merged, Annotations((first,)), second, ManualConstraints())
+    because = replace(second, because="twin rooms")
+    check_annotation(merged, Annotations((first,)), because, ManualConstraints())
     between = merged.relative(node(A, 1), node(B, 1))
     assert between is not None
     drive = Edge(EdgeId(*A, 99), node(A, 1), node(B, 1), between, EdgeKind.DRIVEN)
     scene.merger.on_change(Change(A, 99, 0, EdgePut(drive)))
     with pytest.raises(InvalidValue, match=r"a robot has driven between a\.1\.1 and b\.1\.1"):
-        check_annotation(scene.merger.merged(), Annotations((first,)), second, ManualConstraints())
+        check_annotation(scene.merger.merged(), Annotations((first,)), because, ManualConstraints())
