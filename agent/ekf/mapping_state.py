@@ -129,7 +129,7 @@ class Step:
 
     @property
     def state(self) -> MappingState:
-        """After the step: P- = A P A^T + B S B^T + Q of paper-notes; computed when first asked for."""
+        """After the step: P- = A P A^T + B S B^T (docs/method.md); computed when first asked for."""
         return self._advanced()[0]
 
     def again(self, at: Odometry | None = None, wheel_root: Array | None = None) -> Step:

@@ -6,8 +6,8 @@ centre by (tx forward, ty left) and turns it by u2:
 
     tx = u1 cos(u2/2) + m (cos u2 - 1),   ty = u1 sin(u2/2) + m sin u2
 
-with m the way of the optical centre ahead of the axle. With p1' and p3' of paper-notes' exact form divided
-by p3 one gets, all in closed form and without a pole at w = 0 (a landmark at infinity),
+with m the way of the optical centre ahead of the axle. With p1' and p3' of docs/method.md divided by p3 one
+gets, all in closed form and without a pole at w = 0 (a landmark at infinity),
 
     D  = cos u2 (1 - tx w) - sin u2 (a + ty w)
     a' = (sin u2 (1 - tx w) + cos u2 (a + ty w)) / D,   b' = b / D,   w' = w / D.
