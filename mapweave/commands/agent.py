@@ -106,9 +106,10 @@ def add_rerun(parser: argparse.ArgumentParser) -> None:
 def add_robot(parser: argparse.ArgumentParser) -> None:
     """Declare which robot it is, and where it is reached."""
     parser.add_argument(
-        "--robot", metavar="DRIVER",
-        help="a driver as `mapweave robots` lists them, or your own class, FILE.py:CLASS (default: [robot] "
-        "driver of the settings, else remote, a base behind Zenoh keys such as the simulator's)",
+        "--robot", metavar="DRIVER|FILE",
+        help="a driver as `mapweave robots` lists them, your own class, FILE.py:CLASS, or the settings file, "
+        "FILE.toml, that names the driver (default: [robot] driver of --settings, else remote, a base behind "
+        "Zenoh keys such as the simulator's)",
     )  # fmt: skip
     parser.add_argument(
         "--body",
@@ -116,6 +117,22 @@ def add_robot(parser: argparse.ArgumentParser) -> None:
         metavar="ENDPOINT",
         help="Zenoh endpoint of the robot's body (default: the fleet's)",
     )
+
+
+def take_robot_file(arguments: argparse.Namespace) -> None:
+    """Read a settings file that is given as the robot as --settings.
+
+    Raises:
+        UsageError: --settings is given, too.
+    """
+    from mapweave.commands.usage import UsageError
+
+    given: str | None = arguments.robot
+    if given is None or not given.endswith(".toml"):
+        return
+    if arguments.settings not in (None, Path(given)):
+        raise UsageError(f"--robot {given} is a settings file, and so is --settings: give one of them")
+    arguments.settings, arguments.robot = Path(given), None
 
 
 def run(arguments: argparse.Namespace) -> int:
@@ -140,6 +157,7 @@ def run(arguments: argparse.Namespace) -> int:
         resume = map_of(arguments.resume)
         if not (arguments.data / f"{name}.sqlite").exists():
             raise Refused(f"{arguments.data}: there is no journal of {name} with a map to resume")
+    take_robot_file(arguments)
     settings = settings_of(arguments)
     network = network_of(arguments, settings, name)
     simulated = arguments.lockstep and (arguments.robot or settings.robot.driver) == REMOTE

@@ -9,7 +9,14 @@ from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.agent import add_calibration, bus_of, calibration_of, close_on, open_robot
+from mapweave.commands.agent import (
+    add_calibration,
+    bus_of,
+    calibration_of,
+    close_on,
+    open_robot,
+    take_robot_file,
+)
 from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 from mapweave.commands.replay import add_recording, name_of, options_of
 from mapweave.exit_status import INTERRUPTED, NO
@@ -36,8 +43,8 @@ def add_to(actions: Any) -> None:
     )
     add_recording(parser, optional=True)
     parser.add_argument(
-        "--robot", metavar="NAME|DRIVER",
-        help="of a recording: one of the robots in its splits.toml; without one: the driver, as for `agent` "
+        "--robot", metavar="NAME|DRIVER|FILE",
+        help="of a recording: one of the robots in its splits.toml; without one: as for `agent` "
         "(default: [robot] driver of the settings)",
     )  # fmt: skip
     parser.add_argument(
@@ -75,6 +82,8 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.processes.agent import measured
     from mapweave.terminal import plain_or_terminal
 
+    if arguments.recording is None:
+        take_robot_file(arguments)
     if arguments.recording is None and not (arguments.name and (arguments.robot or arguments.settings)):
         raise UsageError("give a recording, or --name NAME of a robot and --robot DRIVER or --settings FILE")
     cv2.setNumThreads(1)

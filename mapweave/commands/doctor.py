@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
+from mapweave.commands.agent import take_robot_file
 from mapweave.commands.network import add_network, network_of
 from mapweave.exit_status import DONE, NO
 
@@ -34,8 +35,9 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument(
         "--robot",
-        metavar="DRIVER",
-        help="its driver, or FILE.py:CLASS, as of `agent` (default: that of the settings file)",
+        metavar="DRIVER|FILE",
+        help="its driver, FILE.py:CLASS, or its settings file, FILE.toml, as of `agent` (default: the driver "
+        "of --settings)",
     )
     parser.add_argument("--name", type=values.name, help="of the robot in the fleet (default: r0)")
     parser.add_argument(
@@ -60,6 +62,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.doctor.examination import ExaminationOptions, examine
     from mapweave.doctor.finding import first_wrong, report
 
+    take_robot_file(arguments)
     driver = arguments.robot
 
     def load() -> Settings:

@@ -58,8 +58,8 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "keys bundle": ("mapweave keys bundle r0 -o r0.key",),
     "robots": ("mapweave robots",),
     "doctor": (
-        "mapweave doctor --settings robot.toml",
-        "mapweave doctor --settings robot.toml --offline --json",
+        "mapweave doctor --robot robot.toml",
+        "mapweave doctor --robot robot.toml --offline --json",
     ),
     "find-port": ("mapweave find-port",),
     "find-cameras": ("mapweave find-cameras",),

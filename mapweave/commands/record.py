@@ -9,7 +9,14 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.agent import add_robot, bus_of, close_on, open_robot, print_error
+from mapweave.commands.agent import (
+    add_robot,
+    bus_of,
+    close_on,
+    open_robot,
+    print_error,
+    take_robot_file,
+)
 from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 
 
@@ -37,6 +44,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.terminal import Bar, plain_or_terminal
 
     name: str = arguments.name
+    take_robot_file(arguments)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
     check_new(arguments.out)

@@ -90,6 +90,6 @@ def _camera(settings: Settings) -> Iterator[Finding]:
 def _driver(options: ExaminationOptions, settings: Settings) -> Iterator[Finding]:
     open_robot = options.open_robot(settings)
     if open_robot is None:
-        yield skipped("driver", "no robot is given", "mapweave doctor --settings robot.toml")
+        yield skipped("driver", "no robot is given", "mapweave doctor --robot robot.toml")
         return
     yield from driver.examine(open_robot, settings.robot.camera is not None, options.drives, options.ask)
