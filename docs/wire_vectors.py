@@ -32,10 +32,12 @@ from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.descriptor import encode as encode_descriptors
 from mapweave.hybridmap.descriptor import quantise
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.landmark_tables import landmark_tables
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent, MapEventKind
 from mapweave.hybridmap.mission_order import (
@@ -381,6 +383,22 @@ def _refusal(data: bytes) -> Any:
     return {"error": reply.error, "retry_after": reply.retry_after}
 
 
+def descriptors() -> list[dict[str, Any]]:
+    """SIFT, a byte an entry, and its code: usual ones, an empty one, and the farthest ones."""
+    usual = np.minimum(np.random.default_rng(3).gamma(0.5, 45.0, (3, 128)), 255.0)
+    basis = landmark_tables().basis
+    # RootSIFT along an axis reaches farthest, as far as it may: no entry is negative.
+    least, largest = np.maximum(-basis[:, 0], 0.0) ** 2, np.maximum(basis[:, 0], 0.0) ** 2
+    extremes = [255.0 * row / row.max() for row in (least, largest)]
+    rows = np.round([*usual, np.zeros(128), *extremes]).astype(np.uint8)
+    notes = ("", "", "", "an empty one", "far along an axis", "far along an axis")
+    codes = encode_descriptors(rows)
+    return [
+        vector("descriptor", note, "", row.tobytes(), code)
+        for note, row, code in zip(notes, rows, codes, strict=True)
+    ]
+
+
 def others() -> list[dict[str, Any]]:
     """Messages with a form of their own, robot bases, and a map file."""
     placed = {NODE: MergedPose(NODE, Pose2(1.25, -2.0, 0.5)), NEXT: MergedPose(FAR, Pose2(0.5, 0.0, -1.5))}
@@ -422,7 +440,7 @@ def vectors() -> list[dict[str, Any]]:
         for key, ones in answers().items()
         for one in ones
     ]
-    return [*changes(), *values, *others()]
+    return [*changes(), *values, *others(), *descriptors()]
 
 
 def as_json() -> str:

@@ -56,6 +56,13 @@ def frequencies() -> dict[str, Any]:
         return {name: tables[name].tolist() for name in ("codes", "shares", "cells")}
 
 
+@cache
+def axes() -> tuple[list[float], list[list[float]], float]:
+    """What descriptors are projected with: their mean, a row of axes for each entry, and the step."""
+    with np.load(TABLES) as tables:
+        return tables["mean"].tolist(), tables["basis"].tolist(), float(tables["step"])
+
+
 class Landmarks:
     """Reads packed landmarks bit by bit."""
 
@@ -389,6 +396,14 @@ class Plain:
             "image": image, "proximity": fields["r"], "bumped": fields["b"],
             "battery": fields.get("battery"), "kidnapped": fields.get("k", False),
         }  # fmt: skip
+
+    def _descriptor(self, data: bytes) -> Any:
+        """The code of a SIFT descriptor, a byte an entry."""
+        mean, basis, step = axes()
+        total = max(sum(data), 1e-12)
+        root = [math.sqrt(entry / total) - mean[i] for i, entry in enumerate(data)]
+        coordinates = [sum(root[i] * basis[i][k] for i in range(128)) for k in range(32)]
+        return [min(max(round(y / step) + 32, 0), 63) for y in coordinates]
 
     def _map_file(self, data: bytes) -> Any:
         magic, version, length = struct.unpack_from("<8sIQ", data)
