@@ -8,8 +8,7 @@ from collections.abc import Collection
 from mapweave.hybridmap.ids import NodeId
 
 FORGET = 120.0
-"""How long a blockage counts after it was reported last, s; infinite where only simulated time passes,
-which no server knows."""
+"""How long a blockage counts after it was reported last, s."""
 MOST = 256
 """Blockages that are kept, those that were reported last."""
 

@@ -23,7 +23,7 @@ ROLES = (
     ),
     ("people who ask a server: `mapweave relocalize`, `map`", "`[network]`"),
     ("people with map files: `mapweave map`", "`[merge]`"),
-    ("simulation and recordings: `mapweave sim`, `evaluate`", "`[agent]`, `[merge]`"),
+    ("simulation and recordings: `mapweave sim`, `eval`", "`[agent]`, `[merge]`"),
 )
 """Commands that take `--settings FILE`, and the parts of the file that each reads."""
 

@@ -201,7 +201,7 @@ class _Record(LogMessage, frozen=True):
 
 
 def encode_record(values: Mapping[str, Scalar]) -> bytes:
-    """Encode a flat record of names and plain values: status lines, missions, commands to the simulator.
+    """Encode a flat record of names and plain values: status lines, answers in words.
 
     Raises:
         InvalidValue: it would not decode.

@@ -33,7 +33,7 @@ from mapweave.storage.image_file import decode_grey, image_size
 from mapweave.wire import typed
 from mapweave.wire.packing import Limit, pack, unpack
 
-ENDED = "the simulation has ended"
+ENDED = "the base has ended"
 """Refusal: there will be no more observations, and that is no failure."""
 
 AGAIN = "ask again later"

@@ -97,7 +97,7 @@ class RemoteRobot:
         return self._description
 
     def sense(self) -> Observation | None:
-        """Let the last command act for one tick; None when the simulation has ended.
+        """Let the last command act for one tick; None when the base has ended.
 
         Raises:
             DeviceError: no answer, or a malformed one.

@@ -22,7 +22,7 @@ log = logging.getLogger(__name__)
 APPLICATION_ID = 0x4D575354
 """'MWST' in the file's header."""
 
-VERSION = 2
+VERSION = 1
 MOST_MAPS = 4096
 """Of which it is remembered how many landmarks each node has."""
 ADVICE = (

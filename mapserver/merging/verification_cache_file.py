@@ -24,7 +24,7 @@ from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.verdicts import Verdict
 
 MAGIC = b"mapweave verdicts\n"
-FORMAT = 3
+FORMAT = 1
 
 
 def save(path: Path, findings: VerificationCache, made_by: str) -> None:
