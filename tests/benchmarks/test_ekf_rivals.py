@@ -7,6 +7,7 @@ import pytest
 
 from benchmarks.ekf_speed import benchmark as ekf_speed
 from benchmarks.ekf_speed.benchmark import Ours, Theirs, gap, plain, race
+from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.camera import Camera
 from synthetic.mapping_run import AXLE, SHAPES, WHEEL_NOISE, draw_run
 from tests.quick import first_quick
@@ -36,6 +37,16 @@ def test_a_wrong_model_does_not_agree(monkeypatch: pytest.MonkeyPatch) -> None:
         own.step(odometry, pixels)
         theirs.step(odometry, pixels)
     assert min(gap(own.belief, theirs.belief)) > 1e-5
+
+
+def test_a_race_goes_on_when_our_filter_gives_a_landmark_up() -> None:
+    """With its rules it does so in this run, at step 72."""
+    run = draw_run(np.random.default_rng(8932), "arc", steps=200, landmarks=30)
+    own = Ours(run, FilterSettings(pixel_sigma=run.pixel_sigma))
+    for odometry, pixels in zip(run.odometry[:72], run.pixels[1:], strict=False):
+        own.step(odometry, pixels)
+    assert len(own.belief[0]) == 3 + 3 * 29
+    assert race(8932, 30).difference < 1e-6
 
 
 def test_transition_is_the_motions_derivative() -> None:
