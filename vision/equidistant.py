@@ -91,10 +91,10 @@ class Equidistant:
         focal = cx / math.tan(min(angle, WIDEST))
         return Camera(width, height, focal, focal, cx, cy, mount_height, mount_forward)
 
-    def reduced(self, factor: int) -> Equidistant:
-        """The lens on an image reduced by a whole factor; the middle of the first pixel is 0."""
-        cx, cy = (self.cx + 0.5) / factor - 0.5, (self.cy + 0.5) / factor - 0.5
-        return Equidistant(self.fx / factor, self.fy / factor, cx, cy, self.k)
+    def scaled(self, across: float, down: float) -> Equidistant:
+        """The lens on an image of another size, by its ratios; the middle of the first pixel is 0."""
+        cx, cy = (self.cx + 0.5) * across - 0.5, (self.cy + 0.5) * down - 0.5
+        return Equidistant(self.fx * across, self.fy * down, cx, cy, self.k)
 
     def _radius(self, angle: Array) -> Array:
         k1, k2, k3, k4 = self.k

@@ -7,6 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from numbers import Real
 
 import numpy as np
@@ -16,6 +17,7 @@ from mapweave.agent.drivers.messages import encode_description
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, MapweaveError
+from mapweave.vision.image_reduction import ImageSize, reduced_image, reduced_optics, reduced_size
 
 log = logging.getLogger(__name__)
 
@@ -38,7 +40,10 @@ SLACK = (0.5, 1.0)
 
 
 class CheckedRobot:
-    """Wraps a robot and compares each observation with its description."""
+    """Wraps a robot and compares each observation with its description.
+
+    Images that are larger than agents work on are reduced, and the camera with them, as those of recordings.
+    """
 
     def __init__(self, robot: Robot, clock: Callable[[], float] = time.time) -> None:
         """Wrap a robot.
@@ -49,6 +54,7 @@ class CheckedRobot:
         """
         self._robot = robot
         self._clock = clock
+        self._given: RobotDescription | None = None
         self._description: RobotDescription | None = None
         self._stamp_ns: int | None = None
         self._good = self._moved = 0
@@ -56,7 +62,7 @@ class CheckedRobot:
         self._closed = False
 
     def describe(self) -> RobotDescription:
-        """Description of the robot.
+        """Description of the robot; its camera is that of the images that `sense` returns.
 
         Raises:
             DeviceError: it is no description, or a value of it is wrong, or the driver has failed.
@@ -65,7 +71,7 @@ class CheckedRobot:
             with _driver_code():
                 description = self._robot.describe()
             _check_description(description)
-            self._description = description
+            self._given, self._description = description, _reduced(description)
         return self._description
 
     @property
@@ -94,11 +100,15 @@ class CheckedRobot:
             raise mistake("sense()", f"must return an Observation or None, not {kind_of(seen)}")
         before_ns = self._stamp_ns
         self._check_stamp(seen.stamp_ns, description.tick)
-        _check_image(seen, description)
+        assert self._given is not None
+        _check_image(seen, self._given)
         _check_numbers(seen, description)
         if before_ns is not None:
             self._check_motion(seen.odometry, max((seen.stamp_ns - before_ns) * 1e-9, description.tick))
-        return seen
+        if seen.image is None or description is self._given:
+            return seen
+        size = ImageSize(description.camera.width, description.camera.height)
+        return replace(seen, image=reduced_image(seen.image, size))
 
     def act(self, command: Command) -> Command:
         """Send a command.
@@ -179,6 +189,17 @@ class CheckedRobot:
                     f"is {value:g} {unit} in {seconds:.2g} s, but describe() gives at most {fastest:g} "
                     f"{unit}/s; it must be m and rad since the observation before",
                 )
+
+
+def _reduced(given: RobotDescription) -> RobotDescription:
+    """With the camera of reduced images; itself if these are not larger than agents work on."""
+    camera = given.camera
+    size = reduced_size(camera.width, camera.height)
+    if size == (camera.width, camera.height):
+        return given
+    small, lens = reduced_optics(camera, given.distortion, size)
+    log.info("images are reduced from %dx%d to %dx%d px", camera.width, camera.height, *size)
+    return replace(given, camera=small, distortion=lens)
 
 
 @contextmanager

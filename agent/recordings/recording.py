@@ -7,9 +7,7 @@ from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -20,6 +18,7 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.vision.equidistant import Equidistant
+from mapweave.vision.image_reduction import ImageSize, reduced_image, reduced_optics, reduced_size
 from mapweave.vision.lens import NO_DISTORTION, Distortion, Lens
 
 Stamps = NDArray[np.int64]
@@ -35,8 +34,6 @@ ZERO, NEAR_ZERO = 1e-6, 0.1
 LONG_GAP, SLOWEST = 10.0, 1e-3
 """s between two images, and m/s, half of the time or more: what 10 ms and 1 m/s seem to be where milliseconds
 are taken for seconds. No robot's camera is quicker, and a robot that is so slow needs no image so rarely."""
-MOST_WIDTH = 800
-"""px; wider images are reduced. SIFT takes time in proportion to the area."""
 
 
 @dataclass(frozen=True)
@@ -277,15 +274,18 @@ def assembled(
         stamps, increments = stamps[:whole_count], increments[:whole_count]
     increments, jumps = bridged(increments, stamps)
     notes = (*notes, *jumps, *_milliseconds(increments, stamps))
-    factor = math.ceil(camera.width / MOST_WIDTH)
-    if factor > 1:
-        notes = (*notes, f"images are reduced {factor} times")
-    read = _reader(path, read, camera, factor)
-    camera = reduced(camera, factor)
+    size = reduced_size(camera.width, camera.height)
+    if size != (camera.width, camera.height):
+        notes = (
+            *notes,
+            f"images are reduced from {camera.width}x{camera.height} to {size.width}x{size.height} px",
+        )
+    read = _reader(path, read, camera, size)
+    camera, distortion = reduced_optics(camera, distortion, size)
     if isinstance(distortion, Equidistant):
         field = math.degrees(2.0 * camera.semi_aperture)
         notes = (*notes, f"fisheye images are rectified to {field:.0f} degrees")
-        read, distortion = _rectified(read, Lens(camera, distortion.reduced(factor))), NO_DISTORTION
+        read, distortion = _rectified(read, Lens(camera, distortion)), NO_DISTORTION
     return Recording(
         path,
         kind,
@@ -358,24 +358,8 @@ def names_of(topics: Iterable[Topic]) -> str:
     return ", ".join(f"{topic.name} ({topic.kind})" for topic in topics if topic.count) or "no messages"
 
 
-def reduced(camera: Camera, factor: int) -> Camera:
-    """The camera of images that are reduced by a whole factor; what is left over at the edges is cut off."""
-    if factor == 1:
-        return camera
-    return replace(
-        camera,
-        width=camera.width // factor,
-        height=camera.height // factor,
-        fx=camera.fx / factor,
-        fy=camera.fy / factor,
-        # The middle of the first pixel is 0: the middle of the first `factor` pixels moves there.
-        cx=(camera.cx + 0.5) / factor - 0.5,
-        cy=(camera.cy + 0.5) / factor - 0.5,
-    )
-
-
 def _reader(
-    path: Path, read: Callable[[int], NDArray[np.uint8]], camera: Camera, factor: int
+    path: Path, read: Callable[[int], NDArray[np.uint8]], camera: Camera, size: ImageSize
 ) -> Callable[[int], NDArray[np.uint8]]:
     def checked(k: int) -> NDArray[np.uint8]:
         image = read(k)
@@ -385,11 +369,7 @@ def _reader(
                 f"{path}: image {k} has {width}x{height} px, but the camera {camera.width}x{camera.height}; "
                 "give --camera FILE, the camera.toml of images of this size"
             )
-        if factor == 1:
-            return image
-        size = (camera.width // factor, camera.height // factor)
-        whole: NDArray[Any] = image[: size[1] * factor, : size[0] * factor]
-        return np.asarray(cv2.resize(whole, size, interpolation=cv2.INTER_AREA), np.uint8)
+        return reduced_image(image, size)
 
     return checked
 

@@ -17,6 +17,7 @@ from mapweave.vision.calibration.estimation import Fit, fit, refit, residuals_of
 from mapweave.vision.calibration.projection import project, rays_of
 from mapweave.vision.calibration.views import BoardView
 from mapweave.vision.equidistant import WIDEST
+from mapweave.vision.image_reduction import reduced_size
 from mapweave.vision.lens import LensModel
 
 MOST_VIEWS = 50
@@ -25,11 +26,9 @@ FOLDS = 5
 """Parts into which the views are cut; each is held out once."""
 MUCH_BETTER = 0.9
 """An equidistant lens is taken if it explains held out views with less than this of the other's error."""
-COMPARED_WIDTH = 800
-"""px; images of recordings and robots are worked on at no more than this width."""
 MOST_ERROR = 0.7
-"""px of an image of that width, of the worst projection and of corners of views held out: the noise of a
-pixel that the agent tracks (`pixel_sigma`)."""
+"""px of an image as agents work on it, reduced if it is large, of the worst projection and of corners of
+views held out: the noise of a pixel that the agent tracks (`pixel_sigma`)."""
 SQUARE_PIXELS = 0.02
 """Share by which fx and fy differ at most. Pixels are square; a printer that stretches a page is not."""
 GRID = (13, 9)
@@ -178,19 +177,19 @@ def uncertainty_of(found: Fit, image_size: tuple[int, int]) -> Array:
 
 
 def _problems(found: Fit, image_size: tuple[int, int], uncertainty: Array, held_out: float) -> list[str]:
-    limit = MOST_ERROR * math.ceil(image_size[0] / COMPARED_WIDTH)
+    limit = MOST_ERROR * image_size[0] / reduced_size(*image_size).width
     problems = []
     worst = float(np.nanmax(uncertainty))
     if not worst <= limit:
         row, column = np.unravel_index(int(np.nanargmax(uncertainty)), uncertainty.shape)
         place = PLACES[int(row) * 3 // GRID[1]][int(column) * 3 // GRID[0]]
         problems.append(
-            f"projections are uncertain by {worst:.2f} px in the {place}, {limit:g} px are "
+            f"projections are uncertain by {worst:.2f} px in the {place}, {limit:.2g} px are "
             "good: more views there, near and tilted"
         )
     if not held_out <= limit:
         problems.append(
-            f"corners of views held out are {held_out:.2f} px off, {limit:g} px are good: is "
+            f"corners of views held out are {held_out:.2f} px off, {limit:.2g} px are good: is "
             "the board flat and still, the image sharp, and the lens of this kind?"
         )
     fx, fy = found.intrinsics[:2]

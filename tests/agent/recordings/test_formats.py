@@ -14,9 +14,7 @@ from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.incomplete import NoOdometry
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
-from mapweave.agent.recordings.recording import reduced
 from mapweave.agent.recordings.video import video_images
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.vision.equidistant import Equidistant
 from mapweave.vision.lens import NO_DISTORTION, Lens
@@ -283,23 +281,6 @@ def test_odometry_of_another_clock_is_refused(drive: Drive, poses_file: Path, tm
     kitti(drive, tmp_path)
     with pytest.raises(DeviceError, match="do not overlap: they must be of one clock"):
         open_recording(tmp_path, RecordingOptions(odometry=poses_file, camera_height=1.65))
-
-
-def test_a_fisheye_is_reduced_with_its_image() -> None:
-    lens = Equidistant(300.0, 301.0, 400.5, 310.5, (-0.02, 0.004, -0.003, 0.0005))
-    pixels = np.array([[100.0, 80.0], [402.0, 300.0]])
-    rays = lens.rays(pixels)
-    assert np.allclose(lens.reduced(3).project(rays), (pixels + 0.5) / 3 - 0.5, atol=1e-9)
-
-
-def test_a_large_image_is_reduced_with_its_camera(drive: Drive) -> None:
-    """A point falls on the same place of the scene in both images."""
-    large = Camera(1601, 1201, 1400.0, 1390.0, 803.2, 588.7, mount_height=0.4, mount_forward=0.1)
-    small = reduced(large, 3)
-    assert (small.width, small.height) == (533, 400)
-    points = np.array([[3.0, 0.4, 0.2], [2.0, -0.7, 0.9], [5.0, 0.0, 0.4]])
-    # Pixel k of the small image covers pixels 3 k to 3 k + 2, whose middle is 3 k + 1.
-    assert 3.0 * small.project(points) + 1.0 == pytest.approx(large.project(points))
 
 
 @pytest.mark.parametrize(

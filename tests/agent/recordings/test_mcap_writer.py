@@ -8,10 +8,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+from mapweave.agent.drivers.checked import CheckedRobot
 from mapweave.agent.drivers.recorded import RecordedRobot
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
@@ -19,11 +21,13 @@ from mapweave.agent.observation import Command, Observation, Odometry, RobotDesc
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.mcap_writer import PART_S, McapWriter, _Part
 from mapweave.agent.recordings.options import RecordingOptions
+from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.equidistant import Equidistant
-from mapweave.vision.lens import NO_DISTORTION, Distortion
+from mapweave.vision.image_reduction import MOST_PIXELS
+from mapweave.vision.lens import NO_DISTORTION, Distortion, Lens
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, Drive
 
@@ -309,3 +313,54 @@ def test_a_robot_whose_camera_is_at_the_floor_is_refused_in_one_line() -> None:
     camera = replace(DESCRIPTION.camera, mount_height=0.0)
     with pytest.raises(InvalidValue, match=r"^camera: height_m is 0; a robot needs its height"):
         Pipeline(MapId("r0", 1), replace(DESCRIPTION, camera=camera))
+
+
+class Large:
+    """A robot with a camera of more pixels than agents work on."""
+
+    def __init__(self, lens: Distortion) -> None:
+        self._at, noise = 0, np.random.default_rng(5).integers(0, 255, (3, 30, 40), np.uint8)
+        self.images = [cv2.resize(one, (1280, 960), interpolation=cv2.INTER_CUBIC) for one in noise]
+        camera = Camera(1280, 960, 700.0, 702.0, 641.0, 478.0, mount_height=0.3)
+        self._lens = lens
+        if isinstance(lens, Equidistant):
+            camera = lens.ideal(1280, 960, 0.3)
+        self.description = RobotDescription(camera, lens, max_forward=0.3, max_turn=1.0)
+
+    def describe(self) -> RobotDescription:
+        return self.description
+
+    def sense(self) -> Observation | None:
+        if self._at == len(self.images):
+            return None
+        self._at += 1
+        return Observation(BEGUN_NS + self._at * 10**8, Odometry(0.01, 0.0), self.images[self._at - 1])
+
+    def act(self, command: Command) -> Command:
+        return command
+
+    def close(self) -> None:
+        pass
+
+
+@pytest.mark.parametrize(
+    "lens", [(-0.1, 0.02, 0.001, 0.0, 0.0), Equidistant(500.0, 501.0, 640.5, 481.0, (-0.02, 0.0, 0.0, 0.0))]
+)
+def test_a_large_camera_is_replayed_as_the_robot_has_worked_on_it(lens: Distortion, tmp_path: Path) -> None:
+    """Robots were not reduced and recordings were: a replay could not give the robot's map."""
+    robot = CheckedRobot(Large(lens))
+    recorded = RecordedRobot(robot, tmp_path / "walk", lossless=True)
+    described = recorded.describe()
+    assert described.camera.width * described.camera.height <= MOST_PIXELS
+    seen = list(iter(recorded.sense, None))
+    recorded.close()
+    assert len(seen) == 3
+    replay = Replay(tmp_path / "walk")
+    assert replay.describe().camera == described.camera
+    lens_there = Lens(described.camera, described.distortion)
+    for there in seen:
+        here = replay.sense()
+        assert here is not None and here.image is not None and there.image is not None
+        assert there.image.shape == (described.camera.height, described.camera.width)
+        # A recording's fisheye is rectified when it is read, a robot's where features are sought.
+        assert np.array_equal(here.image, lens_there.rectified(there.image))
