@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from contextlib import ExitStack
 from typing import Any
 
 from mapweave.commands import values
@@ -45,7 +46,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.terminal import log_with_time, stamped
     from mapweave.wire.zenoh_bus import ZenohBus
     from mapweave.wire.zenoh_config import router_file
-    from mapweave.wire.zenoh_log import show_refusals
+    from mapweave.wire.zenoh_log import ZenohLog
 
     log_with_time(arguments.log_format)
     network = network_of(arguments, settings_of(arguments))
@@ -55,15 +56,14 @@ def run(arguments: argparse.Namespace) -> int:
         print(router_file(settings))
         return 0
     stop = stop_on_signals()
-    if keys is not None:
-        show_refusals(arguments.log_format)
-    bus = ZenohBus(settings)
-    try:
+    with ExitStack() as stack:
+        if keys is not None:
+            stack.enter_context(ZenohLog())
+        bus = ZenohBus(settings)
+        stack.callback(bus.close)
         print(stamped(f"router listens at {', '.join(settings.listen)}"), flush=True)
         renewal = key_renewal(bus, keys, name, settings)
         while not stop.wait(1.0):
             if renewal is not None:
                 renewal.check()
-    finally:
-        bus.close()
     return 0

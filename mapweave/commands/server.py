@@ -150,12 +150,12 @@ def run(arguments: argparse.Namespace) -> int:
         from mapweave.processes.service_manager import ServiceManager
         from mapweave.wire.keys import Keys
         from mapweave.wire.zenoh_bus import ZenohBus
-        from mapweave.wire.zenoh_log import show_refusals
+        from mapweave.wire.zenoh_log import ZenohLog
 
         gc.freeze()
         gc.enable()
         if folder is not None:
-            show_refusals(arguments.log_format)
+            stack.enter_context(ZenohLog())
         keys, bus = Keys(router.fleet), ZenohBus(router)
         stack.callback(bus.close)
         if router.mode == "client" or router.routers:

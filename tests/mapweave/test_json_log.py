@@ -92,8 +92,8 @@ def test_every_line_of_a_process_is_an_object_also_its_last(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("log_format", ["text", "json"])
-def test_a_refused_handshake_leaves_the_log_as_it_is(log_format: str, tmp_path: Path) -> None:
-    """Zenoh, which refuses it, writes lines of its own."""
+def test_a_refused_handshake_is_a_line_as_all_others(log_format: str, tmp_path: Path) -> None:
+    """Zenoh, which refuses it, would write lines of its own."""
     port = free_port()
     KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, [], "s0", port)
     words = [sys.executable, "-m", "mapweave", "router", "--keys", "keys", "--log-format", log_format]
@@ -109,15 +109,16 @@ def test_a_refused_handshake_leaves_the_log_as_it_is(log_format: str, tmp_path: 
                 with suppress(ConnectionResetError):
                     while stranger.recv(100):
                         pass
-            if log_format == "text":
-                lines += router.stdout.readline()
+            lines += router.stdout.readline()
         finally:
             router.send_signal(signal.SIGTERM)
             lines += router.communicate(timeout=30)[0]
     assert router.returncode == 0
     if log_format == "json":
-        (listens,) = objects(lines)
+        listens, refused = objects(lines)
         assert str(port) in listens["message"]
+        assert (refused["level"], refused["logger"]) == ("warning", "mapweave.wire.zenoh_log")
+        assert refused["message"] == "refused a client: it speaks plain TCP, not TLS"
     else:
-        _, refused = lines.splitlines()
-        assert "received corrupt message" in refused and "\x1b" not in lines
+        _, line = lines.splitlines()
+        assert line[20:] == "refused a client: it speaks plain TCP, not TLS"
