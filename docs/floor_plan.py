@@ -1,6 +1,6 @@
 """Draws the picture of `floor-plan.md`: the map of three robots, laid under a plan by seven clicked pairs.
 
-python docs/floor_plan.py
+`make docs` runs it; by itself: `python docs/floor_plan.py`.
 """
 
 from __future__ import annotations

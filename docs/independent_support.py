@@ -1,6 +1,6 @@
 """Draws the picture of `independent-support.md`; its numbers are what the merge makes of what is drawn.
 
-python docs/independent_support.py
+`make docs` runs it; by itself: `python docs/independent_support.py`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from matplotlib.patches import Ellipse
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
-from mapweave.merge.outlier_rejection.pairwise_consistency import sort_links
+from mapweave.merge.outlier_rejection.pairwise_consistency import CHANCE, sort_links
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import Measurement
 from mapweave.merge.pose_graph.fragments import Fragment
@@ -32,6 +32,7 @@ HEARD = ChanceSupport(40.0, np.array([30.0, 8.0, 4.0, 2.0]))
 """What all other pairs of maps have shown: 40 places that look alike and are the same, 44 that are not. Of
 these 30 bring one link, 8 two, 4 three and 2 four."""
 STEP = PoseGaussian(Pose2(0.8, 0.0, 0.0), np.diag([0.02**2, 0.02**2, 0.01**2]))
+PATH = Path(__file__).with_name("independent-support.svg")
 LINK = np.diag([0.03**2, 0.03**2, 0.01**2])
 
 
@@ -55,8 +56,8 @@ def links(pairs: Sequence[tuple[int, int]], offset: int) -> list[Link]:
     ]
 
 
-def panel(axes: Axes, title: str, pairs: Sequence[tuple[int, int]], offset: int, colour: str) -> None:
-    """Two maps, the links between them, and what the merge makes of these."""
+def panel(axes: Axes, title: str, pairs: Sequence[tuple[int, int]], offset: int, colour: str) -> float:
+    """Two maps, the links between them, and what the merge makes of these: how many false sets to expect."""
     first, second = chain("a", 14, 0.0), chain("b", 14, -2.6)
     found = sort_links(links(pairs, offset), first, second, ConsistencySettings())
     support = found.supports[0]
@@ -81,7 +82,7 @@ def panel(axes: Axes, title: str, pairs: Sequence[tuple[int, int]], offset: int,
             x, y = piece.graph.means[ends].mean(axis=0)[:2]
             width = 0.8 * (max(ends) - min(ends)) + 1.2
             axes.add_patch(Ellipse((x, y), width, 0.9, fill=False, color=colour, linestyle=":"))
-    verdict = "joins" if expected < ConsistencySettings().chance else "does not join"
+    verdict = "joins" if expected < CHANCE else "does not join"
     axes.set_title(title, fontsize=10, loc="left")
     axes.text(
         0.0,
@@ -95,15 +96,17 @@ def panel(axes: Axes, title: str, pairs: Sequence[tuple[int, int]], offset: int,
     axes.set_ylim(-4.8, 0.6)
     axes.set_aspect("equal")
     axes.axis("off")
+    return expected
 
 
-def main() -> None:
-    """Draw."""
+def main(path: Path = PATH) -> tuple[float, float]:
+    """Draw; returns what false sets are expected on the left and on the right."""
     plt.rcParams["svg.hashsalt"] = "mapweave"
     figure, (left, right) = plt.subplots(1, 2, figsize=(10.0, 2.6), layout="constrained")
-    panel(left, "One place of A looks like one of B", [(2, 9), (3, 9), (3, 10), (4, 11)], 7, FALSE)
-    panel(right, "Three places agree on how the maps lie", [(1, 1), (6, 6), (12, 12)], 0, TRUE)
-    figure.savefig(Path(__file__).with_name("independent-support.svg"), metadata={"Date": None})
+    one = panel(left, "One place of A looks like one of B", [(2, 9), (3, 9), (3, 10), (4, 11)], 7, FALSE)
+    three = panel(right, "Three places agree on how the maps lie", [(1, 1), (6, 6), (12, 12)], 0, TRUE)
+    figure.savefig(path, metadata={"Date": None})
+    return one, three
 
 
 if __name__ == "__main__":

@@ -1,0 +1,63 @@
+"""Pictures of the pages are drawn by the programs that the pages' build runs, and say what the pages say."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import cv2
+import pytest
+
+from docs import independent_support
+from docs.site import calibration_picture, demo_picture, hooks
+from mapweave.vision.calibration.target import CalibrationTarget
+from mapweave.vision.calibration.views import BoardDetector
+
+DOCS = Path(__file__).parents[1] / "docs"
+
+
+def test_every_picture_has_a_program_that_draws_it() -> None:
+    """The build runs it, or the page says that a person does."""
+    drawn = [name for names in (hooks.PICTURES | hooks.BY_HAND).values() for name in names]
+    pictures = [path for path in DOCS.rglob("*") if path.suffix in {".png", ".gif", ".svg"}]
+    assert sorted(drawn) == sorted(path.relative_to(DOCS).as_posix() for path in pictures)
+    for program in hooks.PICTURES | hooks.BY_HAND:
+        assert (DOCS.parent / program).is_file()
+    pages = "\n".join(path.read_text(encoding="utf-8") for path in DOCS.glob("*.md"))
+    for program in hooks.BY_HAND:
+        assert f"python -m {program.removesuffix('.py').replace('/', '.')}" in pages
+
+
+def test_the_build_runs_each_of_these_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+    ran = []
+    monkeypatch.setattr(hooks.subprocess, "run", lambda command, **_: ran.append(command[-1]))
+    hooks.on_pre_build(None)
+    assert ran == list(hooks.PICTURES)
+
+
+def test_independent_support_counts_as_its_page_says(tmp_path: Path) -> None:
+    page = " ".join((DOCS / "independent-support.md").read_text(encoding="utf-8").split())
+    one, three = independent_support.main(tmp_path / "drawn.svg")
+    assert f"expected to occur falsely {one:.2g} times" in page
+    assert f"are expected {three:.2g} times" in page
+    assert (tmp_path / "drawn.svg").stat().st_size > 10_000
+
+
+def test_the_guidance_that_is_drawn_is_of_a_target_that_is_seen(tmp_path: Path) -> None:
+    assert calibration_picture.main(tmp_path / "drawn.png").startswith("hold the board nearer")
+    drawn = cv2.imread(str(tmp_path / "drawn.png"), cv2.IMREAD_GRAYSCALE)
+    paper = drawn[:, : drawn.shape[1] - 800]
+    assert BoardDetector(CalibrationTarget()).find(paper) is not None, "what is printed can be read"
+
+
+@pytest.mark.parametrize("reached", [True, False])
+def test_the_demo_gives_its_picture_if_the_lost_robot_arrived(reached: bool, tmp_path: Path) -> None:
+    (tmp_path / "report.json").write_text(json.dumps({"goal": {"reached": reached}}))
+    (tmp_path / "map.png").write_bytes(b"new")
+    (tmp_path / "kept.png").write_bytes(b"old")
+    if reached:
+        demo_picture.keep(tmp_path, tmp_path / "kept.png")
+    else:
+        with pytest.raises(ValueError, match="has not arrived"):
+            demo_picture.keep(tmp_path, tmp_path / "kept.png")
+    assert (tmp_path / "kept.png").read_bytes() == (b"new" if reached else b"old")
