@@ -15,6 +15,7 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import TYPE_CHECKING, overload
 
 from mapweave.connection import ANSWERED, reach
 from mapweave.fleet_annotations import FleetAnnotations
@@ -47,6 +48,9 @@ from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import sent_by
 from mapweave.wire.zenoh_bus import ZenohBus
+
+if TYPE_CHECKING:
+    from mapweave.mapserver.plan_answers import StatusOnPlan
 
 SETTLING = 0.5
 """s; liveliness of agents that are there is known by then."""
@@ -187,12 +191,28 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         if self._own is not None:
             self._own.close()
 
-    def status(self) -> FleetStatus:
+    @overload
+    def status(self, plan: None = None) -> FleetStatus: ...
+    @overload
+    def status(self, plan: str) -> StatusOnPlan: ...
+
+    def status(self, plan: str | None = None) -> FleetStatus:
         """All robots, as the map server sees them; without one, those that answer themselves.
+
+        Args:
+            plan: a floor plan, in whose frame each robot then has `plan_from_robot`.
 
         Raises:
             NotConnected: no map server and no robot answers.
+            Refused: there is no such plan.
         """
+        if plan is not None:
+            from mapweave.mapserver.plan_answers import status_on_plan
+
+            return status_on_plan(self._status(), self.plans().plan(plan))
+        return self._status()
+
+    def _status(self) -> FleetStatus:
         for reply in self._ask(self._keys.any_robots(), b"", ANSWERED):
             return decode(reply.payload, FleetStatus)
         replies = self._ask(self._keys.agent_statuses(), b"", ANSWERED)
@@ -244,7 +264,9 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
                 raise Refused(f"there is no robot {robot}; there are: {', '.join(known) or 'none'}")
         return found
 
-    def go(self, robot: str, goal: str, wait: float = 0.0, via: Sequence[str] = ()) -> MissionReport:
+    def go(
+        self, robot: str, goal: str, wait: float = 0.0, via: Sequence[str] = (), plan: str | None = None
+    ) -> MissionReport:
         """Send a robot to a node (`r0.1.17`), a place, a position in the merged map (`3.1,-2.0`) or `home`.
 
         Args:
@@ -252,13 +274,20 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             goal: where to.
             wait: until it is there or has given up, s at most.
             via: what to pass before, in order, in the same words.
+            plan: a floor plan, in whose frame positions are then, instead of in the merged map.
 
         Raises:
             InvalidValue: `via` is one place, and no list.
             Refused: the robot or the goal does not exist, or no way leads there.
             NotConnected: the robot does not answer.
         """
-        return self._give(robot, MissionKind.GO, goal, wait, listed("via", via))
+        words = (goal, *listed("via", via))
+        if plan is not None:
+            from mapweave.mapserver.plan_answers import component_of, goal_on_plan
+
+            placed, component = self.plans().plan(plan), component_of(robot, self.status())
+            words = tuple(goal_on_plan(word, placed, component, self.resolve) for word in words)
+        return self._give(robot, MissionKind.GO, words[0], wait, words[1:])
 
     def explore(self, robot: str, wait: float = 0.0) -> MissionReport:
         """Let a robot map all floor that it can reach; see `go`."""

@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,6 +34,7 @@ from mapweave.hybridmap.explanation import (
     RouteExplanation,
     route_over,
 )
+from mapweave.hybridmap.floor_plan import PlacedPlans
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.named_nodes import ids_of
 from mapweave.hybridmap.node import Node
@@ -49,8 +50,13 @@ if TYPE_CHECKING:
     import networkx as nx
     from matplotlib.axes import Axes
 
+    from mapweave.mapserver.plan_answers import AnswerOnPlan
     from mapweave.mapserver.routes import Router
 
+Image = NDArray[np.uint8] | str | os.PathLike[str]
+"""(H, W) grey, or its file."""
+CameraName = Camera | str | os.PathLike[str]
+"""A camera, or its `camera.toml`."""
 NodeName = NodeId | str
 """A node, also as people write it: `r0.1.17`, the name of a place, a position `3.1,-2.0` in component 0."""
 MapName = MapId | str
@@ -84,6 +90,10 @@ class Map(ABC):
         Raises:
             Refused: a word is none, with the reason.
         """
+
+    @abstractmethod
+    def plans(self) -> PlacedPlans:
+        """Floor plans, and where they lie under the merged map."""
 
     def __repr__(self) -> str:
         """For example `<FileMap: 17 nodes, 3 maps, ...>`."""
@@ -176,14 +186,18 @@ class Map(ABC):
         axes.legend(loc="best", fontsize="small")
         return axes
 
-    def relocalize(
-        self, image: NDArray[np.uint8] | str | os.PathLike[str], camera: Camera | str | os.PathLike[str]
-    ) -> RelocalizeAnswer:
+    @overload
+    def relocalize(self, image: Image, camera: CameraName, plan: None = None) -> RelocalizeAnswer: ...
+    @overload
+    def relocalize(self, image: Image, camera: CameraName, plan: str) -> AnswerOnPlan: ...
+
+    def relocalize(self, image: Image, camera: CameraName, plan: str | None = None) -> RelocalizeAnswer:
         """Where an image was taken.
 
         Args:
             image: (H, W) grey, or its file (PNG, JPEG, PGM or BMP).
             camera: that took it, ideal, or its `camera.toml`, which also gives the lens.
+            plan: a floor plan, in whose frame each candidate then has `plan_from_robot`.
 
         Returns:
             Certainty, candidates with poses, best first, and the reason in words.
@@ -191,6 +205,7 @@ class Map(ABC):
         Raises:
             InvalidValue: the image is of another form or size.
             DeviceError: a file cannot be read.
+            Refused: there is no such plan.
         """
         from mapweave.agent.recordings.camera_file import read_camera
         from mapweave.offline_relocalization import view_of
@@ -207,7 +222,13 @@ class Map(ABC):
         if image.dtype != np.uint8 or image.shape != (camera.height, camera.width):
             wanted = f"({camera.height}, {camera.width}) of uint8, grey, by {source}"
             raise InvalidValue(f"an image of shape {image.shape} of {image.dtype}: give {wanted}")
-        return self._answer(view_of(image, camera, lens))
+        placed = None if plan is None else self.plans().plan(plan)
+        answer = self._answer(view_of(image, camera, lens))
+        if placed is None:
+            return answer
+        from mapweave.mapserver.plan_answers import answer_on_plan
+
+        return answer_on_plan(answer, placed)
 
     def route(
         self,
@@ -346,6 +367,12 @@ class FileMap(Map):
     def annotations(self) -> Annotations:
         """What people say about the map, as the file has it."""
         return Annotations(self.content.annotations)
+
+    def plans(self) -> PlacedPlans:
+        """Floor plans under the map, as the file has it."""
+        from mapweave.mapserver.floor_plans import placed_plans
+
+        return placed_plans(self.annotations(), self._router().merged)
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         """Nodes for words; see Map."""

@@ -9,7 +9,7 @@
     GET /history      joins, splits and manual constraints, with dates, JSON
     GET /explain      why maps are one, or are not; with ?a=r0.1.17&b=r1.1.5 two nodes or two maps, JSON
     GET /route        explanation of the route from a to b: ?a=r0.1.17&b=r1.1.5&via=kitchen, JSON
-    GET /robots       what every robot is doing, JSON
+    GET /robots       what every robot is doing, JSON; ?plan=NAME: also where they are on a floor plan
     GET /missions     the missions that are known, JSON
     GET /metrics      what Prometheus scrapes
     GET /map          the merged map, a map file
@@ -52,6 +52,7 @@ from starlette.types import ASGIApp
 
 from mapweave.hybridmap.errors import Busy, InvalidValue, MapweaveError, NotConnected, SettingsError
 from mapweave.hybridmap.explanation import PairExplanation, route_over
+from mapweave.hybridmap.floor_plan import PlacedPlan
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import History
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
@@ -73,6 +74,7 @@ from mapweave.mapserver.http.rates import LIMITED, Rates
 from mapweave.mapserver.http.reply import PATIENCE, Reply, busy, refusal
 from mapweave.mapserver.http.same_site import SameSite, is_loopback
 from mapweave.mapserver.http.serving import HttpThread, Limits
+from mapweave.mapserver.plan_answers import answer_on_plan, component_of, goal_on_plan, status_on_plan
 from mapweave.wire.each_robot import each_robot
 
 log = logging.getLogger(__name__)
@@ -91,7 +93,7 @@ METHODS = {
 }
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 """Of the text format of Prometheus."""
-GIVEN = "goal", "via", "by", "id"
+GIVEN = "goal", "via", "by", "id", "plan"
 """What may be said of a mission behind the `?`."""
 BY = "http"
 """Gives a mission, if the request does not say."""
@@ -282,8 +284,20 @@ class Questions:
     async def _history(self, _: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(lambda: json_values(History(self._server.history())))
 
-    async def _robots(self, _: Request) -> Mapping[str, Any]:
-        return await run_in_threadpool(lambda: json_values(self._server.robots()))
+    async def _robots(self, request: Request) -> Mapping[str, Any]:
+        def robots() -> Mapping[str, Any]:
+            plan, status = self._plan(request.query_params.get("plan")), self._server.robots()
+            return json_values(status if plan is None else status_on_plan(status, plan))
+
+        return await run_in_threadpool(robots)
+
+    def _plan(self, name: str | None) -> PlacedPlan | None:
+        """The plan in whose coordinates the answer is to be; None if no plan is named.
+
+        Raises:
+            Refused: there is none of this name.
+        """
+        return None if name is None else self._server.plans().plan(name)
 
     async def _missions(self, _: Request) -> Mapping[str, Any]:
         return await run_in_threadpool(lambda: json_values(self._server.missions()))
@@ -316,12 +330,16 @@ class Questions:
             raise InvalidValue(f"{unknown[0]!r:.40}: there is no such value; give {', '.join(GIVEN)}")
         if len(query.getlist("goal")) > 1:
             raise InvalidValue("goal is given twice: `via` names places on the way")
-        goal, by, mission_id = query.get("goal", ""), _author(request), query.get("id", "")
-        report = await run_in_threadpool(
-            self._server.give, robot, MissionKind(kind), goal.strip(), by, mission_id,
-            tuple(query.getlist("via")),
-        )  # fmt: skip
-        return json_values(report)
+        goal, by, mission_id = query.get("goal", "").strip(), _author(request), query.get("id", "")
+
+        def give() -> MissionReport:
+            words = [goal, *query.getlist("via")]
+            if kind == MissionKind.GO and (plan := self._plan(query.get("plan"))) is not None:
+                component = component_of(robot, self._server.robots())
+                words = [goal_on_plan(word, plan, component, self._server.resolve) for word in words]
+            return self._server.give(robot, MissionKind(kind), words[0], by, mission_id, tuple(words[1:]))
+
+        return json_values(await run_in_threadpool(give))
 
     async def _stop(self, request: Request) -> Mapping[str, Any]:
         by = _author(request)
@@ -374,9 +392,13 @@ class Questions:
         body = await read_body(request, (*IMAGE, FORM), self._patience)
         content_type, query = request.headers.get("Content-Type", ""), dict(request.query_params)
         photo = await run_in_threadpool(read_photo, content_type, body, query)
+        optics = dict(photo.optics)
+        plan = await run_in_threadpool(self._plan, optics.pop("plan", None))
+        photo = replace(photo, optics=optics)
         photo.check()
         ticket = hash(photo.data)
-        return json_values(await self._result(lambda: self._server.locate(photo.view, ticket)))
+        answer = await self._result(lambda: self._server.locate(photo.view, ticket))
+        return json_values(answer if plan is None else answer_on_plan(answer, plan))
 
     async def _result(self, ask: Callable[[], Future[Any]]) -> Any:
         """Ask on a thread, since in lock-step the asking thread does the work; then wait for the answer."""

@@ -46,10 +46,11 @@ def add_to(commands: Any) -> None:
         "--via", type=values.goal, action="append", default=[], metavar="PLACE",
         help="pass this first: a node, a place or a position; may be given again, in the order of the way",
     )  # fmt: skip
+    go.add_argument("--plan", metavar="NAME", help="positions are on this floor plan, m")
     _add_common(go, 600.0)
     go.set_defaults(
         run=lambda arguments: run(
-            arguments, lambda f: f.go(arguments.robot, arguments.goal, via=arguments.via)
+            arguments, lambda f: f.go(arguments.robot, arguments.goal, via=arguments.via, plan=arguments.plan)
         )
     )
 

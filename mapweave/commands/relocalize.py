@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.floor_plan import PlacedPlan
     from mapweave.hybridmap.ids import NodeId
     from mapweave.hybridmap.node import Node
-    from mapweave.hybridmap.pose import Pose2
-    from mapweave.hybridmap.query import RelocalizeAnswer, View, Whereabouts
+    from mapweave.hybridmap.query import RelocalizeAnswer, View
     from mapweave.settings import NetworkSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
@@ -178,23 +177,15 @@ def _node(bus: ZenohBus, keys: Keys, network: NetworkSettings, node_id: NodeId, 
 
 def _json(answer: RelocalizeAnswer, plan: PlacedPlan | None) -> dict[str, Any]:
     from mapweave.mapserver.http.json_values import json_values
+    from mapweave.mapserver.plan_answers import answer_on_plan
 
-    values = json_values(answer)
-    for place, candidate in zip(answer.candidates, values["candidates"], strict=True):
-        pose = None if plan is None else _in_plan(place, plan)
-        if plan is not None:
-            candidate["plan_from_robot"] = None if pose is None else json_values(pose)
-    return values
-
-
-def _in_plan(place: Whereabouts, plan: PlacedPlan) -> Pose2 | None:
-    """Where a candidate is on a plan; None where the plan does not lie."""
-    pose = place.merged_from_robot
-    return None if pose is None else plan.pose(place.component, pose.mean)
+    return json_values(answer if plan is None else answer_on_plan(answer, plan))
 
 
 def _print(answer: RelocalizeAnswer, plan: PlacedPlan | None) -> None:
     import numpy as np
+
+    from mapweave.mapserver.plan_answers import pose_on_plan
 
     print(f"{answer.certainty}: {answer.reason}")
     for place in answer.candidates:
@@ -215,7 +206,7 @@ def _print(answer: RelocalizeAnswer, plan: PlacedPlan | None) -> None:
             f"{place.inliers} landmarks agree, probability {place.probability:.3f}"
         )
         if plan is not None:
-            print(f"    {plan_place(plan, _in_plan(place, plan))}")
+            print(f"    {plan_place(plan, pose_on_plan(place, plan))}")
     for near in answer.similar:
         side = "left" if (near.turn or 0.0) > 0.0 else "right"
         turn = "" if near.turn is None else f"; turn {abs(math.degrees(near.turn)):.0f} deg {side}"

@@ -275,11 +275,6 @@ def _print_json(status: FleetStatus, plan: PlacedPlan | None) -> None:
     import json
 
     from mapweave.mapserver.http.json_values import json_values
+    from mapweave.mapserver.plan_answers import status_on_plan
 
-    values = json_values(status)
-    if plan is not None:
-        for robot, value in zip(status.robots, values["robots"], strict=True):
-            pose = robot.merged_from_robot
-            on_plan = None if pose is None else plan.pose(robot.component, pose)
-            value["plan_from_robot"] = None if on_plan is None else json_values(on_plan)
-    print(json.dumps(values), flush=True)
+    print(json.dumps(json_values(status if plan is None else status_on_plan(status, plan))), flush=True)

@@ -7,6 +7,7 @@ import json
 import math
 import re
 from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -17,20 +18,22 @@ import pytest
 from mapweave.cli import main
 from mapweave.exit_status import FAILED, NO, USAGE
 from mapweave.fleet import Fleet, login
-from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.errors import InvalidValue, Refused
 from mapweave.hybridmap.floor_plan import PIECE, PlanPiece
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.map_event import MapEventKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ResolveRequest
+from mapweave.map import FileMap
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.map_files import map_file_of, merged_of
+from mapweave.mapserver.plan_answers import answer_on_plan, goal_on_plan
 from mapweave.storage.map_file import MapFile, read_map_file, unpack_map_file, write_map_file
 from mapweave.storage.plan_image import plan_file
 from mapweave.wire.typed import packed
 from tests.mapserver.house import House
 from tests.mapserver.http.client import ask
-from tests.mapserver.stub_services import two_maps
+from tests.mapserver.stub_services import picture, two_maps
 from tests.waiting import eventually
 
 SCALE = 0.02
@@ -168,6 +171,87 @@ def test_plans_over_http(house: House) -> None:
         assert cv2.imdecode(np.frombuffer(png, np.uint8), cv2.IMREAD_GRAYSCALE).shape == (500, 400)
         assert ask(served, "GET", "/plans/none.png")[0] == 400
         assert ask(served, "POST", "/plans", b"a page")[0] == 400
+
+
+def test_answers_and_goals_in_coordinates_of_a_plan(
+    house: House,
+) -> None:
+    """Of robots and photographs, over HTTP and in Python; what is no plan is refused, and not passed over."""
+    fleet = house.person
+    fleet.put_plan_image(PNG.png)
+    assert house.server.settle(20.0)
+    fleet.annotate("plan", "flat", **fields())
+    link, _ = house.robot()
+    (robot,) = fleet.status(plan="flat").robots
+    assert robot.merged_from_robot is not None and robot.plan_from_robot is not None
+    on_plan = (PLAN_FROM_MERGED @ robot.merged_from_robot).vector
+    assert np.allclose(robot.plan_from_robot.vector, on_plan, atol=1e-6)
+    photo = picture()
+    with Web(("127.0.0.1", 0), house.server) as served:
+        status, _, body = ask(served, "GET", "/robots?plan=flat")
+        assert status == 200
+        assert json.loads(body)["robots"][0]["plan_from_robot"] == pytest.approx(on_plan, abs=1e-6)
+        assert "plan_from_robot" not in json.loads(ask(served, "GET", "/robots")[2])["robots"][0]
+        for method, path, data in (
+            ("GET", "/robots?plan=none", None),
+            ("POST", "/relocalize?plan=none", photo),
+            ("POST", "/robots/r0/go?goal=1,1&plan=none", None),
+        ):
+            status, _, body = ask(served, method, path, data)
+            assert status == 400 and "no plan 'none'; there are: flat" in json.loads(body)["error"], path
+        status, _, body = ask(served, "POST", "/relocalize?plan=flat", photo)
+        assert (status, json.loads(body)["certainty"]) == (200, "unknown"), "not of this room"
+        node = sorted(house.mapped.truth)[3]
+        at = PLAN_FROM_MERGED.apply(np.array([pose_of(fleet, node).x, pose_of(fleet, node).y]))
+        goal = f"{at[0]:.3f},{at[1]:.3f}"
+        status, _, body = ask(served, "POST", f"/robots/r0/go?goal={goal}&plan=flat")
+        assert (status, json.loads(body)["order"]["node"]) == (200, str(node))
+        assert ask(served, "POST", "/robots/r0/stop?plan=none")[0] == 200, "a stop stops"
+    report = fleet.go("r0", goal, via=["5,6"], plan="flat")
+    assert report.order.node == node and len(report.order.via) == 1
+    assert fleet.go("r0", str(node), plan="flat").order.node == node, "what is no position is as without"
+    with pytest.raises(InvalidValue, match="no plan 'none'"):
+        fleet.go("r0", goal, plan="none")
+    with pytest.raises(InvalidValue, match="no plan 'none'"):
+        fleet.status(plan="none")
+    link.close()
+
+
+def test_a_photograph_is_placed_on_the_plan_of_a_file(house: House) -> None:
+    fleet = house.person
+    fleet.put_plan_image(PNG.png)
+    assert house.server.settle(20.0)
+    fleet.annotate("plan", "flat", **fields())
+    node = sorted(house.mapped.truth)[2]
+    answer = house.server.locate(lambda: house.mapped.view(node), 1).result(20.0)
+    placed = answer_on_plan(answer, fleet.plans().plan("flat"))
+    best = placed.candidates[0]
+    assert answer.candidates and best.merged_from_robot is not None and best.plan_from_robot is not None
+    expected = (PLAN_FROM_MERGED @ best.merged_from_robot.mean).vector
+    assert np.allclose(best.plan_from_robot.vector, expected, atol=1e-6)
+    office = FileMap(map_of(fleet))
+    assert [plan.name for plan in office.plans().plans] == ["flat"]
+    camera = house.mapped.view(node).camera
+    blank = np.zeros((camera.height, camera.width), np.uint8)
+    assert office.relocalize(blank, camera, plan="flat").candidates == ()
+    with pytest.raises(Refused, match="no plan 'none'; there are: flat"):
+        office.relocalize(blank, camera, plan="none")
+
+
+def test_a_position_on_a_plan_under_two_parts_needs_to_know_where_the_robot_is(house: House) -> None:
+    fleet = house.person
+    fleet.put_plan_image(PNG.png)
+    assert house.server.settle(20.0)
+    fleet.annotate("plan", "flat", **fields())
+    plan = fleet.plans().plan("flat")
+    two = replace(plan, parts=(*plan.parts, replace(plan.part(), component=1)))
+    assert goal_on_plan("4,5", two, 0, fleet.resolve) == goal_on_plan("4,5", plan, -1, fleet.resolve)
+    with pytest.raises(Refused, match="lies under 2 parts of the map, and it is not known in which"):
+        goal_on_plan("4,5", two, -1, fleet.resolve)
+    with pytest.raises(Refused, match="does not lie under component 1"):
+        goal_on_plan("4,5", plan, 1, fleet.resolve)
+    with pytest.raises(Refused, match="othing is mapped within 2 m of"):
+        goal_on_plan("400,500", plan, 0, fleet.resolve)
 
 
 def test_a_plan_is_tried_over_http_before_it_is_kept(house: House) -> None:

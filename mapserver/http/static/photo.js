@@ -1,5 +1,6 @@
 // Where a photo was taken, or why that is not known: POST /relocalize.
 import { add, ask, button, byId, degrees, side } from "./dom.js";
+import { onPlans } from "./plans.js";
 
 const LONGEST = 2048; // px; the server makes photos smaller anyway
 const result = byId("answer");
@@ -29,6 +30,8 @@ function table(candidates, show) {
     button(place, c.node, () => show(c.node));
     const where = [c.place, c.floor && `floor ${c.floor}`].filter(Boolean).join(", ");
     if (where) add(place, "div", where);
+    const plan = onPlans(c.merged_from_robot?.mean, c.component);
+    if (plan) add(place, "div", `on plan ${plan}`);
     const probability = (100 * c.probability).toFixed(0) + " %";
     for (const text of [away(x), away(y), degrees(turn), probability]) add(row, "td", text);
   }

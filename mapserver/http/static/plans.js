@@ -1,6 +1,6 @@
 // Floor plans under the map: GET /plans and their images. A map file of before has none.
 import { isDark } from "./colours.js";
-import { ask, byId } from "./dom.js";
+import { ask, byId, degrees } from "./dom.js";
 
 const LARGEST = 16e6; // px; browsers may refuse larger canvases
 const images = new Map(), inverted = new Map(); // by digest
@@ -11,6 +11,18 @@ export const draft = { plan: null };
 export const planNamed = name => plans.find(one => one.name === name);
 export const planNames = () => plans.map(one => one.name);
 
+// Where a pose of the merged map is on each plan that lies there, in words: `office 9.00, 7.00 m, 90 deg`.
+export function onPlans(pose, component) {
+  const words = [];
+  for (const { name, parts } of plans) {
+    const part = parts.find(one => one.component === component);
+    if (!part || !pose) continue;
+    const [x, y, turn] = part.plan_from_merged, c = Math.cos(turn), s = Math.sin(turn);
+    const heading = Math.atan2(Math.sin(turn + pose[2]), Math.cos(turn + pose[2]));
+    words.push(`${name} ${(x + c * pose[0] - s * pose[1]).toFixed(2)}, ${(y + s * pose[0] + c * pose[1]).toFixed(2)} m, ${degrees(heading)}`);
+  }
+  return words.join("; ");
+}
 export async function loadPlans(loaded) {
   if (!offered) return;
   const answer = await ask("plans");

@@ -1,6 +1,7 @@
 // Robots: the list of all, and one with its missions. POST /robots/...
 import { add, ask, button, byId, counted, degrees, facts, listed, made, percent, seconds } from "./dom.js";
 import { wordsOf } from "./names.js";
+import { onPlans } from "./plans.js";
 
 const QUIET = 5; // s without a status
 let panel = null;
@@ -87,6 +88,7 @@ export function updateRobot(robots) {
     ["doing", status && `${status.status.doing}${status.status.detail ? ": " + status.status.detail : ""}`],
     ["mission", status && missionWords(status.mission)],
     ["on the map", pose ? `${pose[0].toFixed(2)}, ${pose[1].toFixed(2)} m, ${degrees(pose[2])}${spread}` : "not known"],
+    ["on the plan", onPlans(pose, robot.component)],
     ["place", robot.place],
     ["floor", robot.floor],
     ["nodes", status && `${status.status.nodes}, ${status.placed} placed by the server`],

@@ -11,13 +11,16 @@ import pytest
 from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
 from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
 from mapweave.hybridmap.errors import Busy, InvalidValue
+from mapweave.hybridmap.floor_plan import PlacedPlans
 from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, SimilarPlace
 from mapweave.mapserver.http.web import Web
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.http.person import Person
 from tests.mapserver.http.test_live import less
 from tests.mapserver.stub_services import PLACE, StubServices, picture, two_maps
+from tests.mapweave.test_plan_answers import PLAN
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
@@ -28,6 +31,10 @@ CONTROLS = {
     "tab", "tablist", "tabpanel", "textbox",
 }  # fmt: skip
 STATUS = "return document.getElementById('summary').textContent"
+FACTS = (
+    "return [...document.querySelectorAll('#selected dt')]"
+    ".map(dt => [dt, dt.nextSibling].map(c => c.textContent))"
+)
 KIND = "const answer = document.getElementById('answer'); return answer.dataset.certainty || answer.className"
 
 
@@ -105,6 +112,28 @@ def test_an_answer_names_the_place_and_the_floor(page: Browser, services: StubSe
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "place")
     assert page.run(ROWS)[1][0] == "r0.1.7<b>kitchen, floor ground"
+
+
+def test_robots_and_photos_are_named_in_coordinates_of_a_plan(
+    page: Browser, services: StubServices, image: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of plan office under component 1, and of none under component 0."""
+    monkeypatch.setattr(services, "plans", lambda: PlacedPlans((PLAN,)), raising=False)
+    at = Pose2(2.0, 1.0, 0.0)
+    services.fleet = FleetStatus(
+        tuple(RobotEntry(f"r{k}", True, merged_from_robot=at, component=k) for k in range(2))
+    )
+    found = replace(PLACE.candidates[0], merged_from_robot=PoseGaussian.from_sigmas(at, 0.1, 0.1))
+    services.answer = replace(PLACE, candidates=(replace(found, component=1), replace(found, component=0)))
+    page.run("document.dispatchEvent(new Event('mapchanged'))")
+    eventually(lambda: page.run("return document.querySelectorAll('#robots button').length") == 2)
+    for number, words in ((1, "office 9.00, 7.00 m, 90°"), (0, None)):
+        page.run(f"document.querySelectorAll('#robots button')[{number}].click()")
+        facts = dict(page.run(FACTS))
+        assert facts["on the map"].startswith("2.00, 1.00 m") and facts.get("on the plan") == words
+    page.type("#image", str(image))
+    eventually(lambda: page.run(KIND) == "place")
+    assert [row[0] for row in page.run(ROWS)[1:]] == ["r0.1.7on plan office 9.00, 7.00 m, 90°", "r0.1.7"]
 
 
 def test_what_is_no_image_is_not_sent(page: Browser, services: StubServices, tmp_path: Path) -> None:
