@@ -150,14 +150,14 @@ class ZenohLog:
         sys.stdout = self._python_stdout
         os.dup2(self._stdout, 1)
         # A process that was started meanwhile may hold the pipe open. The copy of descriptor 1 stays open for
-        # whoever holds the stream.
+        # those that hold the stream.
         self._reader.join(1.0)
 
     def _read(self) -> None:
         try:
             self._read_lines()
         except Exception:
-            # Nobody may wait for a pipe that is not read.
+            # Writers would wait for a pipe that is not read.
             os.dup2(self._stdout, 1)
             log.exception("what Zenoh logs cannot be taken any more and goes to standard output as it is")
         finally:

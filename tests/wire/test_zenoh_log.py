@@ -1,4 +1,4 @@
-"""What Zenoh logs, as records of this process: nothing is lost, and a failure of it stops nobody."""
+"""What Zenoh logs, as records of this process: nothing is lost, and a failure of it stops nothing."""
 
 from __future__ import annotations
 
@@ -87,8 +87,8 @@ def test_a_refusal_in_unknown_words_keeps_them() -> None:
     assert meaning("strange things (os error 5)") == "its handshake failed (strange things (os error 5))"
 
 
-def test_a_failure_of_the_reader_leaves_output_as_it_was_and_stops_nobody() -> None:
-    """A pipe that nobody reads takes 64 kB, and then whoever writes waits for ever."""
+def test_a_failure_of_the_reader_leaves_output_as_it_was_and_stops_nothing() -> None:
+    """A pipe that is not read takes 64 kB, and then a writer waits for ever."""
     broken = "zenoh_log.ZenohLog._take = lambda self, line: 1 / 0"
     more = 'import time; time.sleep(0.5); os.write(1, b"x" * 200_000 + b"\\n")'
     output, log = run(zenoh("zenoh_transport: first"), broken, more)

@@ -1,4 +1,4 @@
-"""Whom a router with keys refuses, and why: lines of its log in both formats, over real TLS."""
+"""Which clients a router with keys refuses, and why: lines of its log in both formats, over real TLS."""
 
 from __future__ import annotations
 
@@ -134,9 +134,9 @@ def test_each_refused_client_is_logged_with_the_reason(log_format: str, tmp_path
         (revoked,) = {line.partition("revoked")[0] for line in router.lines() if "was revoked" in line}
         assert revoked.startswith("refused: r0 at tls/127.0.0.1:")
         if log_format == "json":
-            told = [line for line in router.fields() if line["message"] in reasons]
-            assert {line["level"] for line in told} == {"warning"}
-            assert all(line["message"] == f"refused a client: {line['reason']}" for line in told)
+            reported = [line for line in router.fields() if line["message"] in reasons]
+            assert {line["level"] for line in reported} == {"warning"}
+            assert all(line["message"] == f"refused a client: {line['reason']}" for line in reported)
         router.end()
 
 
