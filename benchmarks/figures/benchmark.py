@@ -1,4 +1,4 @@
-"""docs/figures.md and docs/scale.md of stored results, and the results themselves.
+"""docs/figures.md, docs/scale.md and README.md's table of stored results, and the results themselves.
 
     python -m benchmarks.figures [--run NAME ... [--data DIR]]
 
@@ -14,12 +14,14 @@ from pathlib import Path
 
 from benchmarks.figures.measurements import MEASUREMENTS
 from benchmarks.figures.page import page
+from benchmarks.figures.readme import with_table
 from benchmarks.figures.results import FOLDER, load, run, store
 from benchmarks.figures.scale import scale_page
 from mapweave.hybridmap.errors import MapweaveError
 
 PAGE = FOLDER.with_suffix(".md")
 SCALE = FOLDER.with_name("scale.md")
+README = FOLDER.parents[1] / "README.md"
 
 
 def written_pages() -> dict[Path, str]:
@@ -29,7 +31,8 @@ def written_pages() -> dict[Path, str]:
         MapweaveError: a result is missing or cannot be read.
     """
     results = {name: load(name) for name in MEASUREMENTS}
-    return {PAGE: page(results), SCALE: scale_page(results)}
+    readme = with_table(README.read_text(encoding="utf-8"), results)
+    return {PAGE: page(results), SCALE: scale_page(results), README: readme}
 
 
 def main() -> None:

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 INTRODUCTION = (
     "`python -m benchmarks.figures` writes this page from the results in [figures/](figures/); "
     "with `--run NAME` it measures first. No number is written by hand. *Asked* is what should hold. "
-    "Seeds from 700 on were used for nothing before."
+    "Where a [decision page](decisions/README.md) names a seed of this page, that decision was made with it."
 )
 
 

@@ -1,14 +1,16 @@
-"""docs/figures.md and docs/scale.md: they are what their generator makes of the stored results."""
+"""docs/figures.md, docs/scale.md and README.md's table are what their generator makes of stored results."""
 
 import inspect
 import json
+import re
 from pathlib import Path
 
 import pytest
 
-from benchmarks.figures.benchmark import written_pages
+from benchmarks.figures.benchmark import README, written_pages
 from benchmarks.figures.measurements import MEASUREMENTS
 from benchmarks.figures.page import filled
+from benchmarks.figures.readme import HEAD, with_table
 from benchmarks.figures.results import FOLDER, load, run, store
 from benchmarks.liar.benchmark import RULES as LIE_RULES
 from benchmarks.rules.switches import MERGE_RULES, PLACE_RULES, TRIAL_RULES
@@ -23,6 +25,17 @@ def test_the_pages_are_made_of_the_stored_results() -> None:
 def test_each_stored_result_is_of_the_command_that_is_named() -> None:
     assert {path.stem for path in FOLDER.glob("*.json")} == set(MEASUREMENTS)
     assert {name: load(name).command for name in MEASUREMENTS} == MEASUREMENTS
+
+
+def test_a_figure_of_the_readme_that_is_no_result_is_replaced() -> None:
+    """Also a row that no result is behind; what is not in the table stays."""
+    results = {name: load(name) for name in MEASUREMENTS}
+    kept = README.read_text(encoding="utf-8")
+    wrong = re.sub(r"[\d.]+ m \|", "59 m |", kept).replace(HEAD, HEAD + "| of no result | 1 |\n")
+    assert wrong.count("59 m") == 1
+    assert with_table(wrong, results) == kept
+    with pytest.raises(InvalidValue, match="0 tables"):
+        with_table(kept.replace(HEAD, ""), results)
 
 
 def test_figures_are_filled_in() -> None:
