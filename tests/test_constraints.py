@@ -27,3 +27,15 @@ def test_what_is_pinned_installs_on_the_oldest_python() -> None:
             assert SpecifierSet(needs).contains(oldest), f"{name} {version} needs Python {needs}"
             checked += 1
     assert checked > 10
+
+
+def test_all_files_promise_the_same_python() -> None:
+    """README, the package's metadata and `make`; mypy checks for the oldest one."""
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())
+    oldest = project["project"]["requires-python"].removeprefix(">=")
+    named = re.findall(r"Python :: (3\.\d+)", "\n".join(project["project"]["classifiers"]))
+    assert (named[0], project["tool"]["mypy"]["python_version"]) == (oldest, oldest)
+    readme = " ".join((ROOT / "README.md").read_text(encoding="utf-8").split())
+    tried = " and ".join(named[1:])
+    assert f"Python {oldest} or newer. Each change is tested on {oldest}; {tried} have been tried" in readme
+    assert f"Mapweave needs Python {oldest} or newer" in (ROOT / "Makefile").read_text()
