@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -127,12 +128,14 @@ def images_folder(folder: Path, options: RecordingOptions) -> Recording:
     lines: tuple[str, ...] = (f"{lacking}; the first {len(stamps)} images are used",) if lacking else ()
     path = folder / "odometry.csv"
     images = _images(paths, stamps, None if optics.known is None else optics.known[0])
+    if not times.exists():
+        images = replace(images, assumed=f"no {times.name}: ten images a second are assumed")
     if options.odometry is not None or _is_poses(path):
         return complete(folder, kind, optics, images, read_poses(options.odometry or path), damage=lines)
     if not path.exists():
         return complete(folder, kind, optics, images, None, damage=lines)
     increments, damage = read_increments(path, len(paths))
-    images = Images(stamps[: len(increments)], images.read)
+    images = replace(images, stamps_ns=stamps[: len(increments)])
     increments = increments[: len(images.stamps_ns)]
     lines += (f"{damage}; the images before it are used",) if damage else ()
     return complete(folder, kind, optics, images, increments, damage=lines)

@@ -81,6 +81,7 @@ class Recording:
         kidnapped: (N,) whether the robot was lifted since the image before; None if the format does not say.
         bag: what else is in it, if it is one.
         wheels: how they err; None if it does not say.
+        timed: whether the stamps are the recording's, not assumed.
     """
 
     path: Path
@@ -95,6 +96,7 @@ class Recording:
     kidnapped: NDArray[np.bool_] | None = None
     bag: BagContents | None = None
     wheels: Wheels | None = None
+    timed: bool = True
 
     def __len__(self) -> int:
         """How many images there are."""
@@ -109,11 +111,13 @@ class Images:
         stamps_ns: (N,) ascending.
         read: gives an image by its number, (H, W) grey.
         damage: what follows and cannot be read, in one line; empty if nothing does.
+        assumed: what stamps are assumed where there are none, in one line; empty if they are known.
     """
 
     stamps_ns: Stamps
     read: Callable[[int], NDArray[np.uint8]]
     damage: str = ""
+    assumed: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,6 +242,7 @@ def assembled(
     """
     stamps, read = images.stamps_ns, images.read
     damage = (images.damage, *damage) if images.damage else damage
+    notes = (images.assumed, *notes) if images.assumed else notes
     if len(stamps) < 2:
         raise DeviceError(f"{path}: {len(stamps)} images are no drive; there must be two or more")
     if (np.diff(stamps) <= 0).any():
@@ -296,6 +301,7 @@ def assembled(
         increments,
         notes,
         damage,
+        timed=not images.assumed,
     )
 
 

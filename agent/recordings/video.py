@@ -20,6 +20,8 @@ SUFFIXES = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
 
 INDEXED = {".mp4", ".mov", ".m4v"}
 """Their index stands at the end."""
+ASSUMED_RATE = 30.0
+"""Images a second where neither frames nor header say."""
 OTHER_TRACK = 1.0
 """An AVI says how many frames it has; others how long they are, to which sound may add this, s."""
 
@@ -50,12 +52,13 @@ def video_images(path: Path) -> Images:
     if len(stamps) < 2:
         lost = "; an MP4 that was cut off has lost its index" if path.suffix.lower() in INDEXED else ""
         raise DeviceError(f"{path}: no video that can be read{lost}")
-    damage = _cut_off(path, capture, len(stamps), stamps[-1] * 1e-9)
+    damage, assumed = _cut_off(path, capture, len(stamps), stamps[-1] * 1e-9), ""
     if not all(before < after for before, after in itertools.pairwise(stamps)):
         # Some containers give no stamps for each frame.
         rate = capture.get(cv2.CAP_PROP_FPS)
-        stamps = [round(1e9 * k / (rate if rate > 0 else 30.0)) for k in range(len(stamps))]
-    return Images(np.array(stamps, np.int64), _sequential(path), damage)
+        assumed = "" if rate > 0 else f"frames without stamps: {ASSUMED_RATE:g} images a second are assumed"
+        stamps = [round(1e9 * k / (rate if rate > 0 else ASSUMED_RATE)) for k in range(len(stamps))]
+    return Images(np.array(stamps, np.int64), _sequential(path), damage, assumed)
 
 
 def _cut_off(path: Path, capture: cv2.VideoCapture, frames: int, last_s: float) -> str:

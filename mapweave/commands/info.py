@@ -16,6 +16,10 @@ ODOMETRY = (
     "alone; such a map has no scale, so nothing in it is metric, and lost robots get the place but not the "
     "distance"
 )
+TIMES = (
+    "times of the images: write times.txt (seconds, a line for each image), or give a bag or a video that has "
+    "them. Speeds and everything that depends on time are as wrong as the assumed rate"
+)
 UNKNOWN = dict.fromkeys(
     ("images_per_second", "longest_gap_s", "width", "height", "focal_px", "camera_height_m",
      "camera_forward_m", "driven_m", "turned_rad")
@@ -60,7 +64,11 @@ def run(arguments: argparse.Namespace) -> int:
         "topics": [] if bag is None else [
             {"name": topic.name, "type": topic.kind, "count": topic.count} for topic in bag.topics
         ],
-        "missing": [*lacks, *([] if odometry else [ODOMETRY])],
+        "missing": [
+            *lacks,
+            *([] if odometry else [ODOMETRY]),
+            *([] if recording is None or recording.timed else [TIMES]),
+        ],
     }  # fmt: skip
     if arguments.json:
         print(json.dumps(facts))
@@ -86,12 +94,16 @@ def _described(recording: Recording, camera_lacks: bool, odometry: bool) -> dict
     way, turn = np.abs(recording.increments).sum(axis=0)
     out: dict[str, Any] = {
         "images": len(recording),
-        "seconds": round(float(stamps[-1] - stamps[0]) * 1e-9, 3),
-        "images_per_second": round(1.0 / float(np.median(gaps)), 2),
-        "longest_gap_s": round(float(gaps.max()), 3),
+        "seconds": None,
         "width": camera.width,
         "height": camera.height,
     }
+    if recording.timed:
+        out |= {
+            "seconds": round(float(stamps[-1] - stamps[0]) * 1e-9, 3),
+            "images_per_second": round(1.0 / float(np.median(gaps)), 2),
+            "longest_gap_s": round(float(gaps.max()), 3),
+        }
     notes = list(recording.notes)
     if not camera_lacks:
         notes += recorded_faults(recording)
@@ -110,8 +122,11 @@ def _print(facts: dict[str, Any]) -> None:
     """The same for people."""
     print(f"{facts['recording']}: {facts['format']}")
     if facts["images"]:
-        print(f"  {facts['images']} images in {facts['seconds']:.1f} s, ", end="")
-        print(f"{facts['images_per_second']:g} a second, longest gap {facts['longest_gap_s']:g} s")
+        if facts["seconds"] is None:
+            print(f"  {facts['images']} images, at unknown times")
+        else:
+            print(f"  {facts['images']} images in {facts['seconds']:.1f} s, ", end="")
+            print(f"{facts['images_per_second']:g} a second, longest gap {facts['longest_gap_s']:g} s")
         print(f"  camera {facts['width']}x{facts['height']} px", end="")
         if facts["focal_px"] is not None:
             print(f", focal length {facts['focal_px']:.0f} px, {facts['camera_height_m']:.2f} m high", end="")

@@ -160,6 +160,8 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
     say = EventLog(console)
     network = network_of(arguments, settings_of(arguments))
     print(f"{recording.path}: no odometry, so it is mapped by its images alone: the map has no scale")
+    for note in recording.notes:
+        print(note)
     data.mkdir(parents=True, exist_ok=True)
     path = data / f"{name}.sqlite"
     journal = Journal(path, name)

@@ -56,6 +56,7 @@ def recording(tmp_path: Path) -> Path:
     for k in range(3):
         cv2.imwrite(str(folder / "images" / f"{k}.png"), np.full((48, 64), 90, np.uint8))
     (folder / "camera.toml").write_text(CAMERA)
+    (folder / "times.txt").write_text("0.0\n0.1\n0.2\n")
     (folder / "odometry.csv").write_text("forward_m,turn_rad\n" + "0,0\n" * 3)
     return folder
 

@@ -79,3 +79,16 @@ def test_a_camera_that_can_hardly_be_right_is_named(recording: Path, tmp_path: P
         assert words in " ".join(facts_of(capfd, recording)["notes"])
         assert main(["replay", str(recording), "--offline", "--data", str(tmp_path / "maps")]) == 0
         assert f"camera: {line.split(' =')[0]} = " in capfd.readouterr().out
+
+
+def test_images_without_times_are_said_to_have_none(recording: Path, tmp_path: Path, capfd) -> None:
+    """Ten images a second were reported as if the recording said so."""
+    assert facts_of(capfd, recording)["images_per_second"] == 10.0
+    (recording / "times.txt").unlink()
+    facts = facts_of(capfd, recording)
+    assert facts["images_per_second"] is facts["longest_gap_s"] is facts["seconds"] is None
+    (times,) = facts["missing"]
+    assert "times of the images: write times.txt" in times
+    assert facts["notes"] == ["no times.txt: ten images a second are assumed"]
+    assert main(["replay", str(recording), "--offline", "--data", str(tmp_path / "maps")]) == 0
+    assert facts["notes"][0] in capfd.readouterr().out

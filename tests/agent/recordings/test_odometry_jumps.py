@@ -81,6 +81,7 @@ def test_a_recording_with_a_wrap_is_read_without_it(tmp_path) -> None:
     (tmp_path / "camera.toml").write_text(
         f"width = 320\nheight = 240\nfx = {c.fx}\nfy = {c.fy}\ncx = {c.cx}\ncy = {c.cy}\nheight_m = 0.3\n"
     )
+    (tmp_path / "times.txt").write_text("".join(f"{0.1 * k:.1f}\n" for k in range(COUNT)))
     rows = "".join(f"{a!r},{b!r}\n" for a, b in wrapped(drive(), (40,), 5.59).tolist())
     (tmp_path / "odometry.csv").write_text("forward_m,turn_rad\n" + rows)
     replay = Replay(tmp_path)
