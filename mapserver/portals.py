@@ -2,20 +2,29 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise
 
 import networkx as nx
+import numpy as np
 
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.portal import MAX_FLOOR_WORDS, Portal, PortalMeans, PortalStop
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import REACH
 from mapweave.merge.floors import floor_of
+from mapweave.merge.link_checks import what_joins
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.settings import ConsistencySettings
 
 PORTAL = "portal"
 """Takes the agent's place in the ids of portals in routes."""
+MOST_DOOR = 4 * REACH
+"""Between the nodes at the sides of a door, m. What is mapped has a node within `REACH`, so the two nodes
+nearest to a door are twice that apart; as much again is for deep doorways, and for nodes farther off."""
 
 
 class Portals:
@@ -122,6 +131,7 @@ def check_portal(merged: MergedMap, annotations: Annotations, name: str, portal:
                 f"a door has one floor at both sides, but {portal.a} is on floor {first} and {portal.b} on "
                 f"floor {second}: is it a lift, or a ramp?"
             )
+        _check_door(merged, portal)
         return
     for node, label in zip((portal.a, portal.b), labels, strict=True):
         if not label:
@@ -132,4 +142,31 @@ def check_portal(merged: MergedMap, annotations: Annotations, name: str, portal:
     if first == second:
         raise InvalidValue(
             f"a {portal.means} leads to another floor, but {portal.a} and {portal.b} are on floor {first}"
+        )
+
+
+def _check_door(merged: MergedMap, door: Portal) -> None:
+    """Refuse a door whose sides the map has too far apart: robots would be sent through a wall.
+
+    Lifts and ramps lead to another floor, so the map does not say how far that is.
+
+    Raises:
+        InvalidValue: the evidence, and what would have to be undone first.
+    """
+    between = merged.relative(door.a, door.b)
+    if between is None:
+        return
+    position, heading = between.mean.vector[:2], Pose2(0.0, 0.0, between.mean.heading).rotation
+    distance = float(np.hypot(*position))
+    if distance <= MOST_DOOR:
+        return
+    along = heading.T @ (position / distance)
+    sigma = math.sqrt(float(along @ between.covariance[:2, :2] @ along))
+    off, most = (distance - MOST_DOOR) / sigma, math.sqrt(ConsistencySettings().gate)
+    if off > most:
+        raise InvalidValue(
+            f"no door is between {door.a} and {door.b}: the merged map has them {distance:.2f} m apart "
+            f"(sigma {sigma:.2f} m), and the sides of a door are at most {MOST_DOOR:g} m apart: "
+            f"{off:.1f} standard deviations more, at most {most:.1f} pass. "
+            f"{what_joins(merged, door.a, door.b)}"
         )

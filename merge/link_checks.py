@@ -126,12 +126,12 @@ def _check_geometry(merged: MergedMap, linked: Linked, s: ConsistencySettings) -
         f"{linked} cannot be linked so: the link has {linked.b} at {_words(linked.pose)} from {linked.a}, "
         f"the merged map at {_words(relative.mean)}, {_off(linked.pose, relative.mean)} from there: "
         f"{math.sqrt(distance2):.1f} standard deviations, at most {math.sqrt(s.gate):.1f} pass. "
-        f"{_undo_first(merged, linked)}"
+        f"{what_joins(merged, linked.a, linked.b)}"
     )
 
 
-def _undo_first(merged: MergedMap, linked: Linked) -> str:
-    """What joins two nodes now, and how to take it back if that is what is wrong."""
+def what_joins(merged: MergedMap, a: NodeId, b: NodeId) -> str:
+    """What joins two nodes of one component, and how to take it back if that is what is wrong."""
     links_by_hand = merged.constraints.links
     weights: dict[tuple[MapId, MapId], float] = {}
     counts: dict[tuple[MapId, MapId], list[tuple[NodeId, NodeId]]] = {}
@@ -140,18 +140,18 @@ def _undo_first(merged: MergedMap, linked: Linked) -> str:
             weight = math.inf if link.pair in links_by_hand else link.weight
             weights[link.maps] = weights.get(link.maps, 0.0) + weight
             counts.setdefault(link.maps, []).append(link.pair)
-    step = _weakest(weights, linked.a.map, linked.b.map)
+    step = _weakest(weights, a.map, b.map)
     if step is None:
-        loops = [link for link in merged.links if link.within and link.a.map == linked.a.map]
+        loops = [link for link in merged.links if link.within and link.a.map == a.map]
         more = f" and {len(loops)} loop closures" if loops else ""
         return (
-            f"Map {linked.a.map} says so by its robot's own way{more}: if that is wrong, first retire what "
+            f"Map {a.map} says so by its robot's own way{more}: if that is wrong, first retire what "
             "is wrong of it, or undo a loop closure"
         )
     by_hand = [pair for pair in counts[step] if pair in links_by_hand]
     if by_hand:
-        a, b = by_hand[0]
-        return f"The link by hand of {a} and {b} joins them: first take it back"
+        first, second = by_hand[0]
+        return f"The link by hand of {first} and {second} joins them: first take it back"
     count = len(counts[step])
     links = "1 link joins" if count == 1 else f"{count} links join"
     return (

@@ -187,6 +187,40 @@ def test_portals_and_labels_that_contradict_each_other_are_refused(house, body: 
         check_annotation(house.merged, record, said(name, body), ManualConstraints())
 
 
+def test_a_door_is_refused_where_the_map_has_its_sides_far_apart() -> None:
+    """A corridor of 12 m: within one component the map says how far two nodes are from each other."""
+    merger, which, sigma = Merger(), MapId("a", 1), 0.1
+    nodes = [place_node(at(0, n), (float(n), 0.0)) for n in range(13)]
+    for number, node in enumerate(nodes, start=1):
+        merger.on_change(Change(which, number, 0, NodePut(node)))
+    for number, (a, b) in enumerate(pairwise(nodes), start=1):
+        pose = PoseGaussian.from_sigmas(a.map_from_robot.mean.inverse() @ b.map_from_robot.mean, sigma, 1e-3)
+        merger.on_change(
+            Change(
+                which,
+                20 + number,
+                0,
+                EdgePut(Edge(EdgeId(*which, number), a.id, b.id, pose, EdgeKind.MAPPED)),
+            )
+        )
+    merged = merger.merged()
+
+    def check(far: int, means: PortalMeans = PortalMeans.DOOR) -> None:
+        gate = said("gate", Portal(at(0, 0), at(0, far), means))
+        check_annotation(merged, Annotations(), gate, ManualConstraints())
+
+    for far in (1, 8, 9):  # 9 m are 8 m within what is uncertain
+        check(far)
+    with pytest.raises(
+        InvalidValue,
+        match=r"has them 12\.00 m apart \(sigma 0\.\d\d m\), and .* at most 8 m apart: 1\d\.\d standard "
+        r"deviations more, at most 4\.0 pass\. Map a\.1 says so by its robot's own way",
+    ):
+        check(12)
+    with pytest.raises(InvalidValue, match="has no label"):
+        check(12, PortalMeans.LIFT)
+
+
 def test_a_portal_goes_and_comes_again_and_bad_ones_are_no_values(house) -> None:
     lift = said("lift", Portal(at(0, 3), at(1, 4), PortalMeans.LIFT))
     gone = replace(lift, removed=True)
