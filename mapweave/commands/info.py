@@ -17,8 +17,8 @@ ODOMETRY = (
     "distance"
 )
 TIMES = (
-    "times of the images: write times.txt (seconds, a line for each image), or give a bag or a video that has "
-    "them. Speeds and everything that depends on time are as wrong as the assumed rate"
+    "times of the images: write times.txt (seconds, a line for each image), or give a bag or a video that "
+    "has them. Speeds and everything that depends on time are as wrong as the assumed rate"
 )
 UNKNOWN = dict.fromkeys(
     ("images_per_second", "longest_gap_s", "width", "height", "focal_px", "camera_height_m",

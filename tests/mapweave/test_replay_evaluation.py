@@ -102,6 +102,7 @@ def test_a_recording_is_scored_and_its_trajectory_is_read_by_evo(
         truth.append(f"{0.1 * k},{0.025 * k},0,0")
     (folder / "odometry.csv").write_text("\n".join(odometry) + "\n")
     (folder / "truth.csv").write_text("\n".join(truth) + "\n")
+    (folder / "times.txt").write_text("".join(f"{0.1 * k:.1f}\n" for k in range(30)))
     assert main(["eval", "replay", str(folder), "--out", str(out), "--json"]) == 0
     report = json.loads(capfd.readouterr().out.splitlines()[-1])
     assert report["frames"] == 30 and report["maps"] == 1 and report["nodes"] >= 1
