@@ -17,6 +17,7 @@ from mapweave.commands.network import (
     add_network,
     client_settings,
     connect,
+    keep_files_private,
     network_of,
     reach,
     settings_of,
@@ -163,6 +164,7 @@ def run(arguments: argparse.Namespace) -> int:
     simulated = arguments.lockstep and (arguments.robot or settings.robot.driver) == REMOTE
     if simulated and network.keys and not arguments.body:
         raise UsageError(simulator_beside(network))
+    keep_files_private(network)
     calibration = calibration_of(arguments, name)
     if arguments.record is not None:
         from mapweave.agent.recordings.mcap_writer import check_new

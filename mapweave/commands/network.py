@@ -131,6 +131,15 @@ def network_of(arguments: argparse.Namespace, settings: Settings, name: str = ""
     return NetworkSettings(fleet, endpoints, routers, given.server, keys)
 
 
+def keep_files_private(network: NetworkSettings) -> None:
+    """Let this process make files and folders that other users of the machine cannot read, if there are keys.
+
+    They hold the map and images of the building, and keys say who may see these.
+    """
+    if network.keys:
+        os.umask(os.umask(0o077) | 0o077)
+
+
 def simulator_beside(network: NetworkSettings) -> str:
     """Why a simulator cannot take part in a fleet with keys, and what to do, in one line."""
     return (

@@ -20,6 +20,7 @@ from mapweave.commands.map_input import SOURCES, map_source, opened
 from mapweave.commands.network import (
     add_log_format,
     add_network,
+    keep_files_private,
     key_renewal,
     network_of,
     server_settings,
@@ -115,6 +116,7 @@ def run(arguments: argparse.Namespace) -> int:
         logging.getLogger(part).setLevel(logging.INFO)
     settings = settings_of(arguments)
     network = network_of(arguments, settings)
+    keep_files_private(network)
     name = check_name(arguments.name or network.server)
     router, folder = server_settings(network, name)
     cluster = replace(settings.cluster, ray=arguments.ray or settings.cluster.ray)
