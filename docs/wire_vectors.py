@@ -317,7 +317,9 @@ def answers() -> dict[str, tuple[Any, ...]]:
         ),
         "server/s0/constrain": tuple(ConstraintRequest(one, k == 2) for k, one in enumerate(constraints())),
         "server/s0/constraints": (ConstraintList(constraints()),),
-        "server/s0/annotate": annotations(),
+        "server/s0/annotate": tuple(
+            annotation.AnnotationRequest(one, k == 2) for k, one in enumerate(annotations())
+        ),
         "server/s0/annotations": (annotation.Annotations(annotations()),),
         "server/s0/resolve": (
             query.ResolveRequest(("r0.3.17", "kitchen", "3.1,-2.0"), "kitchen", 2.0),

@@ -227,6 +227,19 @@ class Annotation:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class AnnotationRequest:
+    """An annotation for a server.
+
+    Attributes:
+        annotation: to be kept.
+        check: whether only to say what it would do.
+    """
+
+    annotation: Annotation
+    check: bool = False
+
+
 @dataclass(frozen=True)
 class Annotations:
     """The record, in the order in which it was made.

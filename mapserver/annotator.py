@@ -7,7 +7,15 @@ import threading
 from collections.abc import Callable
 from dataclasses import replace
 
-from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor, Place, Preference
+from mapweave.hybridmap.annotation import (
+    Annotation,
+    AnnotationRequest,
+    Annotations,
+    Closure,
+    Floor,
+    Place,
+    Preference,
+)
 from mapweave.hybridmap.constraint_subject import nodes_in_words
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan
@@ -32,6 +40,8 @@ from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import serve_senders
 
 log = logging.getLogger(__name__)
+
+CHECKED = "only checked, nothing is changed: "
 
 
 class AnnotationRecord:
@@ -148,7 +158,7 @@ class Annotator:
             self._check(annotation)
             words = "; ".join((annotation.words, *effects_of(annotation, places)))
             if check:
-                return f"only checked, nothing is changed: {words}"
+                return CHECKED + words
             self._record.add(annotation)
             self._changed(self._record.annotations)
         log.warning("%s", words)
@@ -163,8 +173,9 @@ class Annotator:
 
     def _annotate(self, request: Request, who: str) -> None:
         def annotate(payload: bytes) -> bytes:
-            annotation = decode(payload, Annotation)
-            return encode_said(self.annotate(replace(annotation, who=who or annotation.who)))
+            asked = decode(payload, AnnotationRequest)
+            annotation = replace(asked.annotation, who=who or asked.annotation.who)
+            return encode_said(self.annotate(annotation, asked.check))
 
         guarded(annotate)(request)
 

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from mapweave.fleet_questions import FleetQuestions
-from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.annotation import AnnotationRequest, Annotations
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.refusals import refusals
@@ -22,13 +22,14 @@ ANSWER = 10.0
 class FleetAnnotations(FleetQuestions):
     """The part of `mapweave.fleet.Fleet` by which people say what is not on the map."""
 
-    def annotate(self, kind: str, name: str, because: str = "", **fields: Any) -> str:
+    def annotate(self, kind: str, name: str, because: str = "", *, check: bool = False, **fields: Any) -> str:
         """Say something about the map, for example `fleet.annotate("place", "kitchen", node="r0.1.17")`.
 
         Args:
             kind: of the annotation: place, closure, preference, floor, portal, plan, pin.
             name: for the same kind and name the last one holds.
             because: why.
+            check: only say what it would do.
             fields: of the body, see mapweave.hybridmap.annotation. Nodes may be words: a node, the name of a
                 place, a position `3.1,-2.0` in the merged map. An area is `corners`, positions in the merged
                 map (in the component of the place or node `near`), or `radius`, m, around `node`.
@@ -40,11 +41,11 @@ class FleetAnnotations(FleetQuestions):
             Refused: it says nothing new, or is about something that is not there.
             NotConnected: no map server answers.
         """
-        return self._annotate(name, {"kind": kind, **fields}, False, because)
+        return self._annotate(name, {"kind": kind, **fields}, False, because, check)
 
-    def withdraw(self, kind: str, name: str, because: str = "") -> str:
+    def withdraw(self, kind: str, name: str, because: str = "", *, check: bool = False) -> str:
         """Withdraw what was said about the map; see `annotate`."""
-        return self._annotate(name, {"kind": kind}, True, because)
+        return self._annotate(name, {"kind": kind}, True, because, check)
 
     def annotations(self) -> Annotations:
         """What people say about the map.
@@ -63,11 +64,15 @@ class FleetAnnotations(FleetQuestions):
         """
         return decode(self._question(self._keys.any_resolve(), encode(request), ANSWER), ResolveAnswer)
 
-    def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
+    def _annotate(
+        self, name: str, fields: Mapping[str, Any], removed: bool, because: str, check: bool
+    ) -> str:
         self._check_role()
         with refusals():
             annotation = annotation_of_words(
                 name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
             )
         key = sent_by(self._keys.any_annotate(), self._sender)
-        return str(decode_record(self._question(key, encode(annotation), ANSWER))["said"])
+        return str(
+            decode_record(self._question(key, encode(AnnotationRequest(annotation, check)), ANSWER))["said"]
+        )

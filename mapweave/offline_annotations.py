@@ -17,7 +17,7 @@ from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_effects import effects_of
 from mapweave.mapserver.annotation_words import annotation_of_words
-from mapweave.mapserver.annotator import check_annotation, check_edge
+from mapweave.mapserver.annotator import CHECKED, check_annotation, check_edge
 from mapweave.mapserver.floor_plans import placed_plans
 from mapweave.mapserver.places import Places
 from mapweave.mapserver.routes import Router
@@ -56,18 +56,18 @@ class OfflineAnnotations:
         self._made = Annotations(self._opened.content.annotations)
         self._images = dict(self._opened.content.images)
 
-    def annotate(self, kind: str, name: str, because: str = "", **fields: Any) -> str:
-        """See Fleet.annotate; the file is written.
+    def annotate(self, kind: str, name: str, because: str = "", *, check: bool = False, **fields: Any) -> str:
+        """See Fleet.annotate; the file is written, unless it is only checked.
 
         Raises:
             Refused: it says nothing new, or is about something that is not there.
             MapweaveError: the file cannot be written.
         """
-        return self._annotate(name, {"kind": kind, **fields}, False, because)
+        return self._annotate(name, {"kind": kind, **fields}, False, because, check)
 
-    def withdraw(self, kind: str, name: str, because: str = "") -> str:
-        """See Fleet.withdraw; the file is written."""
-        return self._annotate(name, {"kind": kind}, True, because)
+    def withdraw(self, kind: str, name: str, because: str = "", *, check: bool = False) -> str:
+        """See Fleet.withdraw; the file is written, unless it is only checked."""
+        return self._annotate(name, {"kind": kind}, True, because, check)
 
     def annotations(self) -> Annotations:
         """What people say about the map."""
@@ -111,12 +111,16 @@ class OfflineAnnotations:
     def _router(self) -> Router:
         return Router(self._opened.merged(self._settings))
 
-    def _annotate(self, name: str, fields: Mapping[str, Any], removed: bool, because: str) -> str:
-        if self._out is None:
+    def _annotate(
+        self, name: str, fields: Mapping[str, Any], removed: bool, because: str, check: bool
+    ) -> str:
+        out = self._out
+        if out is None and not check:
             raise InvalidValue(
                 f"{self._opened.path} is {self._opened.source.words}, which is not written: give -o"
             )
-        check_place(self._out)
+        if out is not None and not check:
+            check_place(out)
         with refusals():
             annotation = annotation_of_words(
                 name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
@@ -130,6 +134,8 @@ class OfflineAnnotations:
         body = annotation.body
         if isinstance(body, FloorPlan) and not annotation.removed:
             self.plan_image(body.image.sha256)
+        if check or out is None:
+            return CHECKED + words
         self._made = Annotations((*self._made.made, annotation))
         used = {plan.image.sha256 for _, plan in self._made.in_force(FloorPlan)}
         images = {name: png for name, png in self._images.items() if name in used}
@@ -140,5 +146,5 @@ class OfflineAnnotations:
         content = self._opened.file(self.merged)
         if isinstance(body, Pin) and content.poses:
             content = replace(content, poses=dict(self.merged.poses))
-        self._opened = self._opened.written(self._out, content)
+        self._opened = self._opened.written(out, content)
         return words

@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from mapweave.hybridmap.agent_status import MAX_ROBOTS, AgentStatus, FleetStatus
-from mapweave.hybridmap.annotation import Annotation, Annotations
+from mapweave.hybridmap.annotation import Annotation, AnnotationRequest, Annotations
 from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
@@ -130,6 +130,7 @@ LIMITS: dict[type, Limit] = {
     ConstraintRequest: Limit("manual constraint", 2**16, 8192),
     ConstraintList: Limit("manual constraints", 2**26, 2_000_000),
     Annotation: Limit("annotation", 2**16),
+    AnnotationRequest: Limit("annotation", 2**16),
     Annotations: Limit("annotations", 2**26, 4_000_000),
     ResolveRequest: Limit("resolve request", 2**14),
     ResolveAnswer: Limit("resolved places", 2**16),

@@ -29,6 +29,7 @@ def add_record_options(parser: argparse.ArgumentParser, changes: bool) -> None:
     """
     if changes:
         add_reason(parser)
+        parser.add_argument("--check", action="store_true", help="only say what it would do; change nothing")
         parser.add_argument(
             "-o", "--out", type=Path, metavar="OUT", help="with --map: write a map file there instead"
         )
@@ -60,7 +61,7 @@ def add_remove(actions: Any, kind: str, words: str, of: str, description: str) -
 
     def run(arguments: argparse.Namespace) -> int:
         with record_of(arguments) as record:
-            print(record.withdraw(kind, arguments.name, arguments.because))
+            print(record.withdraw(kind, arguments.name, arguments.because, check=arguments.check))
         return 0
 
     remove: argparse.ArgumentParser = actions.add_parser("remove", help=words, description=description)

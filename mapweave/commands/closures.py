@@ -97,7 +97,8 @@ def run_close(arguments: argparse.Namespace) -> int:
             print(f"{word} {local_words(stamp_ns)} ({utc_words(stamp_ns)})")
     with record_of(arguments) as record:
         name, fields = _meant(arguments, "closure", record)
-        print(record.annotate("closure", name, arguments.because, **fields, **times))
+        fields |= times
+        print(record.annotate("closure", name, arguments.because, check=arguments.check, **fields))
     return 0
 
 
@@ -114,7 +115,8 @@ def run_prefer(arguments: argparse.Namespace) -> int:
         return _withdraw(arguments, "preference")
     with record_of(arguments) as record:
         name, fields = _meant(arguments, "preference", record)
-        print(record.annotate("preference", name, arguments.because, factor=arguments.factor, **fields))
+        fields["factor"] = arguments.factor
+        print(record.annotate("preference", name, arguments.because, check=arguments.check, **fields))
     return 0
 
 
@@ -157,7 +159,7 @@ def _without_effect(record: Fleet | OfflineAnnotations, entry: Annotation) -> st
 def _withdraw(arguments: argparse.Namespace, kind: str) -> int:
     with record_of(arguments) as record:
         for name in _names(arguments, kind, record):
-            print(record.withdraw(kind, name, arguments.because))
+            print(record.withdraw(kind, name, arguments.because, check=arguments.check))
     return 0
 
 

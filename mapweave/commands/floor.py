@@ -37,9 +37,10 @@ def run(arguments: argparse.Namespace) -> int:
         node = record.resolve(ResolveRequest((arguments.node,))).found[0].node
         name, because = str(node.map), arguments.because
         if arguments.undo:
-            print(record.withdraw("floor", name, because))
+            print(record.withdraw("floor", name, because, check=arguments.check))
         else:
-            print(record.annotate("floor", name, because, node=str(node), label=arguments.label))
-    if arguments.map is not None:
+            fields = {"node": str(node), "label": arguments.label}
+            print(record.annotate("floor", name, because, check=arguments.check, **fields))
+    if arguments.map is not None and not arguments.check:
         print("links between floors fall when the file is merged again: mapweave map merge FILE -o OUT")
     return 0

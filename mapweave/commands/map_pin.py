@@ -44,10 +44,11 @@ def run(arguments: argparse.Namespace) -> int:
         fields["merged_from_node"] = _pose(arguments.pose)
     with record_of(arguments) as record:
         if arguments.undo:
-            said = record.withdraw("pin", arguments.node, arguments.because)
+            said = record.withdraw("pin", arguments.node, arguments.because, check=arguments.check)
         else:
             node = str(record.resolve(ResolveRequest((arguments.node,))).found[0].node)
-            said = record.annotate("pin", node, arguments.because, node=node, **fields)
+            fields["node"] = node
+            said = record.annotate("pin", node, arguments.because, check=arguments.check, **fields)
     print(json.dumps({"said": said}) if arguments.json else said)
     return 0
 

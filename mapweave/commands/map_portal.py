@@ -60,7 +60,8 @@ def run_add(arguments: argparse.Namespace) -> int:
     if a.a == a.b:
         raise UsageError(f"{a.a} twice: a portal leads from one node to another")
     with record_of(a) as record:
-        print(record.annotate("portal", a.name, a.because, a=a.a, b=a.b, means=a.kind, note=a.note))
+        fields = {"a": a.a, "b": a.b, "means": a.kind, "note": a.note}
+        print(record.annotate("portal", a.name, a.because, check=a.check, **fields))
     return 0
 
 

@@ -79,7 +79,7 @@ def run_add(arguments: argparse.Namespace) -> int:
     if arguments.where is not None:
         fields["node"] = arguments.where
     with record_of(arguments) as record:
-        print(record.annotate("place", arguments.name, arguments.because, **fields))
+        print(record.annotate("place", arguments.name, arguments.because, check=arguments.check, **fields))
     return 0
 
 

@@ -130,8 +130,9 @@ def run_add(arguments: argparse.Namespace) -> int:
     name = arguments.name or path.stem
     with record_of(arguments) as record:
         record.put_plan_image(kept.png)
-        print(record.annotate("plan", name, arguments.because, **fields))
-        print("\n".join(plan_words(record.plans().plan(name))))
+        print(record.annotate("plan", name, arguments.because, check=arguments.check, **fields))
+        if not arguments.check:
+            print("\n".join(plan_words(record.plans().plan(name))))
     return 0
 
 

@@ -14,7 +14,7 @@ from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission_control import MissionControl
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import Status
-from mapweave.hybridmap.annotation import Annotation, Place
+from mapweave.hybridmap.annotation import Annotation, AnnotationRequest, Place
 from mapweave.hybridmap.constraint_subject import RetiredNodes
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.ids import NodeId
@@ -73,7 +73,7 @@ def test_the_records_name_the_holder_of_the_key(
         annotation = Annotation("kitchen", Place(NODES[0]), False, "vera", 10**18, "forged")
         for key, message in (
             (KEYS.any_constrain(), encode(ConstraintRequest(constraint))),
-            (KEYS.any_annotate(), encode(annotation)),
+            (KEYS.any_annotate(), encode(AnnotationRequest(annotation))),
         ):
             (reply,) = session.ask(sent_by(key, "anna"), message, 20.0)
             assert not reply.error

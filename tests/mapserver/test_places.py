@@ -138,6 +138,44 @@ def test_a_long_reason_is_no_error_of_what_is_kept(house: House) -> None:
     assert len(house.person.annotations().made) == 2
 
 
+def test_an_annotation_is_tried_before_it_is_kept(house: House) -> None:
+    """On the page and over HTTP it could be; by shell and in Python a mistake had to be made first."""
+    person = house.person
+    said = person.annotate("place", "kitchen", node=str(THERE), check=True)
+    assert said == f"only checked, nothing is changed: place kitchen is node {THERE}, by anna"
+    assert person.annotate("closure", "paint", node=str(THERE), radius=1.0, check=True).endswith(" of robots")
+    with pytest.raises(InvalidValue, match=r"there is no map r9\.1"):
+        person.annotate("place", "cellar", node="r9.1.1", check=True)
+    assert person.annotations().made == ()
+    person.annotate("place", "kitchen", node=str(THERE))
+    assert "place kitchen is withdrawn" in person.withdraw("place", "kitchen", check=True)
+    assert person.annotations().last("place", "kitchen") is not None
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        (["place", "add", "sink", "r0.1.5"], "place sink is node r0.1.5"),
+        (["place", "remove", "kitchen"], "place kitchen is withdrawn"),
+        (["close", "kitchen"], "closure kitchen is an area"),
+        (["prefer", "r0.1.3", "--radius", "1"], "preference r0.1.3 is an area"),
+        (["floor", "ground", "r0.1.3"], "floor r0.1 is on floor ground"),
+        (["map", "portal", "add", "gate", "r0.1.3", "r0.1.5", "--kind", "door"], "portal gate is a door"),
+        (["map", "pin", "r0.1.3"], "pin r0.1.3 is"),
+    ],
+)
+def test_an_annotation_of_a_file_is_tried_before_it_is_kept(
+    fetched: MapFile, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], words: str
+) -> None:
+    path = tmp_path / "room.mapweave"
+    write_map_file(path, replace(fetched, annotations=record("kitchen", Place(THERE)).made))
+    before = path.read_bytes()
+    assert main([*command, "--map", str(path), "--check"]) == 0
+    out = capsys.readouterr().out
+    assert out.startswith(f"only checked, nothing is changed: {words}") and out.count("\n") == 1
+    assert path.read_bytes() == before
+
+
 def test_places_over_http(house: House) -> None:
     with Web(("127.0.0.1", 0), house.server) as web:
         body = {"name": "Küche", "body": {"kind": "place", "node": "r0.1.3"}, "because": "tea"}
