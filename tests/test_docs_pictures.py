@@ -6,9 +6,10 @@ import json
 from pathlib import Path
 
 import cv2
+import numpy as np
 import pytest
 
-from docs import independent_support
+from docs import floor_plan, independent_support
 from docs.site import calibration_picture, demo_picture, hooks
 from mapweave.vision.calibration.target import CalibrationTarget
 from mapweave.vision.calibration.views import BoardDetector
@@ -48,6 +49,16 @@ def test_the_guidance_that_is_drawn_is_of_a_target_that_is_seen(tmp_path: Path) 
     drawn = cv2.imread(str(tmp_path / "drawn.png"), cv2.IMREAD_GRAYSCALE)
     paper = drawn[:, : drawn.shape[1] - 800]
     assert BoardDetector(CalibrationTarget()).find(paper) is not None, "what is printed can be read"
+
+
+def test_a_picture_that_looks_the_same_stays(tmp_path: Path) -> None:
+    grey = np.full((4, 5, 3), 100, np.uint8)
+    kept, drawn = tmp_path / "kept.png", tmp_path / "drawn.png"
+    cv2.imwrite(str(drawn), grey + 2)
+    assert not floor_plan.looks_the_same(drawn, kept)
+    for levels, same in ((0, True), (40, False)):
+        cv2.imwrite(str(kept), grey + levels)
+        assert floor_plan.looks_the_same(drawn, kept) is same
 
 
 @pytest.mark.parametrize("reached", [True, False])
