@@ -69,7 +69,9 @@ def to_pixels(points: Array, height: int) -> Array:
 def looks_the_same(drawn: Path, kept: Path) -> bool:
     """Whether two pictures differ by less than an eye sees: threads of the solver add in any order."""
     one, other = cv2.imread(str(drawn)), cv2.imread(str(kept))
-    return other is not None and one.shape == other.shape and cv2.absdiff(one, other).max() <= VISIBLE
+    if other is None or one.shape != other.shape:
+        return False
+    return bool(cv2.absdiff(one, other).max() <= VISIBLE)
 
 
 def main(path: Path = PATH) -> None:
