@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -28,6 +29,7 @@ from mapweave.hybridmap.query import View
 from mapweave.photographs import LEAST_LANDMARKS, Stretch, changes_of, stretch_of
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
+from mapweave.visual_trajectory import FollowedImage, ImagePose, trajectory_of
 
 PARALLAX = math.radians(2.5)
 """Of the points of a keyframe in the next one, the median, without what turning explains, rad. Depths are
@@ -52,10 +54,27 @@ class Keyframe:
     Attributes:
         stamp_ns: of the image.
         view: its features.
+        followed: the images after it, up to the next one, and where its features are in them.
     """
 
     stamp_ns: int
     view: View
+    followed: list[FollowedImage] = field(default_factory=list)
+
+
+@dataclass(frozen=True, eq=False)
+class VisualMap:
+    """A map of a walk.
+
+    Attributes:
+        id: of it.
+        changes: that make it.
+        trajectory: where its images were taken, in their order.
+    """
+
+    id: MapId
+    changes: list[ChangeBody]
+    trajectory: list[ImagePose]
 
 
 def keyframes(recording: Recording, frames: Iterable[int]) -> tuple[list[Keyframe], list[str]]:
@@ -68,7 +87,7 @@ def keyframes(recording: Recording, frames: Iterable[int]) -> tuple[list[Keyfram
     camera, lens = recording.camera, Lens(recording.camera, recording.distortion)
     sift = Sift(lens)
     before: NDArray[np.uint8] | None = None
-    corners = points = np.zeros((0, 2))
+    corners, points, features = np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 2))
     walk, lost = list[Keyframe](), list[str]()
     for k in frames:
         try:
@@ -77,9 +96,15 @@ def keyframes(recording: Recording, frames: Iterable[int]) -> tuple[list[Keyfram
             lost.append(str(error))
             continue
         if before is not None:
-            corners, points = _followed(before, image, corners, points)
-        if before is None or _is_next(camera, lens, corners, points):
-            walk.append(Keyframe(int(recording.stamps_ns[k]), sift.extract(image).view(camera)))
+            both = _followed(before, image, np.concatenate([points, features]))
+            points, features = both[: len(corners)], both[len(corners) :]
+        stamp_ns = int(recording.stamps_ns[k])
+        if before is not None and not _is_next(camera, lens, corners, points):
+            walk[-1].followed.append(FollowedImage(stamp_ns, _undistorted(lens, features)))
+        else:
+            extracted = sift.extract(image)
+            walk.append(Keyframe(stamp_ns, extracted.view(camera)))
+            features = extracted.raw
             found = cv2.goodFeaturesToTrack(image, CORNERS, CORNER_QUALITY, CORNER_DISTANCE_PX)
             corners = np.zeros((0, 2)) if found is None else found[:, 0].astype(np.float64)
             points = corners
@@ -87,17 +112,23 @@ def keyframes(recording: Recording, frames: Iterable[int]) -> tuple[list[Keyfram
     return walk, [f"{lost[0]} (left out, {len(lost)} of {len(recording)} images)"] if lost else []
 
 
-def _followed(
-    before: NDArray[np.uint8], image: NDArray[np.uint8], corners: Array, points: Array
-) -> tuple[Array, Array]:
-    """Where the keyframe's corners are in the next image; those that are lost become NaN."""
+def _followed(before: NDArray[np.uint8], image: NDArray[np.uint8], points: Array) -> Array:
+    """Where points are in the next image; those that are lost become NaN."""
     alive = np.isfinite(points[:, 0])
     if not alive.any():
-        return corners, points
+        return points
     moved, status, _ = cv2.calcOpticalFlowPyrLK(before, image, points[alive].astype(np.float32), None)  # type: ignore[call-overload]
     out = np.full_like(points, np.nan)
     out[alive] = np.where(status == 1, moved, np.nan)
-    return corners, out
+    return out
+
+
+def _undistorted(lens: Lens, features: Array) -> NDArray[np.float32]:
+    """(N, 2) px in the real image to undistorted ones; NaN stays."""
+    out = np.full(features.shape, np.nan, np.float32)
+    alive = np.isfinite(features[:, 0])
+    out[alive] = lens.undistort(features[alive])
+    return out
 
 
 def _is_next(camera: Camera, lens: Lens, corners: Array, points: Array) -> bool:
@@ -194,9 +225,19 @@ def _scaled(landmarks: Landmarks, scale: float) -> Landmarks:
     return Landmarks(landmarks.pixels, landmarks.codes, depths.astype(np.float32), sigmas.astype(np.float32))
 
 
-def visual_maps(
-    walk: Sequence[Keyframe], camera: Camera, name: str, epoch: int
-) -> list[tuple[MapId, list[ChangeBody]]]:
+def nothing_mapped(path: Path, walk: Sequence[Keyframe], damage: Sequence[str]) -> str:
+    """Why a recording gave no map, in one line.
+
+    Args:
+        path: of it.
+        walk: its keyframes.
+        damage: what of it cannot be read, a line each.
+    """
+    why = f"no two of its {len(walk)} keyframes show the same things from two places"
+    return damage[0] if damage else f"{path}: {why}: nothing can be mapped"
+
+
+def visual_maps(walk: Sequence[Keyframe], camera: Camera, name: str, epoch: int) -> list[VisualMap]:
     """The maps of a walk: one, if it can be followed from its beginning to its end.
 
     Args:
@@ -209,6 +250,8 @@ def visual_maps(
     maps = []
     for number, (first, stretch) in enumerate(found):
         map_id = MapId(name, epoch + number)
-        stamps = [keyframe.stamp_ns for keyframe in walk[first : first + len(stretch.poses)]]
-        maps.append((map_id, changes_of(stretch, stamps, camera, map_id)))
+        piece = walk[first : first + len(stretch.poses)]
+        stamps = [keyframe.stamp_ns for keyframe in piece]
+        trajectory = trajectory_of(stretch, stamps, [keyframe.followed for keyframe in piece], camera)
+        maps.append(VisualMap(map_id, changes_of(stretch, stamps, camera, map_id), trajectory))
     return maps

@@ -5,12 +5,16 @@ from __future__ import annotations
 import argparse
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.commands.network import settings_of
-from mapweave.commands.replay import add_recording, options_of
+from mapweave.commands.replay import add_recording, images_of, options_of
+
+if TYPE_CHECKING:
+    from mapweave.evaluation.replaying import ReplayEvaluation
+    from mapweave.evaluation.visual_replaying import VisualEvaluation
 
 
 def add_to(commands: Any) -> None:
@@ -85,7 +89,8 @@ def add_to(commands: Any) -> None:
         help="map a recording; error of every frame beside the wheels alone",
         description="Map a recording as `mapweave replay` does. Print the absolute and relative error of its "
         "frames beside the wheels alone, nodes, bytes, the share of frames used, and why others were not. "
-        "The trajectories go to files that evo reads. Without truth nothing is scored.",
+        "The trajectories go to files that evo reads. Without truth nothing is scored. A recording without "
+        "odometry is mapped by its images alone, and its error is that after an alignment with scale.",
     )
     add_recording(replay)
     replay.add_argument(
@@ -106,22 +111,39 @@ def run_replay(arguments: argparse.Namespace) -> int:
     from rich.table import Table
 
     from mapweave.agent.drivers.replay import Replay
+    from mapweave.agent.recordings.incomplete import NoOdometry
     from mapweave.evaluation.replaying import evaluate_replay, rows
     from mapweave.output_folder import check_output
-    from mapweave.terminal import Bar, plain_or_terminal
+    from mapweave.terminal import Bar, plain_or_terminal, tracked
 
     path: Path = arguments.recording
     out = arguments.out or Path("out/eval-replay") / path.resolve().stem
     check_output(out)
     beside = (path if path.is_dir() else path.parent) / "truth.csv"
     truth = arguments.truth or (beside if beside.exists() else None)
-    replay = Replay(path, arguments.robot, options=options_of(arguments))
     console = plain_or_terminal()
-    for note in replay.recording.notes:
-        console.print(note, highlight=False)
-    with Bar(console, "frames", len(replay)) as bar:
-        evaluated = evaluate_replay(replay, settings_of(arguments).agent, truth, lambda frame: bar.advance())
-    for line in (*evaluated.notes, *replay.damage):
+    evaluated: ReplayEvaluation | VisualEvaluation
+    try:
+        replay = Replay(path, arguments.robot, options=options_of(arguments))
+    except NoOdometry as missing:
+        # It needs a library that mapping with odometry does not.
+        from mapweave.evaluation.visual_replaying import evaluate_images
+
+        recording = missing.recording
+        notes = ("no odometry: it is mapped by its images alone, without a scale", *recording.notes)
+        for note in notes:
+            console.print(note, highlight=False)
+        frames = images_of(recording, arguments.robot)
+        evaluated = evaluate_images(recording, tracked(frames, "frames", console=console), truth)
+        lines = (*recording.damage, *evaluated.damage)
+    else:
+        for note in replay.recording.notes:
+            console.print(note, highlight=False)
+        with Bar(console, "frames", len(replay)) as bar:
+            settings = settings_of(arguments).agent
+            evaluated = evaluate_replay(replay, settings, truth, lambda frame: bar.advance())
+        lines = (*evaluated.notes, *replay.damage)
+    for line in lines:
         console.print(line, highlight=False)
     for written in evaluated.write(out):
         console.print(f"{written}", highlight=False)

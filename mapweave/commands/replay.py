@@ -145,17 +145,23 @@ def run(arguments: argparse.Namespace) -> int:
 
 def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
     """Map a recording without odometry by its images alone."""
-    from mapweave.agent.recordings.trajectory_file import tum_line
     from mapweave.agent.replication.epochs import newest_on_server
     from mapweave.agent.replication.journal import Journal
+    from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.change import NodePut
     from mapweave.photographs import send_map
     from mapweave.processes.agent import FIRST_PATIENCE
     from mapweave.processes.agent_files import epochs_of_files, map_path, trajectory_path
     from mapweave.storage.map_file import MapFile, write_map_file
     from mapweave.terminal import EventLog, plain_or_terminal, tracked
-    from mapweave.visual_mapping import keyframes, visual_maps
+    from mapweave.visual_mapping import keyframes, nothing_mapped, visual_maps
+    from mapweave.visual_trajectory import tum_lines
 
+    if arguments.rerun is not None:
+        raise UsageError(
+            f"{recording.path}: has no odometry, so no agent runs on it that --rerun could show: leave it out"
+        )
+    taken_images = images_of(recording, arguments.robot)
     name, data, console = name_of(arguments), arguments.data, plain_or_terminal()
     say = EventLog(console)
     network = network_of(arguments, settings_of(arguments))
@@ -173,25 +179,41 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
         if not (taken or arguments.epoch or arguments.offline):
             stored = newest_on_server(bus, keys, network.server, name, FIRST_PATIENCE)
         epoch = max(arguments.epoch or 0, *(used + 1 for used in taken), (stored or 0) + 1)
-        frames = tracked(range(len(recording)), name, console=console)
+        frames = tracked(taken_images, name, console=console)
         walk, damage = keyframes(recording, frames)
         maps = visual_maps(walk, recording.camera, name, epoch)
         if not maps:
-            why = f"no two of its {len(walk)} keyframes show the same things from two places"
-            raise DeviceError(damage[0] if damage else f"{recording.path}: {why}: nothing can be mapped")
-        for map_id, changes in maps:
-            write_map_file(map_path(data, map_id), MapFile("agent", str(map_id), tuple(changes)))
-            nodes = [change.node for change in changes if isinstance(change, NodePut)]
-            trajectory_path(data, map_id).write_text(
-                "".join(tum_line(node.stamp_ns, node.map_from_robot.mean) for node in nodes)
-            )
-            say(f"{name}: {counted(len(nodes), 'node')} in {map_path(data, map_id)}; its scale is unknown")
+            raise DeviceError(nothing_mapped(recording.path, walk, damage))
+        for one in maps:
+            file = map_path(data, one.id)
+            write_map_file(file, MapFile("agent", str(one.id), tuple(one.changes)))
+            trajectory_path(data, one.id).write_text(tum_lines(one.trajectory))
+            nodes = sum(isinstance(change, NodePut) for change in one.changes)
+            say(f"{name}: {counted(nodes, 'node')} in {file}; its scale is unknown")
             if not arguments.offline:
-                sent = send_map(changes, map_id, path, bus, keys, network.server, arguments.timeout)
+                sent = send_map(one.changes, one.id, path, bus, keys, network.server, arguments.timeout)
                 say(f"{name}: server {network.server} has {'' if sent else 'not taken '}it all")
+        poses = [pose for one in maps for pose in one.trajectory]
+        found = sum(pose.found for pose in poses)
+        say(
+            f"{name}: of {counted(len(taken_images), 'image')} {found} are found in a map, "
+            f"{len(poses) - found} interpolated, {len(taken_images) - len(poses)} in none"
+        )
     finally:
         bus.close()
     return _report([*recording.damage, *damage])
+
+
+def images_of(recording: Recording, robot: str | None) -> range:
+    """Numbers of the images of one robot of the splits.toml beside a recording; all without a robot.
+
+    Raises:
+        DeviceError: the file is missing or wrong, or has no such robot.
+    """
+    from mapweave.agent.recordings.splits import read_split
+
+    folder = recording.path if recording.path.is_dir() else recording.path.parent
+    return read_split(folder / "splits.toml", robot, len(recording))
 
 
 def _bus(network: NetworkSettings, name: str, offline: bool) -> tuple[ZenohBus | MemoryBus, Keys]:

@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 
 from mapweave.cli import main
+from mapweave.evaluation.visual_replaying import NO_MAP
+from mapweave.exit_status import USAGE
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import Pose2
@@ -20,6 +22,7 @@ from mapweave.sim.camera import CAMERAS
 from mapweave.sim.photographer import walk
 from mapweave.sim.worlds.catalog import world_from_table
 from mapweave.storage.map_file import read_map_file
+from tests.mapweave.command_line import complaint
 
 COUNT, SPACING, RATE, PHONE = 30, 0.1, 10.0, CAMERAS["phone"]
 
@@ -90,6 +93,34 @@ def test_a_video_becomes_one_map_that_is_right_up_to_one_scale(video, made: Path
     assert all(edge.evidence["shared"] == len(edge.shared) >= 12 for edge in edges)
 
 
+def test_the_trajectory_has_every_image_as_exactly_as_the_keyframes(video, made: Path) -> None:
+    """Only the keyframes were written."""
+    _, truth = video
+    lines = made.with_suffix(".tum").read_text().splitlines()
+    assert not [line for line in lines if line.startswith("#")], "all are found, none is interpolated"
+    rows = np.array([line.split() for line in lines], float)
+    assert rows[:, 0] == pytest.approx(np.arange(COUNT) / RATE)
+    true = np.array([pose.vector for pose in truth])
+    mine, there = rows[:, 1] + 1j * rows[:, 2], true[:, 0] + 1j * true[:, 1]
+    mine, there = mine - mine.mean(), there - there.mean()
+    # The similarity that brings the one nearest to the other.
+    fit = (mine.conj() @ there) / (mine.conj() @ mine)
+    off = np.abs(fit * mine - there)
+    assert off.max() < 0.04, "on a walk of 3 m"
+    turned = 2 * np.arctan2(rows[:, 6], rows[:, 7]) - true[:, 2]
+    turned -= turned[0]
+    assert np.abs((turned + np.pi) % (2 * np.pi) - np.pi).max() < 0.03
+
+
+def test_rerun_and_a_robot_that_is_not_there_are_refused(video, tmp_path: Path, capfd) -> None:
+    """Both were ignored."""
+    path, _ = video
+    command = ["replay", path, "--camera", path.with_name("camera.toml"), "--offline", "--data", tmp_path]
+    assert "leave it out" in complaint(capfd, *command, "--rerun", tmp_path / "x.rrd", status=USAGE)
+    said = complaint(capfd, *command, "--robot", "a")
+    assert "splits.toml" in said and not list(tmp_path.iterdir())
+
+
 def test_a_lost_robot_gets_the_place_but_not_the_distance(video, made: Path) -> None:
     path, truth = video
     relocalizer, (nodes, _) = relocalizer_of(read_map_file(made)), contents(made)
@@ -146,7 +177,7 @@ def test_a_folder_of_images_without_odometry_is_mapped_as_the_video_is(made, vid
     (file,) = replayed(folder, path.with_name("camera.toml"), tmp_path / "maps")
     nodes, _ = contents(file)
     assert [node.stamp_ns for node in nodes] == [node.stamp_ns for node in contents(made)[0]]
-    assert len(np.loadtxt(file.with_suffix(".tum"))) == len(nodes), "a trajectory of the keyframes"
+    assert len(np.loadtxt(file.with_suffix(".tum"))) == COUNT
 
 
 def test_info_says_what_is_missing_and_damage_is_said(video, tmp_path: Path, capfd) -> None:
@@ -161,3 +192,34 @@ def test_info_says_what_is_missing_and_damage_is_said(video, tmp_path: Path, cap
     replayed(blank, camera, tmp_path / "none", status=1)
     output = capfd.readouterr().err.splitlines()
     assert output[-1].startswith(f"mapweave: {blank}: no two of its") and "Traceback" not in output
+
+
+def test_an_evaluation_says_what_is_used_and_the_error_up_to_scale(video, tmp_path: Path, capfd) -> None:
+    """It refused recordings without odometry."""
+    path, truth = video
+    (tmp_path / "truth.csv").write_text(
+        "stamp_s,x_m,y_m,heading_rad\n"
+        + "".join(f"{k / RATE},{3 * p.x},{3 * p.y},{p.heading}\n" for k, p in enumerate(truth))
+    )
+    arguments = ["eval", "replay", path, "--camera", path.with_name("camera.toml"), "--out", tmp_path / "out"]
+    given = ["--truth", tmp_path / "truth.csv", "--json"]
+    assert main([str(one) for one in (*arguments, *given)]) == 0
+    report = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert (report["frames"], report["frames_used"], report["not_used"]) == (COUNT, 1.0, {})
+    assert report["maps"] == 1 and report["nodes"] == report["edges"] + 1 and report["bytes"] > 1000
+    assert 0.0 < report["ate_up_to_scale_m"] < 0.06, "on a walk of 9 m"
+    assert len(np.loadtxt(tmp_path / "out" / "map0.tum")) == COUNT
+    assert main([str(one) for one in arguments]) == 0
+    lines = capfd.readouterr().out
+    assert "frames_used" in lines and "100 %" in lines and "unknown" in lines, "nothing is scored"
+
+
+def test_an_evaluation_counts_images_that_no_map_has(video, tmp_path: Path, capfd) -> None:
+    path, _ = video
+    grey = [np.full((240, 320), 90, np.uint8)] * 6
+    write(tmp_path / "walk.avi", [*frames(path)[:12], *grey])
+    arguments = ["eval", "replay", tmp_path / "walk.avi", "--camera", path.with_name("camera.toml"), "--json"]
+    assert main([str(one) for one in (*arguments, "--out", tmp_path / "out")]) == 0
+    report = json.loads(capfd.readouterr().out.splitlines()[-1])
+    assert report["frames"] == 18 and report["not_used"] == {NO_MAP: 6} and not report["truth"]
+    assert report["frames_used"] == round(12 / 18, 4) and report["ate_up_to_scale_m"] is None
