@@ -7,6 +7,9 @@ from typing import Any
 
 from uvicorn.protocols.websockets.wsproto_impl import WSProtocol
 
+PIECE = 1024
+"""Bytes that are looked at before the longest message is compared; compressed they can be 1 MB."""
+
 
 class WebSocketConnection(WSProtocol):
     """One viewer.
@@ -31,6 +34,13 @@ class WebSocketConnection(WSProtocol):
         if message["type"] == "websocket.http.response.start":
             message = {**message, "headers": [*message["headers"], *self.default_headers]}
         await super().send(message)
+
+    def data_received(self, data: bytes) -> None:
+        """Take it in pieces: compressed, a message is a thousand times as long before it is refused."""
+        for begin in range(0, len(data), PIECE):
+            if self.transport.is_closing():
+                return
+            super().data_received(data[begin : begin + PIECE])
 
     def pause_writing(self) -> None:
         """The peer is slower than what is sent."""
