@@ -7,7 +7,6 @@ So the server never imports it: requests and answers are bytes that pass through
 from __future__ import annotations
 
 import logging
-import pickle
 import subprocess
 import sys
 import threading
@@ -18,7 +17,8 @@ from queue import SimpleQueue
 from socket import socketpair
 from typing import NamedTuple
 
-from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.errors import InvalidMessage, MapweaveError
+from mapweave.mapserver.cluster.frames import MOST_FRAME, Reply, Request
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ class ClusterGone(MapweaveError):
 class _Child(NamedTuple):
     process: subprocess.Popen[bytes]
     connection: Connection
-    outbox: SimpleQueue[tuple[int, int, bytes] | None]
+    outbox: SimpleQueue[Request | None]
 
 
 class Gateway:
@@ -94,7 +94,7 @@ class Gateway:
                 if not self._pending:
                     self._heard = time.monotonic()
                 self._pending[self._next] = answer
-                self._child.outbox.put((self._next, target, request))
+                self._child.outbox.put(Request(self._next, target, request))
                 return answer
         answer.set_exception(ClusterGone("the cluster is not there"))
         return answer
@@ -107,7 +107,7 @@ class Gateway:
             child = self._start()
             try:
                 words = self._serve(child)
-            except (EOFError, OSError) as error:
+            except (EOFError, OSError, InvalidMessage) as error:
                 words = str(error) or "its process has ended"
             finally:
                 self._end(child)
@@ -147,24 +147,24 @@ class Gateway:
                     "the cluster at %s is not reached yet, after %.0f s: this process works alone meanwhile",
                     self._address, waited,
                 )  # fmt: skip
-        workers, words = pickle.loads(connection.recv_bytes())
-        if words:
-            return str(words)
+        first = _received(connection)
+        if first.words:
+            return first.words
         with self._lock:
-            self._ready, self.workers = True, int(workers)
+            self._ready, self.workers = True, first.number
         log.info("in the cluster at %s, with %d workers", self._address, self.workers)
         while True:
             if connection.poll(1.0):
-                number, answer, words = pickle.loads(connection.recv_bytes())
+                reply = _received(connection)
                 with self._lock:
                     self._heard = time.monotonic()
-                    future = self._pending.pop(number, None)
+                    future = self._pending.pop(reply.number, None)
                 if future is None:
                     continue
-                if words:
-                    future.set_exception(MapweaveError(words))
+                if reply.words:
+                    future.set_exception(MapweaveError(reply.words))
                 else:
-                    future.set_result(answer)
+                    future.set_result(reply.message)
             with self._lock:
                 if self._pending and time.monotonic() - self._heard > SILENCE:
                     return f"no answer for {SILENCE:g} s"
@@ -188,10 +188,14 @@ class Gateway:
             future.set_exception(ClusterGone("the cluster is lost"))
 
 
+def _received(connection: Connection) -> Reply:
+    return Reply.read(connection.recv_bytes(MOST_FRAME))
+
+
 def _write(child: _Child) -> None:
     """In a thread of its own, so that no thread of the server waits for a child that does not read."""
     try:
         while (item := child.outbox.get()) is not None:
-            child.connection.send_bytes(pickle.dumps(item))
+            child.connection.send_bytes(item.packed())
     except (OSError, ValueError):
         pass  # The child has ended: the reader sees it.

@@ -8,7 +8,6 @@ Each shard is an actor that Ray starts again, as often as needed; all belong to 
 from __future__ import annotations
 
 import os
-import pickle
 import signal
 import socket
 import sys
@@ -20,6 +19,8 @@ from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import Any
 
+from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.mapserver.cluster.frames import MOST_FRAME, MOST_WORDS, Reply, Request
 from mapweave.mapserver.cluster.gateway import WORK
 
 LOOPBACK = "127.0.0.1"
@@ -34,7 +35,7 @@ def main() -> int:
     try:
         ray = _joined(address)
     except Exception as error:  # noqa: BLE001 - whatever it is, the server says it and tries again
-        connection.send_bytes(pickle.dumps((0, f"{type(error).__name__}: {_words(error)}")))
+        connection.send_bytes(Reply(0, words=f"{type(error).__name__}: {_words(error)}").packed())
         return 1
     from mapweave.mapserver.cluster.shard import ShardServer
     from mapweave.mapserver.cluster.work import answer_work
@@ -42,14 +43,15 @@ def main() -> int:
     shard = ray.remote(ShardServer).options(max_restarts=-1, num_cpus=0, scheduling_strategy="SPREAD")
     actors = [shard.remote() for _ in range(shards)]
     work = ray.remote(answer_work).options(num_cpus=1, max_retries=3, scheduling_strategy="SPREAD")
-    connection.send_bytes(pickle.dumps((int(ray.cluster_resources().get("CPU", 0)), "")))
+    connection.send_bytes(Reply(int(ray.cluster_resources().get("CPU", 0))).packed())
     sending = threading.Lock()
     try:
         while True:
-            number, target, request = pickle.loads(connection.recv_bytes())
-            sent = work.remote(request) if target == WORK else actors[target].call.remote(request)
-            sent.future().add_done_callback(partial(_reply, connection, sending, number))
-    except (EOFError, OSError):
+            request = Request.read(connection.recv_bytes(MOST_FRAME))
+            at = work if request.target == WORK else actors[request.target].call
+            sent = at.remote(request.message)
+            sent.future().add_done_callback(partial(_reply, connection, sending, request.number))
+    except (EOFError, OSError, InvalidMessage):
         # Not sys.exit: with a head that is gone, Ray waits for it.
         threading.Timer(5.0, partial(os._exit, 0)).start()
         ray.shutdown()
@@ -104,14 +106,14 @@ def _listens(address: str) -> bool:
 def _reply(connection: Connection, sending: threading.Lock, number: int, done: Future[bytes]) -> None:
     """Send an answer, or why there is none."""
     error = done.exception()
-    reply = (number, done.result(), "") if error is None else (number, b"", _words(error))
+    reply = Reply(number, done.result()) if error is None else Reply(number, words=_words(error))
     # The other side may have closed: then this ends, too.
     with sending, suppress(OSError):
-        connection.send_bytes(pickle.dumps(reply))
+        connection.send_bytes(reply.packed())
 
 
 def _words(error: BaseException) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[-1][:500]
+    return (str(error).strip().splitlines() or [type(error).__name__])[-1][:MOST_WORDS]
 
 
 if __name__ == "__main__":

@@ -6,10 +6,10 @@ another `incarnation`; the server then fills it again.
 
 from __future__ import annotations
 
-import pickle
 import secrets
 from collections.abc import Collection, Iterable
-from typing import Any, NamedTuple
+from dataclasses import replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,24 +17,27 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Node
+from mapweave.mapserver.cluster.messages import (
+    Answer,
+    Ask,
+    Change,
+    Nearest,
+    NearestAnswer,
+    OverlapsAnswer,
+    Question,
+    Reset,
+    ShardRequest,
+    State,
+    answer_message,
+    decoded,
+    encoded,
+)
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.mapserver.retrieval.ranking import NearestLandmarks
 
 
 class OutOfDate(MapweaveError):
     """A shard lacks changes that it should have."""
-
-
-class State(NamedTuple):
-    """What a shard has.
-
-    Attributes:
-        incarnation: random, drawn when it began to be filled.
-        number: of the last change it has, without gaps from 1 on.
-    """
-
-    incarnation: str
-    number: int
 
 
 class Shard:
@@ -62,6 +65,12 @@ class Shard:
         """Which nodes of this shard overlap with a node; see `PlaceIndex.overlaps`."""
         return self._index.overlaps(node, self._nodes.get)
 
+    def answer(self, question: Question) -> Answer:
+        """The answer to a question."""
+        if isinstance(question, Nearest):
+            return self.nearest(question.codes)
+        return self.overlaps(*question.nodes.nodes)
+
 
 class ShardServer:
     """A shard that is asked by messages, whose order it checks: a message may be lost, or the process."""
@@ -71,51 +80,34 @@ class ShardServer:
         self._reset()
 
     def call(self, request: bytes) -> bytes:
-        """Answer a request made by one of the functions below.
+        """Answer a request, see mapweave.mapserver.cluster.messages.
 
         Raises:
+            InvalidMessage: it is none.
             OutOfDate: it lacks what the asker knows to have sent.
         """
-        method, arguments = pickle.loads(request)
-        return pickle.dumps(getattr(self, f"_{method}")(*arguments))
+        return encoded(self._answer(decoded(request, ShardRequest)))
 
-    def _hello(self) -> State:
+    def _answer(self, request: ShardRequest) -> Any:
+        match request:
+            case Reset():
+                self._reset()
+            case Change():
+                self._change(request)
+            case Ask():
+                return self._ask(request)
         return self._state
 
-    def _reset(self) -> State:
+    def _reset(self) -> None:
         self._shard, self._state = Shard(), State(secrets.token_hex(8), 0)
-        return self._state
 
-    def _change(self, state: State, nodes: list[Node], gone: list[NodeId]) -> State:
-        if state != (self._state.incarnation, self._state.number + 1):
-            raise OutOfDate(f"has {self._state}, and not what comes before {state}")
-        self._shard.change(nodes, gone)
-        self._state = state
-        return state
+    def _change(self, change: Change) -> None:
+        if change.state != replace(self._state, number=self._state.number + 1):
+            raise OutOfDate(f"has {self._state}, and not what comes before {change.state}")
+        self._shard.change(change.nodes.nodes, change.gone.nodes)
+        self._state = change.state
 
-    def _ask(self, state: State, question: bytes) -> Any:
-        if state.incarnation != self._state.incarnation or state.number > self._state.number:
-            raise OutOfDate(f"has {self._state}, and not {state}")
-        method, *arguments = pickle.loads(question)
-        return getattr(self._shard, method)(*arguments)
-
-
-HELLO = pickle.dumps(("hello", ()))
-"""Asks for the state."""
-RESET = pickle.dumps(("reset", ()))
-"""Asks to forget everything; the answer is the new state."""
-
-
-def change_request(state: State, nodes: list[Node], gone: list[NodeId]) -> bytes:
-    """Change a shard; `state` is that which follows."""
-    return pickle.dumps(("change", (state, nodes, gone)))
-
-
-def question_of(method: str, *arguments: Any) -> bytes:
-    """A question to any shard: the name of a method of `Shard`, and what it is called with."""
-    return pickle.dumps((method, *arguments))
-
-
-def ask_request(state: State, question: bytes) -> bytes:
-    """Ask a shard that must have come at least to a state."""
-    return pickle.dumps(("ask", (state, question)))
+    def _ask(self, ask: Ask) -> NearestAnswer | OverlapsAnswer:
+        if ask.state.incarnation != self._state.incarnation or ask.state.number > self._state.number:
+            raise OutOfDate(f"has {self._state}, and not {ask.state}")
+        return answer_message(self._shard.answer(decoded(ask.question, Question)))

@@ -9,7 +9,6 @@ for long, a stand-in in this process answers in its place.
 from __future__ import annotations
 
 import logging
-import pickle
 import threading
 import time
 from collections import deque
@@ -23,14 +22,20 @@ import numpy as np
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Node
 from mapweave.mapserver.cluster.gateway import ClusterGone
-from mapweave.mapserver.cluster.shard import (
-    HELLO,
-    RESET,
-    Shard,
+from mapweave.mapserver.cluster.messages import (
+    Ask,
+    Change,
+    ComparedNodes,
+    Hello,
+    Ids,
+    Question,
+    Reset,
     State,
-    ask_request,
-    change_request,
+    answer_to,
+    decoded,
+    encoded,
 )
+from mapweave.mapserver.cluster.shard import Shard
 
 log = logging.getLogger(__name__)
 
@@ -134,7 +139,7 @@ class ShardLink:
         """Send the next change; what is lost of it is noticed."""
         assert self._state is not None
         state = self._state = State(self._state.incarnation, self._state.number + 1)
-        sent = self._call(change_request(state, nodes, gone))
+        sent = self._call(encoded(Change(state, ComparedNodes.of(nodes), Ids.of(gone))))
         self._unacknowledged.append(sent)
         sent.add_done_callback(lambda done: self._acknowledged(done, state))
         return sent
@@ -148,8 +153,12 @@ class ShardLink:
 
     # Ask it.
 
-    def ask(self, question: bytes) -> Callable[[float], Any] | None:
-        """Ask; see mapweave.mapserver.cluster.shard.question_of.
+    def ask(self, question: Question, message: bytes) -> Callable[[float], Any] | None:
+        """Ask.
+
+        Args:
+            question: for a stand-in.
+            message: the same, encoded once for all shards.
 
         Returns:
             Gives the answer when it is called with the time left, s; raises whatever went wrong. None if
@@ -159,17 +168,16 @@ class ShardLink:
             state, stand_in = self._state, self._stand_in
             sent = None
             if self._current and state is not None:
-                sent = self._call(ask_request(state, question))
+                sent = self._call(encoded(Ask(state, message)))
         if sent is not None and state is not None:
-            return lambda left: self._answer(sent, state, left)
+            return lambda left: self._answer(question, sent, state, left)
         if stand_in is None:
             return None
-        method, *arguments = pickle.loads(question)
-        return lambda left: getattr(stand_in, method)(*arguments)
+        return lambda left: stand_in.answer(question)
 
-    def _answer(self, sent: Future[bytes], state: State, left: float) -> Any:
+    def _answer(self, question: Question, sent: Future[bytes], state: State, left: float) -> Any:
         try:
-            return pickle.loads(sent.result(max(left, 0.0)))
+            return answer_to(question, sent.result(max(left, 0.0)))
         except Exception as error:
             self._lost(state, error)
             raise
@@ -210,11 +218,11 @@ class ShardLink:
 
     def _restore(self) -> None:
         """Bring the shard up to date; raises if it cannot be reached."""
-        state = State(*pickle.loads(self._call(HELLO).result(max(self.timeout, REACHED_WITHIN))))
+        state = self._asked_state(Hello())
         with self._changed:
             same = state == self._state
         if not same:
-            state = State(*pickle.loads(self._call(RESET).result(max(self.timeout, REACHED_WITHIN))))
+            state = self._asked_state(Reset())
             with self._changed:
                 self._state, self._behind = state, dict.fromkeys(self._nodes)
         began, count = time.monotonic(), len(self._behind)
@@ -238,6 +246,11 @@ class ShardLink:
             self.name, len(self), count, time.monotonic() - began,
         )  # fmt: skip
 
+    def _asked_state(self, request: Hello | Reset) -> State:
+        answer = self._call(encoded(request)).result(max(self.timeout, REACHED_WITHIN))
+        state: State = decoded(answer, State)
+        return state
+
     def _stand_in_if_due(self, at_once: bool) -> None:
         """Let this process answer for a shard that is lost for long."""
         with self._changed:
@@ -245,7 +258,7 @@ class ShardLink:
                 return
             shard = self._built = Shard()
             left = deque(self._nodes)
-            back = self._call(HELLO)
+            back = self._call(encoded(Hello()))
         while left:
             with self._changed:
                 if self._closing or (back.done() and back.exception() is None):

@@ -17,9 +17,8 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.query import View
-from mapweave.mapserver.cluster.shard import question_of
+from mapweave.mapserver.cluster.messages import ComparedNodes, Nearest, Overlaps, Question, encoded
 from mapweave.mapserver.cluster.shard_link import ShardLink
-from mapweave.mapserver.retrieval.compared_landmarks import bounded
 from mapweave.mapserver.retrieval.place_database import NodeOf
 from mapweave.mapserver.retrieval.place_index import PlaceIndexSettings
 from mapweave.mapserver.retrieval.ranking import IncompleteSearch, NearestLandmarks, Ranked
@@ -81,7 +80,7 @@ class ShardedIndex:
 
     def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> Ranked:
         """Rank nodes by their similarity to a view; says what could not be searched in time."""
-        parts, silent = self._asked(question_of("nearest", view.codes), self._links)
+        parts, silent = self._asked(Nearest(view.codes), self._links)
         missing = f"{len(silent)} of {len(self._links)} shards of the map did not answer" if silent else ""
         if not parts:
             return Ranked((), missing)
@@ -98,7 +97,7 @@ class ShardedIndex:
         Raises:
             IncompleteSearch: this is closed.
         """
-        question, left = question_of("overlaps", bounded(node)), self._links
+        question, left = Overlaps(ComparedNodes.of([node])), self._links
         overlaps_by_node: dict[NodeId, float] = {}
         while left:
             parts, left = self._asked(question, left)
@@ -110,9 +109,12 @@ class ShardedIndex:
         overlaps_by_node.pop(node.id, None)
         return overlaps_by_node
 
-    def _asked(self, question: bytes, links: Sequence[ShardLink]) -> tuple[list[Any], tuple[ShardLink, ...]]:
+    def _asked(
+        self, question: Question, links: Sequence[ShardLink]
+    ) -> tuple[list[Any], tuple[ShardLink, ...]]:
         """Ask shards at once: the answers, and the shards that gave none in time."""
-        asked = [(link, link.ask(question)) for link in links]
+        message = encoded(question)
+        asked = [(link, link.ask(question, message)) for link in links]
         # Stand-ins work in this thread: others work meanwhile.
         asked.sort(key=lambda item: item[0].current)
         end = time.monotonic() + max(link.timeout for link in links)

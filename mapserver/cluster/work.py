@@ -6,16 +6,19 @@ Whatever does not come back is done here, so a process that fails does no harm.
 from __future__ import annotations
 
 import logging
-import pickle
 import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future
 from itertools import islice
-from typing import Any
 
-from mapweave.hybridmap.node import Node
+from mapweave.mapserver.cluster.messages import (
+    Comparison,
+    ComparisonAnswer,
+    Pairs,
+    decoded,
+    encoded,
+)
 from mapweave.mapserver.merging.node_comparisons import compare
-from mapweave.mapserver.retrieval.compared_landmarks import bounded
 from mapweave.merge.pose_graph.verdicts import Verdict
 
 log = logging.getLogger(__name__)
@@ -30,12 +33,13 @@ PATIENCE, TRUCE = 5.0, 30.0
 
 
 def answer_work(request: bytes) -> bytes:
-    """Do what a request asks for."""
-    name, argument = pickle.loads(request)
-    return pickle.dumps(FUNCTIONS[name](argument))
+    """Compare the nodes of a Comparison.
 
-
-FUNCTIONS: dict[str, Callable[[Any], Any]] = {"compare": lambda pairs: [*compare(pairs)]}
+    Raises:
+        InvalidMessage: the request is none.
+    """
+    comparison: Comparison = decoded(request, Comparison)
+    return encoded(ComparisonAnswer.of(compare(comparison.node_pairs())))
 
 
 class WorkPool:
@@ -51,35 +55,38 @@ class WorkPool:
         """Whether workers have not answered of late."""
         return time.monotonic() < self._not_before
 
-    def compare(self, pairs: Sequence[tuple[Node, Node]]) -> Iterable[Verdict]:
+    def compare(self, pairs: Pairs) -> Iterable[Verdict]:
         """Compare pairs of nodes; see `mapweave.mapserver.merging.node_comparisons.compare`."""
         if len(pairs) <= PAIRS:  # a single worker would be no faster
             return compare(pairs)
-        rest = iter([(bounded(a), bounded(b)) for a, b in pairs])
-        parts = iter(lambda: list(islice(rest, PAIRS)), [])
-        return (verdict for verdicts in self._map("compare", parts) for verdict in verdicts)
+        return (verdict for verdicts in self._compared(pairs) for verdict in verdicts)
 
-    def _map(self, name: str, arguments: Iterator[Any]) -> Iterator[Any]:
-        """The results, in order."""
-        asked: list[tuple[Any, Future[bytes] | None]] = []
+    def _compared(self, pairs: Pairs) -> Iterator[Iterable[Verdict]]:
+        """The verdicts on some pairs after the others, in order."""
+        rest = iter(pairs)
+        parts = iter(lambda: list(islice(rest, PAIRS)), [])
+        asked: list[tuple[Pairs, Future[bytes] | None]] = []
+        part: Pairs
         while True:
             workers = 0 if self._silent else self._workers()
-            for argument in islice(arguments, max(max(AHEAD * workers, 1) - len(asked), 0)):
-                sent = self._call(pickle.dumps((name, argument))) if workers else None
-                asked.append((argument, sent))
+            for part in islice(parts, max(max(AHEAD * workers, 1) - len(asked), 0)):
+                sent = self._call(encoded(Comparison.of(part))) if workers else None
+                asked.append((part, sent))
             if not asked:
                 return
-            argument, sent = asked.pop(0)
-            yield self._result(name, argument, sent)
+            part, sent = asked.pop(0)
+            yield self._verdicts(part, sent)
 
-    def _result(self, name: str, argument: Any, sent: Future[bytes] | None) -> Any:
+    def _verdicts(self, pairs: Pairs, sent: Future[bytes] | None) -> Iterable[Verdict]:
         if sent is not None:
             try:
-                return pickle.loads(sent.result(0.0 if self._silent else PATIENCE))
+                data = sent.result(0.0 if self._silent else PATIENCE)
+                answer: ComparisonAnswer = decoded(data, ComparisonAnswer)
+                return answer.verdicts_on(pairs)
             except TimeoutError:
                 if not self._silent:
                     self._not_before = time.monotonic() + TRUCE
                     log.warning("no worker of the cluster answers in %g s: nodes are compared here", PATIENCE)
             except Exception as error:  # noqa: BLE001 - whatever it is, it is done here
                 log.debug("no answer from the cluster: %s", error)
-        return FUNCTIONS[name](argument)
+        return compare(pairs)

@@ -3,31 +3,36 @@
 from __future__ import annotations
 
 import os
-import pickle
 import sys
 import time
 from multiprocessing.connection import Connection
+
+from mapweave.mapserver.cluster.frames import MOST_FRAME, Reply, Request
 
 
 def main() -> None:
     connection = Connection(int(sys.argv[1]))
     if sys.argv[2] == "nowhere":
-        connection.send_bytes(pickle.dumps((0, "nothing listens at nowhere")))
+        connection.send_bytes(Reply(0, words="nothing listens at nowhere").packed())
         return
     if sys.argv[2] == "slow":
         time.sleep(2.0)
-    connection.send_bytes(pickle.dumps((int(sys.argv[3]), "")))
+    connection.send_bytes(Reply(int(sys.argv[3])).packed())
     while True:
         try:
-            number, target, request = pickle.loads(connection.recv_bytes())
+            number, target, request = Request.read(connection.recv_bytes())
         except EOFError:
             return
         if request == b"die":
             os._exit(1)
-        if request == b"fail":
-            connection.send_bytes(pickle.dumps((number, b"", "it failed")))
+        if request == b"garbage":
+            connection.send_bytes(b"no frame")
+        elif request == b"too long":
+            connection.send_bytes(bytes(MOST_FRAME + 1))
+        elif request == b"fail":
+            connection.send_bytes(Reply(number, words="it failed").packed())
         elif request != b"silence":
-            connection.send_bytes(pickle.dumps((number, b"%d %s" % (target, request), "")))
+            connection.send_bytes(Reply(number, b"%d %s" % (target, request)).packed())
 
 
 if __name__ == "__main__":

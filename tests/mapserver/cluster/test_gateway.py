@@ -77,3 +77,15 @@ def test_a_server_says_that_it_waits_for_its_cluster(
         "in the cluster at slow, with 3 workers",
     )
     assert waiting in caplog.text and caplog.text.index(waiting) < caplog.text.index(reached)
+
+
+@pytest.mark.parametrize("request_of_it", [b"garbage", b"too long"])
+def test_a_process_that_sends_no_frame_is_started_again(
+    request_of_it: bytes, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    with gateway(monkeypatch) as opened:
+        eventually(lambda: opened.workers)
+        with pytest.raises(ClusterGone):
+            opened.ask(0, request_of_it).result(10.0)
+        eventually(lambda: "the cluster at here is not there: " in caplog.text and opened.workers)
+        assert opened.ask(1, b"again").result(10.0) == b"1 again"
