@@ -97,7 +97,7 @@ class FleetClient:
         self.relocalized: Counter[str] = Counter()
         self._closing = [
             *serve_senders(bus, keys.mission(map_id.agent), self._take_mission),
-            bus.serve(keys.drive(map_id.agent), self._take_drive),
+            *serve_senders(bus, keys.drive(map_id.agent), self._take_drive),
             *serve_senders(bus, keys.portal(map_id.agent), self._take_portal),
             bus.serve(keys.agent_status(map_id.agent), self._tell_status),
             bus.watch(keys.servers_alive(), self._see_server),
@@ -185,6 +185,7 @@ class FleetClient:
             trouble,
             age,
             self._skipped,
+            self._teleoperation.drive,
         )
 
     def _tell_status(self, request: Request) -> None:
@@ -212,8 +213,9 @@ class FleetClient:
         except MapweaveError as refused:
             request.refuse(str(refused))
 
-    def _take_drive(self, request: Request) -> None:
-        answer_ns = self._teleoperation.take(decode(request.payload, DriveRequest))
+    def _take_drive(self, request: Request, who: str) -> None:
+        asked = decode(request.payload, DriveRequest)
+        answer_ns = self._teleoperation.take(replace(asked, by=who or asked.by))
         request.reply(encode(DriveAnswer(self.status(), answer_ns, *self._limits)))
 
     def _ask_all(self) -> None:

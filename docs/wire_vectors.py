@@ -28,7 +28,7 @@ from mapweave.agent.drivers.messages import (
 )
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.hybridmap import annotation, constraint_subject, explanation, floor_plan, nearby, query
-from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
+from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, HandDrive, RobotEntry, Status
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
@@ -219,13 +219,28 @@ def status() -> AgentStatus:
         5, progress=0.25, tally=DriveStatistics(4, 1, 1, 0), covariance=(0.25, 0.0, 0.25, 0.0625),
     )  # fmt: skip
     return AgentStatus(
-        pipeline, STAMP, "r0", 3, 2, 123456, True, 15, mission(), 0.75, "map server s0 is gone", 2.5, 3
+        pipeline,
+        STAMP,
+        "r0",
+        3,
+        2,
+        123456,
+        True,
+        15,
+        mission(),
+        0.75,
+        "map server s0 is gone",
+        2.5,
+        3,
+        HandDrive("anna", STAMP, True),
     )
 
 
 def mission() -> MissionReport:
     """A drive to a place."""
-    order = MissionOrder("7f3a9c", "r0", MissionKind.GO, STAMP, "anna", FAR, "kitchen", (NODE,))
+    order = MissionOrder(
+        "7f3a9c", "r0", MissionKind.GO, STAMP, "anna", FAR, "kitchen", (NODE,), "a guest waits"
+    )
     wait = PortalWait(LIFT, 2, True)
     return MissionReport(order, MissionState.RUNNING, 0.25, "driving", 1, wait)
 
@@ -273,7 +288,9 @@ def answers() -> dict[str, tuple[Any, ...]]:
     hop = explanation.Hop(NODE, FAR, "merged", 0.5, 0.25, 1.5, "the servo drives along it")
     views = np.array([[1.5, -2.0, 0.5, 0.75], [3.0, 0.0, -1.5, 0.5]], np.float32)
     image = floor_plan.PlanImage("0f" * 32, 760, 800, "office.png")
-    request = MissionRequest("7f3a9c", "r0", MissionKind.GO, STAMP, "anna", "kitchen", ("r0.3.17",))
+    request = MissionRequest(
+        "7f3a9c", "r0", MissionKind.GO, STAMP, "anna", "kitchen", ("r0.3.17",), "a guest waits"
+    )
     obstacle = query.Obstacle(NEXT, 0.25, -0.5, 0.375, "r1")
     route = query.RouteRequest(NODE, FAR, ((NODE, NEXT),), Pose2(0.1, 0.0, 0.2), (obstacle,))
     robots = (
@@ -338,7 +355,9 @@ def answers() -> dict[str, tuple[Any, ...]]:
         "agent/r0/status": (status(),),
         "agent/r0/view": (ViewRequest(NODE), ViewImage(NODE, b"\xff\xd8\xff\xd9")),
         "agent/r0/portal": (PortalDone("r0", "anna"),),
-        "agent/r0/drive": (DriveRequest(7, 0.25, -0.5, STAMP, True), DriveAnswer(status(), STAMP, 0.5, 0.75)),
+        "agent/r0/drive": (
+            DriveRequest(7, 0.25, -0.5, STAMP, True, "anna"), DriveAnswer(status(), STAMP, 0.5, 0.75),
+        ),
     }  # fmt: skip
 
 

@@ -84,6 +84,21 @@ class Status:
 
 
 @dataclass(frozen=True)
+class HandDrive:
+    """A drive by hand, the last one.
+
+    Attributes:
+        by: who drives: the name in the key of the commands, else what they say.
+        begin_ns: of the drive, wall time of the robot since 1970.
+        over: whether it has ended.
+    """
+
+    by: Annotated[str, Meta(max_length=64)]
+    begin_ns: Stamp
+    over: bool = False
+
+
+@dataclass(frozen=True)
 class AgentStatus:
     """A status as others receive it.
 
@@ -102,6 +117,7 @@ class AgentStatus:
             answer, in words; empty once that is over.
         error_age: for how long the latter has been so, s.
         skipped: images that it has skipped because a tick took too long.
+        drive: who drives it by hand, or has last since its agent began; None without a drive.
     """
 
     status: Status
@@ -117,6 +133,7 @@ class AgentStatus:
     last_error: Line = ""
     error_age: Amount = 0.0
     skipped: Number = 0
+    drive: HandDrive | None = None
 
     @property
     def map(self) -> MapId:

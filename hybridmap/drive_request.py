@@ -26,6 +26,7 @@ class DriveRequest:
         turn: rad/s, counter-clockwise.
         answer_ns: `answer_ns` of the last answer that the program received; 0 for its first request.
         release: the person gives the wheels back to the mission.
+        by: who drives; where the key of the request ends with a name, that holds.
     """
 
     session: Number
@@ -33,6 +34,7 @@ class DriveRequest:
     turn: Speed = 0.0
     answer_ns: Stamp = 0
     release: bool = False
+    by: Annotated[str, Meta(max_length=64)] = ""
 
 
 @dataclass(frozen=True)

@@ -24,6 +24,8 @@ class MapEventKind(StrEnum):
     """A person has decided."""
     ANNOTATED = "annotated"
     """A person has said something about the map."""
+    COMMANDED = "commanded"
+    """A person has sent, stopped or driven a robot."""
     FRAME = "frame"
     """A pin yields to an older one, or holds its component's frame again."""
     CONTRADICTED = "contradicted"

@@ -26,6 +26,9 @@ MOST_APART_NS = 86_400_000_000_000
 """By which the stamps of two orders differ at most if both clocks are right: none is under way for a day."""
 
 MAX_TEXT = 64
+MAX_BECAUSE = 300
+Because = Annotated[str, Meta(max_length=MAX_BECAUSE)]
+"""Why a mission is given, in the words of who gives it."""
 Text = Annotated[str, Meta(max_length=MAX_TEXT)]
 """A goal as it was written, or a person's name."""
 
@@ -90,6 +93,7 @@ class MissionRequest:
         goal: where to: a node (`r0.1.17`), a named place, `x,y` in the merged map, m, or `home`; empty
             without one.
         via: what to pass before, in order, in the same words.
+        because: why, for the history; may be empty.
     """
 
     id: Name
@@ -99,9 +103,12 @@ class MissionRequest:
     by: Text
     goal: Text = ""
     via: Annotated[tuple[Text, ...], Meta(max_length=MAX_VIA)] = ()
+    because: Because = ""
 
     def __post_init__(self) -> None:
-        """Refuse a goal too many or too few, or one that is too long (InvalidValue)."""
+        """Refuse a goal too many or too few, and what is too long (InvalidValue)."""
+        if len(self.because) > MAX_BECAUSE:
+            raise InvalidValue(f"mission {self.kind}: a reason has at most {MAX_BECAUSE} characters")
         if long := [word for word in (self.goal, *self.via) if len(word) > MAX_TEXT]:
             words = f"{long[0][:MAX_TEXT]!r}... is longer than {MAX_TEXT} characters"
             raise InvalidValue(f"mission {self.kind}: {words}")
@@ -116,7 +123,7 @@ class MissionOrder:
     """A mission as a robot takes it.
 
     Attributes:
-        id: see MissionRequest; likewise robot, kind, stamp_ns, by and goal.
+        id: see MissionRequest; likewise robot, kind, stamp_ns, by, goal and because.
         node: where to park; None without a goal.
         via: nodes to pass before, in order.
     """
@@ -129,6 +136,7 @@ class MissionOrder:
     node: NodeId | None = None
     goal: Text = ""
     via: Annotated[tuple[NodeId, ...], Meta(max_length=MAX_VIA)] = ()
+    because: Because = ""
 
     def __post_init__(self) -> None:
         """Refuse a node too many or too few (InvalidValue)."""

@@ -71,6 +71,7 @@ class MissionRelay:
         places: Callable[[], Places],
         time_ns: Callable[[], int],
         later: Callable[[Callable[[], None]], None],
+        note: Callable[[MissionOrder, bool], None] = lambda order, heard: None,
     ) -> None:
         """Go on with the record of the store.
 
@@ -81,8 +82,9 @@ class MissionRelay:
             places: of the newest merged map.
             time_ns: the present time.
             later: has something done soon, and does not wait for it.
+            note: is called with each mission once, and whether a robot has said so; must not wait.
         """
-        self._later = later
+        self._later, self._noted = later, note
         self._bus, self._keys, self._store, self._places, self._time_ns = bus, keys, store, places, time_ns
         self.roster: Roster | None = None
         # A commit may wait for a standby of PostgreSQL: what is known is never held up by it.
@@ -164,6 +166,7 @@ class MissionRelay:
         by: str,
         mission_id: str = "",
         via: tuple[str, ...] = (),
+        because: str = "",
     ) -> MissionRequest:
         """A mission that is given now, and is newer than the one that holds the robot.
 
@@ -176,7 +179,7 @@ class MissionRelay:
         mission_id = check_name(mission_id) if mission_id else new_id()
         if len(via) > MAX_VIA:
             raise InvalidValue(f"a mission passes at most {MAX_VIA} places, not {len(via)}")
-        return MissionRequest(mission_id, check_name(robot), kind, stamp_ns, by[:64], goal, via)
+        return MissionRequest(mission_id, check_name(robot), kind, stamp_ns, by[:64], goal, via, because)
 
     def hear(self, status: AgentStatus) -> None:
         """Take note of what a robot reports of its mission."""
@@ -184,7 +187,7 @@ class MissionRelay:
         # That one is on its way only the server can say: it would try to hand it on.
         if report is None or report.state is MissionState.SENT:
             return
-        self._take(report)
+        self._take(report, heard=True)
         self._take_replaced(report.order)
         with self._turn:
             if not self._unwritten or self._write_is_due:
@@ -225,8 +228,9 @@ class MissionRelay:
             node = node_of_goal(request.goal, map_id, places)
             via = tuple(node_of_goal(word, map_id, places, "via point") for word in request.via)
         order = MissionOrder(
-            request.id, robot, request.kind, request.stamp_ns, request.by, node, request.goal, via
-        )
+            request.id, robot, request.kind, request.stamp_ns, request.by, node, request.goal, via,
+            request.because,
+        )  # fmt: skip
         return MissionReport(order, MissionState.SENT)
 
     def _replace_older(self, order: MissionOrder, *states: MissionState) -> None:
@@ -278,8 +282,12 @@ class MissionRelay:
         self._write()
         return taken
 
-    def _take(self, report: MissionReport) -> MissionReport:
+    def _take(self, report: MissionReport, heard: bool = False) -> MissionReport:
         """Keep a report, to be written if the state is new; returns what holds.
+
+        Args:
+            report: of a mission.
+            heard: whether it is the robot's word alone.
 
         Raises:
             InvalidValue: no message may hold it.
@@ -294,6 +302,8 @@ class MissionRelay:
                 # A robot says what has become of an order, and not what was ordered, or by whose name.
                 report = replace(report, order=before.order)
             self._reports[_key(report.order)] = report
+            if before is None:
+                self._noted(report.order, heard)
             if before is None or before.state is not report.state:
                 self._unwritten = True
                 if len(self._reports) > MAX_KEPT:

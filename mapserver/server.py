@@ -31,6 +31,7 @@ from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.cluster.cluster import Cluster
 from mapweave.mapserver.cluster.settings import ClusterSettings
+from mapweave.mapserver.command_history import COMMANDS, CommandHistory
 from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.libraries import library_jobs
 from mapweave.mapserver.log.ingest import Ingest
@@ -182,9 +183,11 @@ class MapServer:
         self._cluster.start()
         worker.start()
         base = self._base
+        self._commands = CommandHistory(self._store, clock.time_ns, clock.post)
         self._missions = MissionRelay(
-            self._bus, self._keys, self._store, self._named_places, clock.time_ns, clock.post
-        )
+            self._bus, self._keys, self._store, self._named_places, clock.time_ns, clock.post,
+            self._commands.order,
+        )  # fmt: skip
         self._roster = Roster(
             self._bus, self._keys, clock.monotonic, self._hear, self._quotas, lambda: self._ingest.lags()
         )
@@ -211,7 +214,8 @@ class MapServer:
         self._explainer = Explainer(
             self._bus, self._keys, self._name, self._answers, self._admission, self._constraints,
             lambda _: self._constrain(), lambda: worker.settled, self._settings.merge,
-            lambda: self._blockages.known(clock.monotonic()), self._events,
+            lambda: self._blockages.known(clock.monotonic()),
+            lambda: (*self._events(), *self._commands.events),
             lambda: self._annotations.annotations,
         )  # fmt: skip
         self._annotator = Annotator(
@@ -223,6 +227,7 @@ class MapServer:
         self._metrics.read(self._sources())
         clock.every(STATUS_EVERY, self._publish)
         clock.every(RETRY_EVERY, self._missions.retry)
+        clock.every(RETRY_EVERY, self._commands.write)
         self._store.follow(self._follow)
         # Behind the reading of the store: its map can be seen meanwhile.
         for job in library_jobs():
@@ -244,6 +249,7 @@ class MapServer:
         self._cluster.close()
         self._worker.close()
         self._missions.close()
+        self._commands.write()
         self._counting.shutdown()
         self._store.close()
 
@@ -310,7 +316,7 @@ class MapServer:
         return self._admission.submit(lambda: self._explainer.explain(request), usual=False)
 
     def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps, the manual constraints and the annotations, in order."""
+        """The history of the maps, manual constraints, annotations and commands, in order."""
         return self._explainer.history()
 
     def annotations(self) -> Annotations:
@@ -408,9 +414,10 @@ class MapServer:
         by: str,
         mission_id: str = "",
         via: tuple[str, ...] = (),
+        because: str = "",
     ) -> MissionReport:
         """Give a robot a mission that is newer than the one that holds it; see `command`."""
-        return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id, via))
+        return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id, via, because))
 
     def portal_done(self, robot: str, by: str) -> str:
         """Tell a robot that it was taken through a portal, from any thread; returns what it does, in words.
@@ -454,6 +461,8 @@ class MapServer:
             self._apply_annotations(self._annotations.annotations)
         if news.names(MISSIONS):
             self._missions.reload()
+        if news.names(COMMANDS):
+            self._commands.reload()
         if news.names(HISTORY) and not self._store.leads:
             self._history.reload()
 
@@ -478,6 +487,8 @@ class MapServer:
     def _hear(self, status: AgentStatus) -> None:
         self._schedule.observe(status.stamp_ns)
         self._missions.hear(status)
+        if status.drive is not None:
+            self._commands.drive(status.robot, status.drive)
 
     def _apply_annotations(self, annotations: Annotations) -> None:
         # A merge takes its time: only what moves a frame, or parts maps, is worth one.

@@ -265,7 +265,13 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         return found
 
     def go(
-        self, robot: str, goal: str, wait: float = 0.0, via: Sequence[str] = (), plan: str | None = None
+        self,
+        robot: str,
+        goal: str,
+        wait: float = 0.0,
+        via: Sequence[str] = (),
+        plan: str | None = None,
+        because: str = "",
     ) -> MissionReport:
         """Send a robot to a node (`r0.1.17`), a place, a position in the merged map (`3.1,-2.0`) or `home`.
 
@@ -275,6 +281,7 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
             wait: until it is there or has given up, s at most.
             via: what to pass before, in order, in the same words.
             plan: a floor plan, in whose frame positions are then, instead of in the merged map.
+            because: why, for the history.
 
         Raises:
             InvalidValue: `via` is one place, and no list.
@@ -287,25 +294,31 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
 
             placed, component = self.plans().plan(plan), component_of(robot, self.status())
             words = tuple(goal_on_plan(word, placed, component, self.resolve) for word in words)
-        return self._give(robot, MissionKind.GO, words[0], wait, words[1:])
+        return self._give(robot, MissionKind.GO, words[0], wait, words[1:], because)
 
-    def explore(self, robot: str, wait: float = 0.0) -> MissionReport:
+    def explore(self, robot: str, wait: float = 0.0, because: str = "") -> MissionReport:
         """Let a robot map all floor that it can reach; see `go`."""
-        return self._give(robot, MissionKind.EXPLORE, "", wait)
+        return self._give(robot, MissionKind.EXPLORE, "", wait, because=because)
 
-    def carried(self, robot: str) -> MissionReport:
+    def carried(self, robot: str, because: str = "") -> MissionReport:
         """Let a robot map while a person moves it; see `go`."""
-        return self._give(robot, MissionKind.CARRIED, "", 0.0)
+        return self._give(robot, MissionKind.CARRIED, "", 0.0, because=because)
 
-    def stop(self, robot: str = "") -> tuple[MissionReport, ...]:
+    def stop(self, robot: str = "", because: str = "") -> tuple[MissionReport, ...]:
         """Stop a robot, or all of them; the orders go to the robots directly, and at once.
+
+        Args:
+            robot: which; all without a name.
+            because: why, for the history.
 
         Raises:
             NotConnected: one does not answer, or not as it should; the others are stopped.
         """
         self._check_role()
         names = [check_name(robot)] if robot else [e.robot for e in self.status().robots if e.alive]
-        return tuple(each_robot(names, lambda name: self._direct(name, MissionKind.STOP, None, "")))
+        return tuple(
+            each_robot(names, lambda name: self._direct(name, MissionKind.STOP, None, "", (), because))
+        )
 
     def portal_done(self, robot: str) -> str:
         """Tell a robot that it was taken through the portal at which it waits; it looks where it is then.
@@ -372,7 +385,13 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         return last[0]
 
     def _give(
-        self, robot: str, kind: MissionKind, goal: str, wait: float, via: tuple[str, ...] = ()
+        self,
+        robot: str,
+        kind: MissionKind,
+        goal: str,
+        wait: float,
+        via: tuple[str, ...] = (),
+        because: str = "",
     ) -> MissionReport:
         """By way of the map server; without one directly."""
         check_name(robot)
@@ -380,7 +399,7 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         report, after_ns = None, 0
         for _ in range(TRIES):
             stamp_ns = later_stamp(time.time_ns(), after_ns)
-            request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal, via)
+            request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal, via, because)
             key = sent_by(self._keys.any_mission(), self._sender)
             replies = self._bus.ask(key, encode(request), 2.0 * ANSWERED)
             taken = [reply for reply in replies if not reply.error]
@@ -388,7 +407,7 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
                 raise Refused(replies[0].error.removeprefix("refused: "))
             if not taken:
                 nodes = tuple(node for word in via if (node := _node(word, "via point")) is not None)
-                report = self._direct(robot, kind, _node(goal), goal, nodes)
+                report = self._direct(robot, kind, _node(goal), goal, nodes, because)
                 break
             report = decode(taken[0].payload, MissionReport)
             if report.state is not MissionState.REPLACED:
@@ -398,11 +417,18 @@ class Fleet(FleetMap, FleetConstraints, FleetAnnotations, FleetPlans):
         return self.wait(report, wait) if wait > 0.0 else report
 
     def _direct(
-        self, robot: str, kind: MissionKind, node: NodeId | None, goal: str, via: tuple[NodeId, ...] = ()
+        self,
+        robot: str,
+        kind: MissionKind,
+        node: NodeId | None,
+        goal: str,
+        via: tuple[NodeId, ...] = (),
+        because: str = "",
     ) -> MissionReport:
         after_ns = 0
         for _ in range(TRIES):
-            order = replace(MissionOrder.new(robot, kind, self._by, node, after_ns), goal=goal, via=via)
+            order = MissionOrder.new(robot, kind, self._by, node, after_ns)
+            order = replace(order, goal=goal, via=via, because=because)
             report = send_order(self._bus, self._keys, order, ANSWERED, self._sender)
             if report.state is not MissionState.REPLACED:
                 break

@@ -174,7 +174,14 @@ class ReadOnlyServer:
         return Missions()
 
     def give(
-        self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str, via: tuple[str, ...]
+        self,
+        robot: str,
+        kind: MissionKind,
+        goal: str,
+        by: str,
+        mission_id: str,
+        via: tuple[str, ...],
+        because: str = "",
     ) -> MissionReport:
         """Refuse a mission.
 

@@ -82,8 +82,7 @@ def _allowed(keys: Keys, name: str, role: Role) -> list[_Rule]:
     ]
     questions += [keys.agent_statuses(), f"{keys.root}/server/*/ack/*"]
     if role is Role.OPERATOR:
-        questions += [sent_by(f"{keys.root}/agent/*/{what}", name) for what in ("mission", "portal")]
-        questions.append(f"{keys.root}/agent/*/drive")
+        questions += [sent_by(f"{keys.root}/agent/*/{what}", name) for what in ("mission", "portal", "drive")]
     reads = [
         keys.agent_statuses(), keys.server_statuses(), keys.agents_alive(), keys.servers_alive(),
         f"{keys.root}/server/*/poses/*",
@@ -100,8 +99,8 @@ def _robot(keys: Keys, name: str) -> list[_Rule]:
         ("ingress", ("declare_queryable",), [f"{agent}/**"]),
         *_writes([f"{agent}/change/*", f"{agent}/head/*", f"{agent}/alive/*", f"{base}/driver/*",
                   f"{agent}/log/*", f"{agent}/status", f"{agent}/mission", f"{agent}/mission/*",
-                  f"{agent}/portal", f"{agent}/portal/*", f"{agent}/drive", f"{agent}/view",
-                  f"{base}/describe", f"{base}/step"]),
+                  f"{agent}/portal", f"{agent}/portal/*", f"{agent}/drive", f"{agent}/drive/*",
+                  f"{agent}/view", f"{base}/describe", f"{base}/step"]),
         # A publisher hears who listens to its key, under any pattern. If it hears of none it sends nothing.
         ("egress", ("declare_subscriber",), ["**"]),
         *_reads([*addressed, keys.servers_alive(), f"{base}/driver/*", f"{agent}/alive/*"]),

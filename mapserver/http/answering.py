@@ -29,7 +29,14 @@ class Answering(Annotating, Planning, Showing, Shown, Protocol):
         """The missions that are known."""
 
     def give(
-        self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str, via: tuple[str, ...]
+        self,
+        robot: str,
+        kind: MissionKind,
+        goal: str,
+        by: str,
+        mission_id: str,
+        via: tuple[str, ...],
+        because: str = "",
     ) -> MissionReport:
         """Give a robot a mission; waits for its answer."""
 

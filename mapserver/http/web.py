@@ -55,7 +55,7 @@ from mapweave.hybridmap.explanation import PairExplanation, route_over
 from mapweave.hybridmap.floor_plan import PlacedPlan
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.map_event import History
-from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
+from mapweave.hybridmap.mission_order import MAX_BECAUSE, MissionKind, MissionReport, Missions
 from mapweave.identities.logins import Logins
 from mapweave.mapserver.http.annotations import annotate, annotations_json
 from mapweave.mapserver.http.answering import Answering
@@ -93,7 +93,7 @@ METHODS = {
 }
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 """Of the text format of Prometheus."""
-GIVEN = "goal", "via", "by", "id", "plan"
+GIVEN = "goal", "via", "by", "id", "plan", "because"
 """What may be said of a mission behind the `?`."""
 BY = "http"
 """Gives a mission, if the request does not say."""
@@ -331,24 +331,27 @@ class Questions:
         if len(query.getlist("goal")) > 1:
             raise InvalidValue("goal is given twice: `via` names places on the way")
         goal, by, mission_id = query.get("goal", "").strip(), _author(request), query.get("id", "")
+        because = _because(request) if kind == MissionKind.STOP else query.get("because", "").strip()
 
         def give() -> MissionReport:
             words = [goal, *query.getlist("via")]
             if kind == MissionKind.GO and (plan := self._plan(query.get("plan"))) is not None:
                 component = component_of(robot, self._server.robots())
                 words = [goal_on_plan(word, plan, component, self._server.resolve) for word in words]
-            return self._server.give(robot, MissionKind(kind), words[0], by, mission_id, tuple(words[1:]))
+            return self._server.give(
+                robot, MissionKind(kind), words[0], by, mission_id, tuple(words[1:]), because
+            )
 
         return json_values(await run_in_threadpool(give))
 
     async def _stop(self, request: Request) -> Mapping[str, Any]:
-        by = _author(request)
+        by, because = _author(request), _because(request)
 
         def stop() -> Mapping[str, Any]:
             names = [entry.robot for entry in self._server.robots().robots if entry.alive]
 
             def one(name: str) -> MissionReport:
-                return self._server.give(name, MissionKind.STOP, "", by, "", ())
+                return self._server.give(name, MissionKind.STOP, "", by, "", (), because)
 
             return json_values(Missions(tuple(each_robot(names, one))))
 
@@ -414,6 +417,12 @@ def _asker(request: Request) -> str:
 def _author(request: Request) -> str:
     """Who gives a mission: the person who has logged in, without keys the one that the request names."""
     return request.scope[PERSON].name or request.query_params.get("by", BY)
+
+
+def _because(request: Request) -> str:
+    """Why a robot is stopped; cut where it is too long, since a stop stops whatever is said with it."""
+    words = request.query_params.get("because", "").strip()
+    return "".join(c if c.isprintable() else " " for c in words)[:MAX_BECAUSE]
 
 
 async def _no_such(request: Request, error: Exception) -> Response:

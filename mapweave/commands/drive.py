@@ -9,7 +9,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.network import add_network, key_holder, network_of, reach, settings_of, stop_on_signals
+from mapweave.commands.network import (
+    add_author,
+    add_network,
+    key_holder,
+    network_of,
+    reach,
+    settings_of,
+    stop_on_signals,
+)
 
 if TYPE_CHECKING:
     import threading
@@ -41,6 +49,7 @@ def add_to(commands: Any) -> None:
         "--speed", type=float, default=0.5, metavar="SHARE",
         help="share of the robot's speed limits, 0.1 to 1 (default: 0.5)",
     )  # fmt: skip
+    add_author(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 
@@ -48,6 +57,7 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Drive until the person quits."""
     from mapweave.commands.usage import UsageError
+    from mapweave.fleet import author
     from mapweave.fleet_questions import check_role
     from mapweave.hybridmap.errors import Refused
     from mapweave.teleoperation.gamepad import Gamepad
@@ -58,13 +68,15 @@ def run(arguments: argparse.Namespace) -> int:
     if not 0.1 <= arguments.speed <= 1.0:
         raise UsageError(f"--speed: {arguments.speed:g} is not within 0.1 to 1")
     network = network_of(arguments, settings_of(arguments))
-    check_role(key_holder(network))
+    holder = key_holder(network)
+    check_role(holder)
+    by = author(holder, arguments.by)
     gamepad = None if arguments.gamepad is None else Gamepad(arguments.gamepad, arguments.speed)
     terminal = RawTerminal() if gamepad is None else None
     stop = stop_on_signals()
     bus, keys = reach(network)
     try:
-        with Session(bus, keys, name) as session:
+        with Session(bus, keys, name, by, "" if holder is None else holder.name) as session:
             if gamepad is not None:
                 _by_gamepad(session, name, gamepad, stop)
             elif terminal is not None:

@@ -21,9 +21,9 @@ def add_to(actions: Any) -> None:
         help="joins, splits and manual constraints, with dates",
         description="List the history of the maps that a running server keeps, oldest first: which became "
         "one, which came apart and what took their links away, which are kept apart since two robots cannot "
-        "have been where their links put them, and constraints. The server keeps the newest 500 on its "
-        "disk, and every constraint; a map file (--map) has the history until it was "
-        "written.",
+        "have been where their links put them; constraints, annotations, and who has sent, stopped or driven "
+        "which robot. The server keeps the newest 500 on its disk, the newest 1000 commands, and every "
+        "constraint and annotation; a map file (--map) has the history until it was written, no commands.",
     )
     parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     parser.add_argument("--most", type=int, default=40, metavar="N", help="the newest so many (default: 40)")
@@ -47,7 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     left_out = len(listed) - arguments.most
     lines = [f"({left_out} older ones: --most)"] if left_out > 0 else []
     lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:11}  {h.words}" for h in listed[-arguments.most :]]
-    print("\n".join(lines) if lines else "no joins, splits, manual constraints or annotations yet")
+    print("\n".join(lines) if lines else "no joins, splits, manual constraints, annotations or commands yet")
     return 0
 
 

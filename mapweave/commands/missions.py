@@ -8,7 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.network import add_author, add_network, network_of, settings_of
+from mapweave.commands.network import add_network, add_reason, network_of, settings_of
 from mapweave.commands.usage import UsageError
 from mapweave.exit_status import DONE, NO
 
@@ -50,7 +50,14 @@ def add_to(commands: Any) -> None:
     _add_common(go, 600.0)
     go.set_defaults(
         run=lambda arguments: run(
-            arguments, lambda f: f.go(arguments.robot, arguments.goal, via=arguments.via, plan=arguments.plan)
+            arguments,
+            lambda f: f.go(
+                arguments.robot,
+                arguments.goal,
+                via=arguments.via,
+                plan=arguments.plan,
+                because=arguments.because,
+            ),
         )
     )
 
@@ -61,7 +68,9 @@ def add_to(commands: Any) -> None:
     )
     explore.add_argument("robot", type=values.name, help="the robot's name, for example r0")
     _add_common(explore, 3600.0)
-    explore.set_defaults(run=lambda arguments: run(arguments, lambda f: f.explore(arguments.robot)))
+    explore.set_defaults(
+        run=lambda arguments: run(arguments, lambda f: f.explore(arguments.robot, because=arguments.because))
+    )
 
     stop: argparse.ArgumentParser = commands.add_parser(
         "stop",
@@ -95,7 +104,7 @@ def _add_common(parser: argparse.ArgumentParser, patience: float | None) -> None
             "--timeout", type=values.seconds, default=patience, metavar="S",
             help=f"with --wait: at most so long (default: {patience:g})",
         )  # fmt: skip
-    add_author(parser)
+    add_reason(parser)
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(parser)
 
@@ -127,7 +136,7 @@ def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -
 def run_stop(arguments: argparse.Namespace) -> int:
     """Stop robots."""
     with fleet_of(arguments) as fleet:
-        reports = list(fleet.stop(arguments.robot or ""))
+        reports = list(fleet.stop(arguments.robot or "", arguments.because))
     if not reports and not arguments.json:
         print("no robot is there")
     _print(reports, arguments.json)

@@ -16,6 +16,7 @@ from mapweave.hybridmap.errors import DeviceError, MapweaveError
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.senders import sent_by
 
 PERIOD = 0.1
 """Between two commands at the most, s."""
@@ -32,13 +33,15 @@ class Session:
         refused: why the agent takes no commands; empty if it does.
     """
 
-    def __init__(self, bus: Bus, keys: Keys, name: str) -> None:
+    def __init__(self, bus: Bus, keys: Keys, name: str, by: str = "", sender: str = "") -> None:
         """Take the wheels.
 
         Args:
             bus: connected.
             keys: of the fleet.
             name: of the agent.
+            by: who drives, for the history.
+            sender: holder of the key with which the bus is connected; empty without one.
 
         Raises:
             DeviceError: no such agent answers, or it refuses.
@@ -46,7 +49,8 @@ class Session:
         self.answer: DriveAnswer | None = None
         self.answered = 0.0
         self.refused = ""
-        self._bus, self._keys, self._name = bus, keys, name
+        self._bus, self._keys, self._name, self._by = bus, keys, name, by[:64]
+        self._key = sent_by(keys.drive(name), sender)
         self._number = secrets.randbits(52)
         self._shares = (0.0, 0.0)
         self._changed = threading.Event()
@@ -98,8 +102,8 @@ class Session:
     def _send(self, timeout: float, release: bool = False) -> None:
         answer_ns = 0 if self.answer is None else self.answer.answer_ns
         command = Command() if release else self.command
-        request = DriveRequest(self._number, command.forward, command.turn, answer_ns, release)
-        for reply in self._bus.ask(self._keys.drive(self._name), encode(request), timeout):
+        request = DriveRequest(self._number, command.forward, command.turn, answer_ns, release, self._by)
+        for reply in self._bus.ask(self._key, encode(request), timeout):
             if reply.error:
                 self.refused = reply.error
                 return

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import msgpack
 import pytest
@@ -14,6 +15,7 @@ from mapweave.agent.mission import Driven
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Command
 from mapweave.agent.teleoperation import Teleoperation
+from mapweave.hybridmap.agent_status import HandDrive
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.ids import MapId
@@ -21,6 +23,7 @@ from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode
+from mapweave.wire.senders import sent_by
 
 SPEED = st.floats(-1000.0, 1000.0)
 KEYS = Keys("hand")
@@ -123,6 +126,27 @@ def test_the_fleet_client_answers_with_its_status_and_a_mission_ends_the_wait(cl
         assert link.driven() == Driven(Command(), pytest.approx(3.0))
         person.ask(KEYS.mission("r0"), encode(MissionOrder.new("r0", MissionKind.STOP, "a test")), 5.0)
         assert link.driven() is None
+    finally:
+        link.close()
+        person.close()
+        bus.close()
+
+
+def test_who_drives_is_in_the_status(clock: Clock) -> None:
+    """The name in the key holds, and a drive that has ended is still there."""
+    hub = MemoryHub()
+    bus, person = MemoryBus(hub), MemoryBus(hub)
+    robot = Teleoperation(clock, time_ns=lambda: 7)
+    link = FleetClient(bus, KEYS, MapId("r0", 3), MissionControl("r0"), teleoperation=robot)
+    try:
+        assert link.status().drive is None
+        request, key = DriveRequest(7, by="eve"), KEYS.drive("r0")
+        (reply,) = person.ask(sent_by(key, "anna"), encode(request), 5.0)
+        assert link.status().drive == HandDrive("anna", 7) == decode(reply.payload, DriveAnswer).report.drive
+        person.ask(sent_by(key, "anna"), encode(replace(request, release=True)), 5.0)
+        assert link.status().drive == HandDrive("anna", 7, over=True)
+        person.ask(key, encode(replace(request, session=8)), 5.0)
+        assert link.status().drive == HandDrive("eve", 7)
     finally:
         link.close()
         person.close()

@@ -82,7 +82,14 @@ class StubServices:
         return self.said
 
     def give(
-        self, robot: str, kind: MissionKind, goal: str, by: str, mission_id: str, via: tuple[str, ...]
+        self,
+        robot: str,
+        kind: MissionKind,
+        goal: str,
+        by: str,
+        mission_id: str,
+        via: tuple[str, ...],
+        because: str = "",
     ) -> MissionReport:
         self.ways.append((goal, via))
         raise InvalidValue(f"{robot} stays where it is")

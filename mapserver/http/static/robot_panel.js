@@ -50,12 +50,16 @@ export function showRobot(name, whyNot, goal) {
   input.setAttribute("aria-label", `Where to send ${name}`);
   via.id = "via"; via.placeholder = "by way of, in order";
   via.setAttribute("aria-label", `Places that ${name} must pass before, in order`);
+  const why = add(form, "input");
+  why.id = "mission-because"; why.placeholder = "why, for the history";
+  why.setAttribute("aria-label", `Why ${name} is sent or stopped, for the history`);
   add(form, "button", "Send");
   const actions = add(box, "div", "", "actions"), words = add(box, "p");
   words.setAttribute("role", "status");
   const give = async path => {
     words.className = ""; words.textContent = "Asking ...";
-    const answer = await ask(`robots/${encodeURIComponent(name)}/${path}`, { method: "POST" });
+    const said = why.value.trim() ? "&" + new URLSearchParams([["because", why.value.trim()]]) : "";
+    const answer = await ask(`robots/${encodeURIComponent(name)}/${path}${said}`, { method: "POST" });
     words.className = answer.error ? "bad" : "good";
     words.textContent = answer.error || answer.said || missionWords(answer);
   };
