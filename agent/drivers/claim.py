@@ -1,4 +1,4 @@
-"""One agent per robot: a second agent of the same name is refused before it moves the robot."""
+"""One agent per robot: a second agent of the same name, or at the same topic, moves nothing."""
 
 from __future__ import annotations
 
@@ -6,17 +6,33 @@ import secrets
 import threading
 import time
 from collections.abc import Callable
+from typing import Protocol
 
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.wire.bus import Bus
 from mapweave.wire.bus_settings import AGENT_LEASE
-from mapweave.wire.keys import Keys
 
 LEAVING = 4.0
 """s; an agent whose process has ended has left the network by then. One that hangs, or has lost the network,
 leaves after `AGENT_LEASE`."""
 SETTLING = 0.5
 """s; liveliness of an agent that starts at the same time arrives within this time."""
+
+
+class ClaimKeys(Protocol):
+    """Keys of those who drive a robot: those of a fleet, or `mapweave.wire.ros2.keys.CommandKeys`."""
+
+    def robot_drivers_of(self, robot: str) -> str:
+        """Pattern: all who drive the robot."""
+        ...
+
+    def robot_driver(self, robot: str, number: int) -> str:
+        """Liveliness of the one with this number."""
+        ...
+
+    def parse_robot_driver(self, key: str) -> tuple[str, int]:
+        """Which robot, and the number of who drives it."""
+        ...
 
 
 class Claim:
@@ -26,7 +42,9 @@ class Claim:
         number: random; part of the agent's liveliness key.
     """
 
-    def __init__(self, bus: Bus, keys: Keys, robot: str, leaving: float = LEAVING) -> None:
+    def __init__(
+        self, bus: Bus, keys: ClaimKeys, robot: str, leaving: float = LEAVING, refusal: str = ""
+    ) -> None:
         """Claim the robot.
 
         The agent checks for other claims and then announces its own. Two agents that start at the same time
@@ -35,9 +53,10 @@ class Claim:
 
         Args:
             bus: bus of the robot base, connected if a router is there.
-            keys: keys of the fleet.
-            robot: name of the robot.
+            keys: keys of the fleet, or of a topic.
+            robot: name of the robot, or of the topic that drives it.
             leaving: how long to wait for the end of another claim, whose agent may be dead, s.
+            refusal: what to say to a second agent; by default that of a fleet.
 
         Raises:
             DeviceError: another agent drives the robot.
@@ -46,7 +65,10 @@ class Claim:
         self._others: set[int] = set()
         self._changed = threading.Condition()
         self._keys = keys
-        self._robot = robot
+        self._refused = refusal or (
+            f"another agent drives {robot}; stop it, or give this robot another name. "
+            f"One that hangs, or has lost the network, is gone after {AGENT_LEASE:g} s"
+        )
         self._watch = bus.watch(keys.robot_drivers_of(robot), self._presence)
         try:
             if not self._wait(lambda: not self._others, leaving):
@@ -79,7 +101,4 @@ class Claim:
             return self._changed.wait_for(free, patience)
 
     def _refusal(self) -> DeviceError:
-        return DeviceError(
-            f"another agent drives {self._robot}; stop it, or give this robot another name. "
-            f"One that hangs, or has lost the network, is gone after {AGENT_LEASE:g} s"
-        )
+        return DeviceError(self._refused)

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.drivers import ros2_odometry, ros2_ranges
 from mapweave.agent.drivers.base import BaseReading, Wheels
+from mapweave.agent.drivers.claim import Claim
 from mapweave.agent.drivers.clock import RemoteClock, now_ns
 from mapweave.agent.drivers.ros2_guard import Ros2Guard
 from mapweave.agent.drivers.ros2_odometry import WheelOdometry
@@ -32,7 +33,8 @@ from mapweave.agent.ros_messages.values import (
     camera_of,
 )
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, SettingsError
-from mapweave.wire.ros2.keys import Endpoint, Role
+from mapweave.wire.bus_settings import LEASE
+from mapweave.wire.ros2.keys import CommandKeys, Endpoint, Role
 from mapweave.wire.ros2.messages import encode, make
 from mapweave.wire.ros2.node import Publisher, Ros2Node
 from mapweave.wire.ros2.settings import Ros2Link
@@ -125,6 +127,9 @@ class Ros2Base:
         topic = node.link.topic(options.command)
         self._twist, self._stamped = (node.publisher(topic, kind) for kind in (TWIST_TYPE, STAMPED_TYPE))
         self._subscribed: list[Publisher] = []
+        self._command = topic
+        node.watch(Role.PUBLISHER, topic, self._command_source)
+        self._claim: Claim | None = None
         self._guard: Ros2Guard | None = None
         self._unheard = False
 
@@ -132,19 +137,30 @@ class Ros2Base:
         """Wait for a first message of each topic.
 
         Raises:
-            DeviceError: something is missing or wrong; one line says what and where.
+            DeviceError: something is missing or wrong, or another agent drives the robot; one line says
+                what and where.
         """
+        self._take_odometry(time.monotonic() + PATIENCE)
+        if self._claim is None:
+            # Tried again as long as the robot is waited for: an agent that is dead may still be announced.
+            self._claim = Claim(
+                self._node.bus, CommandKeys(self._node.link), self._command, 0.0,
+                f"another agent drives the robot by {self._command}; stop it, or give this robot another "
+                f"namespace. One that hangs, or has lost the network, is gone after {LEASE:g} s",
+            )  # fmt: skip
         end = time.monotonic() + PATIENCE
-        self._take_odometry(end)
         self._check_images(end)
         if self._ranges and not self._rangers:
             self.geometry = self._with_rangers(end)
         self._guard = Ros2Guard(self._options.endpoint, self._stops())
 
     def close(self) -> None:
-        """Stop the wheels, by the guard as well. The node stays: it connects again by itself."""
-        self.publish(Command())
+        """Stop the wheels, by the guard as well. The node stays: it connects again by itself.
+
+        Without a guard nothing has been driven, and another agent may drive.
+        """
         if self._guard is not None:
+            self.publish(Command())
             self._guard.close()
             self._guard = None
 
@@ -220,6 +236,14 @@ class Ros2Base:
                 self._odometry.name,
                 len(self._sources),
             )
+
+    def _command_source(self, endpoint: Endpoint, token: str, alive: bool) -> None:
+        """Another publisher of commands comes or goes, which may be of use, as to drive by hand."""
+        if alive and endpoint.kind in (TWIST_TYPE, STAMPED_TYPE) and f"/{NODE}/" not in token:
+            log.warning(
+                "%s has another publisher, which drives the robot, too: let it drive only while this agent "
+                "does not", endpoint.topic,
+            )  # fmt: skip
 
     def _check_images(self, end: float) -> None:
         """Find out what camera it is, and whether the images are its."""

@@ -18,6 +18,7 @@ import re
 from dataclasses import dataclass
 from enum import StrEnum
 
+from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.wire.ros2.settings import NAME, Ros2Link
 
 ADMIN = "@ros2_lv"
@@ -62,6 +63,36 @@ def ros_type(dds: str) -> str:
     """The inverse of `dds_type`; empty if it is no message."""
     found = DDS_TYPE.fullmatch(dds)
     return f"{found[1]}/msg/{found[2]}" if found else ""
+
+
+class CommandKeys:
+    """Tokens of the agents that drive a robot by a topic, beside those of ROS, which the bridge lacks.
+
+    `mapweave_driver/<domain, or bridge>/<topic>/<number>`.
+    """
+
+    def __init__(self, link: Ros2Link) -> None:
+        """Take the domain."""
+        self._root = f"mapweave_driver/{'bridge' if link.bridge else link.domain_id()}"
+
+    def robot_drivers_of(self, topic: str) -> str:
+        """Pattern: all agents that drive by a topic."""
+        return f"{self._root}/{topic.strip('/')}/*"
+
+    def robot_driver(self, topic: str, number: int) -> str:
+        """Liveliness of one of them."""
+        return f"{self._root}/{topic.strip('/')}/{number}"
+
+    def parse_robot_driver(self, key: str) -> tuple[str, int]:
+        """By which topic, and the number of who drives.
+
+        Raises:
+            InvalidMessage: it is no such key.
+        """
+        topic, _, number = key.removeprefix(f"{self._root}/").rpartition("/")
+        if not (number.isascii() and number.isdigit()):
+            raise InvalidMessage(f"{key}: is no agent that drives")
+        return f"/{topic}", int(number)
 
 
 class RmwZenohKeys:

@@ -69,6 +69,11 @@ class Ros2Node:
             self._bus.declare(Token(self._bus.owner, token))
         self.watch(Role.PUBLISHER, None, self._publisher)
 
+    @property
+    def bus(self) -> ZenohBus:
+        """Its session, for keys that are not those of ROS."""
+        return self._bus
+
     def connected(self) -> bool:
         """Whether the router is in reach."""
         return self._bus.connected()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import math
 import re
+import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -31,6 +32,7 @@ from tests.quick import first_quick
 from tests.ros2_peer import RosPeer
 
 Start = Callable[..., CheckedRobot]
+KINDS_OF_COMMANDS = "geometry_msgs/msg/Twist"
 
 
 def options_of(emulator: Ros2Robot, **options: Any) -> dict[str, Any]:
@@ -327,3 +329,58 @@ def test_that_no_node_listens_is_said_once(start: Start, caplog: pytest.LogCaptu
         drive_until(robot, Command(0.1, 0.0), lambda: bool(caplog.records))
         drive(robot, Command(0.1, 0.0), 0.1)
     assert [r.message for r in caplog.records] == ["no node subscribes to drive: the robot does not move"]
+
+
+@pytest.mark.parametrize("bridge", first_quick([None, "/bot1"], 1))
+def test_a_second_agent_of_one_robot_is_refused_and_says_nothing_to_the_wheels(
+    start: Start, bridge: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Agents of two names drove one robot, each against the other."""
+    emulator = Ros2Robot(bridge=bridge)
+    first = start(emulator)
+    first.describe()
+    drive_until(first, Command(0.1, 0.0), lambda: emulator.wheels.way()[0] > 0.03)
+    monkeypatch.setattr("mapweave.agent.drivers.wheeled.PATIENCE", 2.0)
+    heard = RosPeer(emulator.endpoint, bridge=bridge)
+    commands = heard.subscriber("/cmd_vel", KINDS_OF_COMMANDS)
+    try:
+        drive_until(first, Command(0.1, 0.0), lambda: len(commands) > 0)
+        refused, said = threading.Event(), list[str]()
+
+        def begin() -> None:
+            second = start(emulator)
+            try:
+                second.describe()
+            except DeviceError as error:
+                said.append(str(error))
+            second.close()
+            refused.set()
+
+        threading.Thread(target=begin, daemon=True).start()
+        drive_until(first, Command(0.1, 0.0), refused.is_set)
+        drive(first, Command(0.1, 0.0), 0.3)
+        assert said and said[0].startswith(
+            f"another agent drives the robot by {bridge or ''}/cmd_vel; stop it"
+        )
+        forward = [peer.Reader(data).several("d", 6)[0] for data in commands]
+        assert min(forward) > 0.09, "the second has not stopped the wheels of the first"
+    finally:
+        heard.close()
+    first.close()
+    third = start(emulator)
+    assert third.describe().camera.width == WIDTH, "the first has left"
+
+
+def test_others_who_publish_commands_are_named(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+    """A person's teleoperation, or Nav2: no reason to refuse."""
+    emulator = Ros2Robot()
+    robot = start(emulator)
+    robot.describe()
+    assert "another publisher" not in caplog.text
+    other = RosPeer(emulator.endpoint)
+    try:
+        other.publisher("/cmd_vel", KINDS_OF_COMMANDS)
+        until(lambda: "/cmd_vel has another publisher, which drives the robot, too" in caplog.text, 10.0)
+        assert robot.sense() is not None
+    finally:
+        other.close()
