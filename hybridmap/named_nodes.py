@@ -21,6 +21,21 @@ Record = Callable[[], Annotations]
 """Returns the annotations of the same map."""
 
 
+def asked_of(words: ResolveRequest | str | Iterable[str]) -> ResolveRequest:
+    """A question for nodes: one word, several, or the question itself.
+
+    Raises:
+        InvalidValue: it is none of these.
+    """
+    if isinstance(words, ResolveRequest):
+        return words
+    if not isinstance(words, str | list | tuple) or not all(isinstance(word, str) for word in words):
+        raise InvalidValue(
+            f"{words!r:.40}: give a node (r0.1.17), the name of a place, or a position, as text"
+        )
+    return ResolveRequest((words,) if isinstance(words, str) else tuple(words))
+
+
 def ids_of(words: Iterable[str], resolve: Resolve) -> list[str]:
     """An id for each word: nodes (`r0.1.17`) and maps (`r0.1`) as they are, active nodes for all else.
 

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any
 
+from mapweave.annotation_methods import AnnotationMethods
 from mapweave.fleet_questions import FleetQuestions
 from mapweave.hybridmap.annotation import AnnotationRequest, Annotations
+from mapweave.hybridmap.named_nodes import asked_of
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.refusals import refusals
@@ -19,11 +21,13 @@ ANSWER = 10.0
 """A server that merges answers questions about its map late, s."""
 
 
-class FleetAnnotations(FleetQuestions):
+class FleetAnnotations(FleetQuestions, AnnotationMethods):
     """The part of `mapweave.fleet.Fleet` by which people say what is not on the map."""
 
     def annotate(self, kind: str, name: str, because: str = "", *, check: bool = False, **fields: Any) -> str:
         """Say something about the map, for example `fleet.annotate("place", "kitchen", node="r0.1.17")`.
+
+        Each kind has a typed method: `place`, `close_way`, `prefer`, `floor`, `portal`, `plan`, `pin`.
 
         Args:
             kind: of the annotation: place, closure, preference, floor, portal, plan, pin.
@@ -55,14 +59,16 @@ class FleetAnnotations(FleetQuestions):
         """
         return decode(self._question(self._keys.any_annotations(), b"", ANSWER), Annotations)
 
-    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+    def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
         """Nodes for words: names of places, and positions in the merged map.
 
         Raises:
+            InvalidValue: it is no text.
             Refused: a word is none, with the reason.
             NotConnected: no map server answers.
         """
-        return decode(self._question(self._keys.any_resolve(), encode(request), ANSWER), ResolveAnswer)
+        payload = encode(asked_of(request))
+        return decode(self._question(self._keys.any_resolve(), payload, ANSWER), ResolveAnswer)
 
     def _annotate(
         self, name: str, fields: Mapping[str, Any], removed: bool, because: str, check: bool

@@ -36,7 +36,7 @@ from mapweave.hybridmap.explanation import (
 )
 from mapweave.hybridmap.floor_plan import PlacedPlans
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.named_nodes import ids_of
+from mapweave.hybridmap.named_nodes import asked_of, ids_of
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
@@ -84,10 +84,11 @@ class Map(ABC):
         """What people say about the map: named places, closures, preferences."""
 
     @abstractmethod
-    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+    def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
         """Nodes for words: names of places, and positions in the merged map.
 
         Raises:
+            InvalidValue: it is no text.
             Refused: a word is none, with the reason.
         """
 
@@ -374,13 +375,14 @@ class FileMap(Map):
 
         return placed_plans(self.annotations(), self._router().merged)
 
-    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+    def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
         """Nodes for words; see Map."""
+        asked = asked_of(request)
         router = self._router()
         from mapweave.mapserver.places import Places
 
         with refusals():
-            return Places(router, router.annotations).answer(request)
+            return Places(router, router.annotations).answer(asked)
 
     def _router(self) -> Router:
         """Of the ways that are open now."""

@@ -3,16 +3,18 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from mapweave.annotation_methods import AnnotationMethods
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage
 from mapweave.hybridmap.manual_constraint import ManualConstraints
+from mapweave.hybridmap.named_nodes import asked_of
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_effects import effects_of
@@ -29,7 +31,7 @@ from mapweave.storage.atomic_file import check_place
 from mapweave.storage.plan_image import check_plan_png
 
 
-class OfflineAnnotations:
+class OfflineAnnotations(AnnotationMethods):
     """The annotations of one map. Map files are written; a store is only read, since it is its server's."""
 
     def __init__(
@@ -73,14 +75,16 @@ class OfflineAnnotations:
         """What people say about the map."""
         return self._made
 
-    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+    def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
         """Nodes for words.
 
         Raises:
+            InvalidValue: it is no text.
             Refused: a word is none, with the reason.
         """
+        asked = asked_of(request)
         with refusals():
-            return Places(self._router, self.annotations()).answer(request)
+            return Places(self._router, self.annotations()).answer(asked)
 
     def plans(self) -> PlacedPlans:
         """Floor plans under the map."""

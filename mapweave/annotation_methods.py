@@ -1,0 +1,206 @@
+"""What people say about a map, one typed method for each kind; the same for a fleet and for a file."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from typing import Any, Literal
+
+from mapweave.hybridmap.floor_plan import PlanImage
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.named_nodes import ids_of
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.wire.typed import packed
+
+NodeWord = NodeId | str
+"""A node, also as people write it: `r0.1.17`, the name of a place, a position `3.1,-2.0`."""
+Corners = Sequence[tuple[float, float]]
+"""Of an area, in order around it, m, in the merged map."""
+Time = str | int
+"""ns since 1970, or text such as `2026-03-01 14:00`, in UTC unless it names a zone."""
+
+
+class AnnotationMethods(ABC):
+    """Each says something and returns it in words; with `check` nothing is kept, and the words say what it
+    would do. Each raises Refused with the reason, and what `annotate` raises.
+    """
+
+    @abstractmethod
+    def annotate(self, kind: str, name: str, because: str = "", *, check: bool = False, **fields: Any) -> str:
+        """Say something of any kind."""
+
+    @abstractmethod
+    def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
+        """Nodes for words."""
+
+    def place(
+        self,
+        name: str,
+        node: NodeWord = "",
+        *,
+        radius: float | None = None,
+        corners: Corners | None = None,
+        near: str = "",
+        because: str = "",
+        check: bool = False,
+    ) -> str:
+        """Name a node, the floor within a radius of it, m, or the floor within corners.
+
+        Args:
+            name: of the place; the same name again: the later one holds.
+            node: where it is; none with corners.
+            radius: of the floor around it, m.
+            corners: of an area.
+            near: in the part of the map where this node or place is; the largest part without.
+            because: why.
+            check: only say what it would do.
+        """
+        fields = _given(node=_word(node), radius=radius, corners=corners, near=near)
+        return self.annotate("place", name, because, check=check, **fields)
+
+    def close_way(
+        self,
+        name: str,
+        *,
+        edge: tuple[NodeWord, NodeWord] | None = None,
+        place: str = "",
+        node: NodeWord = "",
+        radius: float | None = None,
+        corners: Corners | None = None,
+        near: str = "",
+        begin: Time | None = None,
+        end: Time | None = None,
+        because: str = "",
+        check: bool = False,
+    ) -> str:
+        """Close an edge or an area to robots; give one of edge, place, node with radius, and corners.
+
+        Args:
+            name: of the closure.
+            edge: its two nodes.
+            place: a named place.
+            node: amid the floor that is closed.
+            radius: of the floor around it, or around the place, m.
+            corners: of an area.
+            near: see `place`.
+            begin: from when on; from now on without.
+            end: until when; until it is withdrawn without.
+            because: why.
+            check: only say what it would do.
+        """
+        where = _where(edge, place, node, radius, corners, near)
+        fields = {**where, **_given(begin_ns=begin, end_ns=end)}
+        return self.annotate("closure", name, because, check=check, **fields)
+
+    def prefer(
+        self,
+        name: str,
+        factor: float,
+        *,
+        edge: tuple[NodeWord, NodeWord] | None = None,
+        place: str = "",
+        node: NodeWord = "",
+        radius: float | None = None,
+        corners: Corners | None = None,
+        near: str = "",
+        because: str = "",
+        check: bool = False,
+    ) -> str:
+        """Let robots prefer ways, or avoid them where they can; which ways, see `close_way`.
+
+        Args:
+            name: of the preference.
+            factor: by which their cost is multiplied: 0.1 to 1 prefers, 1 to 100 avoids.
+            edge: see `close_way`; likewise place, node, radius, corners, near.
+            place: see there.
+            node: see there.
+            radius: see there, m.
+            corners: see there.
+            near: see there.
+            because: why.
+            check: only say what it would do.
+        """
+        fields = {**_where(edge, place, node, radius, corners, near), "factor": factor}
+        return self.annotate("preference", name, because, check=check, **fields)
+
+    def floor(self, node: NodeWord, label: str, *, because: str = "", check: bool = False) -> str:
+        """Label the map of a node with its floor; a label that parts maps needs a reason."""
+        (own,) = ids_of([_word(node)], self.resolve)
+        name = str(NodeId.parse(own).map)
+        return self.annotate("floor", name, because, check=check, node=own, label=label)
+
+    def portal(
+        self,
+        name: str,
+        a: NodeWord,
+        b: NodeWord,
+        means: Literal["lift", "ramp", "door"],
+        note: str = "",
+        *,
+        because: str = "",
+        check: bool = False,
+    ) -> str:
+        """Add a lift, a ramp or a door between two nodes; the note is for who takes robots through."""
+        fields = {"a": _word(a), "b": _word(b), "means": str(means), "note": note}
+        return self.annotate("portal", name, because, check=check, **fields)
+
+    def plan(
+        self,
+        name: str,
+        image: PlanImage,
+        pairs: Iterable[tuple[NodeWord, float, float]],
+        *,
+        metres_per_pixel: float | None = None,
+        origin: Pose2 | None = None,
+        near: str = "",
+        because: str = "",
+        check: bool = False,
+    ) -> str:
+        """Lay a floor plan under the map.
+
+        Args:
+            name: of the plan.
+            image: as `put_plan_image` returns it.
+            pairs: three or more: a place, and its pixel in the image, right and down, px.
+            metres_per_pixel: of the image; the pairs say it without.
+            origin: pose of the lower left corner of the image in the frame of the plan.
+            near: in the part of the map where this node or place is; the largest part without.
+            because: why.
+            check: only say what it would do.
+        """
+        clicked = [{"at": _word(at), "u": u, "v": v} for at, u, v in pairs]
+        given = _given(metres_per_pixel=metres_per_pixel, near=near)
+        if origin is not None:
+            given["origin"] = packed(origin)
+        fields = {"pairs": clicked, "image": packed(image), **given}
+        return self.annotate("plan", name, because, check=check, **fields)
+
+    def pin(
+        self, node: NodeWord, pose: Pose2 | None = None, *, because: str = "", check: bool = False
+    ) -> str:
+        """Hold the frame of a component by one of its nodes: at a pose, or where it is now."""
+        own = str(self.resolve(_word(node)).found[0].node)
+        fields = {} if pose is None else {"merged_from_node": packed(pose)}
+        return self.annotate("pin", own, because, check=check, node=own, **fields)
+
+
+def _where(
+    edge: tuple[NodeWord, NodeWord] | None,
+    place: str,
+    node: NodeWord,
+    radius: float | None,
+    corners: Corners | None,
+    near: str,
+) -> dict[str, Any]:
+    fields = _given(place=place, node=_word(node), radius=radius, corners=corners, near=near)
+    return fields if edge is None else {**fields, "edge": [_word(end) for end in edge]}
+
+
+def _given(**fields: Any) -> dict[str, Any]:
+    """Those that are given."""
+    return {name: value for name, value in fields.items() if value is not None and value != ""}
+
+
+def _word(node: NodeWord) -> str:
+    return str(node)

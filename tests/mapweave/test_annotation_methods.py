@@ -1,0 +1,90 @@
+"""Typed methods for annotations say the same as the fields of the wire, and words are nodes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+import mapweave
+from mapweave.hybridmap.annotation import Annotation, Closure, Place, Preference
+from mapweave.hybridmap.errors import InvalidValue, Refused
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.map_files import map_file_of
+from mapweave.offline_annotations import OfflineAnnotations
+from mapweave.storage.map_file import write_map_file
+from mapweave.storage.plan_image import plan_file
+from synthetic.maps import looked_around, merger_of
+
+FIRST, THIRD = NodeId("r0", 1, 1), NodeId("r1", 1, 3)
+
+
+@pytest.fixture(scope="module")
+def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    merged = merger_of(looked_around((MapId("r0", 1), MapId("r1", 1)), seed=6)).merged()
+    path = tmp_path_factory.mktemp("map") / "room.mapweave"
+    write_map_file(path, map_file_of(merged))
+    return path
+
+
+@pytest.fixture
+def record(path: Path, tmp_path: Path) -> OfflineAnnotations:
+    return OfflineAnnotations(path, tmp_path / "out.mapweave", "anna")
+
+
+def last(record: OfflineAnnotations) -> Annotation:
+    return record.annotations().made[-1]
+
+
+def test_each_kind_has_a_method(record: OfflineAnnotations) -> None:
+    record.place("kitchen", THIRD, because="the sink")
+    assert last(record).body == Place(THIRD) and last(record).because == "the sink"
+    record.place("hall", corners=[(0, 0), (1, 0), (1, 1)], near="kitchen")
+    record.close_way(
+        "wet floor", place="kitchen", radius=0.5, begin="2030-03-01 14:00", end="2030-03-01 15:00"
+    )
+    body = last(record).body
+    assert isinstance(body, Closure) and body.area is not None and body.end_ns is not None
+    assert body.begin_ns is not None and body.end_ns - body.begin_ns == 3600 * 10**9
+    record.close_way("way", edge=(FIRST, "kitchen"))
+    assert last(record).body == Closure((FIRST, THIRD))
+    record.prefer("carpet", 0.5, node="kitchen", radius=1.0)
+    assert isinstance(body := last(record).body, Preference) and body.factor == 0.5
+    record.floor("kitchen", "ground")
+    assert (last(record).name, last(record).words) == ("r1.1", "floor r1.1 is on floor ground, by anna")
+    record.portal("gate", FIRST, "kitchen", "door", "the key is at the desk")
+    assert last(record).words.startswith("portal gate is a door between r0.1.1 and r1.1.3 (the key is")
+    record.pin("kitchen", Pose2(12.5, -3.0, 1.5))
+    assert last(record).name == str(THIRD) and record.merged.pose(THIRD).distance(Pose2(12.5, -3.0)) < 1e-6
+    image = record.put_plan_image(
+        plan_file(cv2.imencode(".png", np.full((50, 40), 200, np.uint8))[1].tobytes(), "flat.png").png
+    )
+    at = record.merged.pose(THIRD)
+    corners = ((0, 0), (4, 0), (4, 3), (0, 3))
+    pairs = [(f"{at.x + x},{at.y + y}", 5.0 + 5 * x, 45.0 - 5 * y) for x, y in corners]
+    record.plan("flat", image, pairs, metres_per_pixel=0.2, origin=Pose2(1.0, 2.0, 0.0))
+    assert record.plans().plan("flat").part().rms < 1e-6
+
+
+def test_a_check_keeps_nothing_and_a_field_that_there_is_not_is_found(record: OfflineAnnotations) -> None:
+    """The type checker finds it, too: an ignored error that there is not would be one."""
+    assert record.place("kitchen", THIRD, check=True).startswith("only checked, nothing is changed: place")
+    with pytest.raises(TypeError, match="nodee"):
+        record.place("kitchen", nodee=3)  # type: ignore[call-arg]
+    with pytest.raises(Refused, match='"lift", "ramp" or "door"'):
+        record.portal("gate", FIRST, THIRD, "stairs")  # type: ignore[arg-type]
+    assert record.annotations().made == ()
+
+
+def test_words_are_nodes_and_what_is_none_is_refused(path: Path, record: OfflineAnnotations) -> None:
+    room = mapweave.open(path)
+    for one in (room, record):
+        assert one.resolve("r1.1.3").found[0].node == THIRD
+        assert [found.node for found in one.resolve(["r1.1.3", "r0.1.1"]).found] == [THIRD, FIRST]
+        with pytest.raises(Refused, match="'kitchen' is no place of this map"):
+            one.resolve("kitchen")
+        with pytest.raises(InvalidValue, match=r"3: give a node \(r0\.1\.17\)"):
+            one.resolve(3)  # type: ignore[arg-type]
