@@ -166,11 +166,10 @@ ALONE = """\
 One server a site is the plan: sites share no floor, so no map, no link and no route crosses them. A site that
 stands alone keeps working when the network between sites fails."""
 TOGETHER = """\
-Then one merged map has to be shared: several front servers on one record take changes and answer, one or
-several merge."""
-OTHERS = """\
-Figures of front servers on one PostgreSQL and of shards on a Ray cluster are in [figures](figures.md), if
-these are measured; put them in place of the formulas."""
+Then one merged map has to be shared: several front servers on one record take changes and answer. The record
+has what robots and people sent. Each front server compares all new nodes and merges the whole map by itself,
+so each needs the processor and the memory for that: more front servers bring neither down. Workers of a
+[Ray cluster](cluster.md) compare what a front server does not compare itself."""
 WATCH = """\
 The [metrics](monitoring.md) show where the plan is wrong: `mapweave_ack_seconds` (fronts),
 `mapweave_queue_length{queue="comparisons"}` and `mapweave_merge_seconds` (merging),
@@ -188,7 +187,7 @@ def scale_page(results: Mapping[str, Result]) -> str:
         "## The fleet", _table(("what", "", "", "basis"), _fleet_rows()),
         "## One site", _table(head, _site(costs, plan)),
         "## All sites", _table(head, _all(plan)), ALONE,
-        "## One building with all robots", TOGETHER, _table(head, _building(costs, plan)), OTHERS,
+        "## One building with all robots", TOGETHER, _table(head, _building(costs, plan)),
         "## What to watch", WATCH,
     ]  # fmt: skip
     return "\n\n".join(parts) + "\n"
@@ -280,7 +279,12 @@ def _all(plan: Plan) -> list[Row]:
 
 def _building(costs: Costs, plan: Plan) -> list[Row]:
     rate, first = SITES * plan.node_rate, SITES * plan.first_rate
-    fronts = f"{math.ceil(ROBOTS / costs.carried)}" if costs.carried else "not known"
+    whole = costs.base_bytes + SITES * plan.nodes * costs.kept_bytes
+    fronts = math.ceil(ROBOTS / costs.carried) if costs.carried else 0
+
+    def of_all(each: float) -> str:
+        return f"{fronts * each:.0f}" if fronts else "not known"
+
     carried = (
         f"{costs.carried} robots" if costs.carried else f"none of {costs.agents} was in time on that machine"
     )
@@ -288,15 +292,24 @@ def _building(costs: Costs, plan: Plan) -> list[Row]:
         (f"robots on one front server, acknowledged within {GOOD_ACK_MS:g} ms (99 %)",
          "the largest fleet in time in one run; on slower machines of two cores it was 200: measure yours",
          carried, MEASURED),
-        ("front servers", "robots over that", fronts, EXTRAPOLATED),
+        ("front servers", "robots over that", f"{fronts}" if fronts else "not known", EXTRAPOLATED),
         ("cores for links", "robots × link, as if all map", f"{ROBOTS * costs.link_s:.0f}",
          "extrapolated, at most"),
         ("cores for answers", "robots × questions × answer",
          f"{ROBOTS / QUESTION_EVERY * costs.answer_s:.1f}", EXTRAPOLATED),
-        ("shards that merge", "new nodes × comparing / share of a core",
-         f"{math.ceil(rate * costs.compare_s / MERGE_SHARE)}", EXTRAPOLATED),
-        ("the same on the first day", "new nodes × comparing / share of a core",
-         f"{math.ceil(first * costs.compare_s / MERGE_SHARE)}", EXTRAPOLATED),
+        ("cores for comparing, of one front server", "new nodes × comparing", f"{rate * costs.compare_s:.1f}",
+         EXTRAPOLATED),
+        ("the same on the first day", "new nodes × comparing", f"{first * costs.compare_s:.0f}",
+         EXTRAPOLATED),
+        ("cores for comparing, of all; on the first day", "front servers × that",
+         f"{of_all(rate * costs.compare_s)}; {of_all(first * costs.compare_s)}", EXTRAPOLATED),
+        ("cores for merging, of all", "front servers × share of a core", of_all(MERGE_SHARE),
+         "as built, at most"),
+        ("a merge is behind by", "a merge × nodes of all sites / 10 000, over its share",
+         f"{SITES * plan.merge_s / MERGE_SHARE:.0f} s", EXTRAPOLATED),
+        ("memory of one front server; of all",
+         "empty + nodes of all sites × memory of a node; front servers × that",
+         f"{_bytes(whole)}; {_bytes(fronts * whole) if fronts else 'not known'}", EXTRAPOLATED),
         ("changes that the record takes a second; on the first day", "two a node",
          f"{2 * rate:.0f}; {2 * first:.0f}", EXTRAPOLATED),
     ]  # fmt: skip
