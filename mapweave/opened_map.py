@@ -32,6 +32,7 @@ from mapweave.mapserver.plan_images import kept_images, recorded_images
 from mapweave.storage.atomic_file import State, state_of, unchanged_since
 from mapweave.storage.database_reader import MAGIC as SQLITE
 from mapweave.storage.database_reader import reading
+from mapweave.storage.file_format import of_format
 from mapweave.storage.map_file import MAGIC, MapFile, read_map_file, write_map_file
 from mapweave.wire.messages import KeptHistory, KeptPruning, decode
 
@@ -213,14 +214,12 @@ def source_of(path: Path, live: bool = False) -> MapSource:
         raise InvalidFile(f"{path}: cannot be read ({error})") from None
     if kind == journal.APPLICATION_ID:
         if version != journal.VERSION:
-            raise InvalidFile(
-                f"{path}: agent journal of format {version}, this program uses {journal.VERSION}"
-            )
+            raise InvalidFile(f"{path}: agent journal {of_format(version, journal.VERSION)}")
         return MapSource.JOURNAL
     if kind != sqlite_store.APPLICATION_ID:
         raise InvalidFile(f"{path}: {OTHER}")
     if version != sqlite_store.VERSION:
-        raise InvalidFile(f"{path}: map store of format {version}, this program uses {sqlite_store.VERSION}")
+        raise InvalidFile(f"{path}: map store {of_format(version, sqlite_store.VERSION)}")
     return MapSource.STORE
 
 

@@ -10,6 +10,7 @@ from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.database_reader import reading
+from mapweave.storage.file_format import of_format
 from mapweave.storage.file_owner import owning
 from mapweave.storage.os_errors import DISK_FULL, READ_ONLY, no_permission
 from mapweave.storage.write_ahead_log import lost_commits
@@ -196,9 +197,7 @@ class Database:
             raise InvalidFile(f"{self.path}: is not a Mapweave {self.what}")
         stored_version = run("PRAGMA user_version").fetchone()[0]
         if stored_version != version:
-            raise InvalidFile(
-                f"{self.path}: {self.what} of format {stored_version}, this program uses {version}"
-            )
+            raise InvalidFile(f"{self.path}: {self.what} {of_format(stored_version, version)}")
 
     def _check_pages(self) -> None:
         # A message that begins with the file's name may have two lines; the second gives the reason.

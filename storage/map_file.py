@@ -38,6 +38,7 @@ from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.storage.atomic_file import read_whole, write_whole
+from mapweave.storage.file_format import what_to_do
 from mapweave.storage.first_bytes import MAP_FILE
 from mapweave.wire.packing import Limit
 from mapweave.wire.typed import decode, encode
@@ -174,7 +175,8 @@ def unpack_map_file(data: bytes) -> MapFile:
         raise InvalidMessage(f"is truncated: {len(data)} bytes, not even a header")
     _, version, length = HEADER.unpack_from(data)
     if version != VERSION:
-        raise InvalidMessage(f"has format version {version}, this program reads {VERSION}")
+        advice = what_to_do(version, VERSION)
+        raise InvalidMessage(f"has format version {version}, this program reads {VERSION}: {advice}")
     whole = HEADER.size + length + DIGEST_BYTES
     if len(data) < whole:
         raise InvalidMessage(f"is truncated: {len(data)} of {whole} bytes")

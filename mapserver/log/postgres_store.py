@@ -21,6 +21,7 @@ from mapweave.mapserver.log.postgres_follower import CHANNEL, LOG, RECORD, Postg
 from mapweave.mapserver.log.postgres_name import ServerName
 from mapweave.mapserver.log.sql_store import SqlStore
 from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, ID, News, Run, fresh_id
+from mapweave.storage.file_format import what_to_do
 from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
 from mapweave.storage.postgres_watchdog import PostgresWatchdog
 
@@ -175,7 +176,8 @@ class PostgresStore(SqlStore):
             )
         if version != VERSION:
             what = "no map store" if version is None else f"a map store of format {version}"
-            raise InvalidFile(f"{self.address.words}: has {what}, this program uses format {VERSION}")
+            advice = "" if version is None else f": {what_to_do(version, VERSION)}"
+            raise InvalidFile(f"{self.address.words}: has {what}, this program uses format {VERSION}{advice}")
 
     def _prepare_reader(self, connection: psycopg.Connection) -> None:
         if self._has_name:

@@ -264,7 +264,9 @@ def test_a_newer_format_is_refused(path: Path, journal: Journal) -> None:
     other = sqlite3.connect(path)
     other.execute("PRAGMA user_version = 9")
     other.close()
-    with pytest.raises(InvalidFile, match="of format 9, this program uses 1"):
+    with pytest.raises(
+        InvalidFile, match=r"of format 9, this program uses 1: a newer version .*: upgrade this"
+    ):
         Journal(path, "r0")
 
 
