@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.agent.drivers.settings import RobotSettings
+from mapweave.agent.recordings.settings import RecordingSettings
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.mapserver.admission_control import AdmissionSettings
@@ -45,6 +46,7 @@ class Settings:
     Attributes:
         network: how to reach the fleet.
         robot: driver, camera and geometry of an agent's robot.
+        recording: which topics of a bag are the robot's.
         agent: of a robot's program.
         admission_control: how a map server shares out the questions that take long.
         quotas: what a map server takes of one robot at most.
@@ -54,6 +56,7 @@ class Settings:
 
     network: NetworkSettings = field(default_factory=NetworkSettings)
     robot: RobotSettings = field(default_factory=RobotSettings)
+    recording: RecordingSettings = field(default_factory=RecordingSettings)
     agent: AgentSettings = field(default_factory=AgentSettings)
     admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     quotas: QuotaSettings = field(default_factory=QuotaSettings)

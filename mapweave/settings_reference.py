@@ -24,6 +24,7 @@ ROLES = (
     ("people who ask a server: `mapweave relocalize`, `map`", "`[network]`"),
     ("people with map files: `mapweave map`", "`[merge]`"),
     ("simulation and recordings: `mapweave sim`, `eval`", "`[agent]`, `[merge]`"),
+    ("bags: `mapweave replay`, `info`, `eval replay`, `calibrate drive`", "`[recording]`"),
 )
 """Commands that take `--settings FILE`, and the parts of the file that each reads."""
 

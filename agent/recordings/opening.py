@@ -28,7 +28,7 @@ def open_recording(path: Path, options: RecordingOptions | None = None) -> Recor
     opened = _opener(path)
     has_height = opened is images_folder and (path / "camera.toml").exists()
     options.check_used(path, opened is bags.bag, has_height)
-    return opened(path, options)
+    return opened(path, options.of_bag() if opened is bags.bag else options)
 
 
 def _opener(path: Path) -> Callable[[Path, RecordingOptions], Recording]:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from mapweave.agent.drive_geometry import check_mount
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.incomplete import CameraAndLens, CameraGiven
+from mapweave.agent.recordings.settings import RecordingSettings
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 
 
@@ -22,6 +23,7 @@ class RecordingOptions:
         image_topic: of a bag; None takes the most likely one.
         odometry_topic: of a bag; likewise.
         camera_info_topic: of a bag; None takes the one beside the images.
+        settings: topics of bags where none are given here.
     """
 
     camera: Path | None = None
@@ -30,6 +32,16 @@ class RecordingOptions:
     image_topic: str | None = None
     odometry_topic: str | None = None
     camera_info_topic: str | None = None
+    settings: RecordingSettings = field(default_factory=RecordingSettings)
+
+    def of_bag(self) -> RecordingOptions:
+        """The same with the topics of the settings where none are given."""
+        return replace(
+            self,
+            image_topic=self.image_topic or self.settings.image_topic or None,
+            odometry_topic=self.odometry_topic or self.settings.odometry_topic or None,
+            camera_info_topic=self.camera_info_topic or self.settings.camera_info_topic or None,
+        )
 
     def check_used(self, path: Path, is_bag: bool, has_height: bool) -> None:
         """Refuse an option that the recording does not use: a person who gives one expects an effect.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands.replay import add_recording, options_of
@@ -35,6 +36,9 @@ def add_to(commands: Any) -> None:
         "listed with the option that gives it.",
     )
     add_recording(parser)
+    parser.add_argument(
+        "--settings", type=Path, metavar="FILE", help="TOML with [recording], the topics of a bag"
+    )
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=run)
 

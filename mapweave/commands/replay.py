@@ -79,10 +79,20 @@ def add_recording(parser: argparse.ArgumentParser, optional: bool = False) -> No
         "--odometry", type=Path, metavar="FILE",
         help="stamped poses: CSV with stamp_s, x_m, y_m, heading_rad, or lines as TUM and evo write them",
     )  # fmt: skip
-    parser.add_argument("--image-topic", metavar="TOPIC", help="of a bag (default: the one with most images)")
-    parser.add_argument("--odometry-topic", metavar="TOPIC", help="of a bag (default: by its type and name)")
     parser.add_argument(
-        "--camera-info-topic", metavar="TOPIC", help="of a bag (default: the one beside the images)"
+        "--image-topic",
+        metavar="TOPIC",
+        help="of a bag (default: that of the settings, else the one with most images)",
+    )
+    parser.add_argument(
+        "--odometry-topic",
+        metavar="TOPIC",
+        help="of a bag (default: that of the settings, else by its type and name)",
+    )
+    parser.add_argument(
+        "--camera-info-topic",
+        metavar="TOPIC",
+        help="of a bag (default: that of the settings, else the one beside the images)",
     )
 
 
@@ -92,8 +102,9 @@ def options_of(arguments: argparse.Namespace) -> RecordingOptions:
 
     a = arguments
     return RecordingOptions(
-        a.camera, a.camera_height, a.odometry, a.image_topic, a.odometry_topic, a.camera_info_topic
-    )
+        a.camera, a.camera_height, a.odometry, a.image_topic, a.odometry_topic, a.camera_info_topic,
+        settings_of(a).recording,
+    )  # fmt: skip
 
 
 def run(arguments: argparse.Namespace) -> int:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import math
 import subprocess
 import sys
@@ -29,7 +30,10 @@ from mapweave.agent.recordings.incomplete import Incomplete
 from mapweave.agent.recordings.mcap_writer import FLUSH_S, McapWriter
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
+from mapweave.agent.recordings.settings import RecordingSettings
 from mapweave.agent.ros_messages.values import Mount
+from mapweave.cli import main
+from mapweave.exit_status import FAILED
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Pose2
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive, between
@@ -423,6 +427,49 @@ def test_the_topic_of_the_camera_may_be_given(drive: Drive, tmp_path: Path) -> N
     assert open_recording(tmp_path / "drive", given).camera == drive.camera
     with pytest.raises(DeviceError, match="no topic /none; it has"):
         open_recording(tmp_path / "drive", replace(OPTIONS, camera_info_topic="/none"))
+
+
+def test_the_settings_name_the_topics_and_the_command_line_overrides_them(
+    drive: Drive, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """There were options alone: they had to be given with every command."""
+    path = tmp_path / "drive"
+    write_bag(path, drive, info="/elsewhere/info", second="/other/info", odom="/amcl/odom")
+    file = tmp_path / "robot.toml"
+    file.write_text(
+        '[recording]\nodometry_topic = "/amcl/odom"\ncamera_info_topic = "/elsewhere/info"\n'
+        'image_topic = "/cam/image_raw"\n'
+    )
+    command = ["info", str(path), "--camera-height", "0.3", "--json"]
+    assert main(command) == 0
+    guessed = json.loads(capfd.readouterr().out)
+    assert guessed["focal_px"] is None and guessed["missing"], "two cameras, and no odometry"
+    assert main([*command, "--settings", str(file)]) == 0
+    facts = json.loads(capfd.readouterr().out)
+    assert not facts["missing"] and facts["focal_px"] == drive.camera.fx and facts["driven_m"] > 0.0
+    assert facts["notes"][:2] == ["images from /cam/image_raw", "odometry from /amcl/odom"]
+    assert main([*command, "--settings", str(file), "--odometry-topic", "/none"]) == FAILED
+    assert "no topic /none; it has" in capfd.readouterr().err
+    replayed = ["replay", str(path), "--camera-height", "0.3", "--offline", "--data", str(tmp_path / "maps")]
+    assert main([*replayed, "--settings", str(file)]) == 0
+    assert "odometry from /amcl/odom" in capfd.readouterr().out
+
+
+def test_a_recording_without_topics_does_without_those_of_the_settings(drive: Drive, tmp_path: Path) -> None:
+    folder = tmp_path / "walk"
+    (folder / "images").mkdir(parents=True)
+    c = drive.camera
+    (folder / "camera.toml").write_text(
+        f"width = {c.width}\nheight = {c.height}\nfx = {c.fx}\nfy = {c.fy}\ncx = {c.cx}\ncy = {c.cy}\n"
+        "height_m = 0.3\n"
+    )
+    for k, image in enumerate(drive.images):
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), image)
+    (folder / "odometry.csv").write_text(
+        "forward_m,turn_rad\n" + "".join(f"{a},{b}\n" for a, b in drive.increments)
+    )
+    options = RecordingOptions(settings=RecordingSettings(image_topic="/cam/image_raw"))
+    assert len(open_recording(folder, options)) == COUNT
 
 
 def test_what_a_bag_lacks_is_said_with_what_is_in_it(drive: Drive, tmp_path: Path) -> None:
