@@ -63,6 +63,7 @@ class StubServices:
         self.fleet = FleetStatus()
         self.said = Annotations()
         self.ways: list[tuple[str, tuple[str, ...]]] = []
+        self.reasons: list[str] = []
         self.read_only = False
         self.images: dict[NodeId, bytes] = {}
 
@@ -92,6 +93,7 @@ class StubServices:
         because: str = "",
     ) -> MissionReport:
         self.ways.append((goal, via))
+        self.reasons.append(because)
         raise InvalidValue(f"{robot} stays where it is")
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:

@@ -23,6 +23,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.mapserver.server import MapServer
+from mapweave.teleoperation.session import Session
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Role
 from mapweave.wire.keys import Keys
@@ -89,6 +90,13 @@ def test_the_records_name_the_holder_of_the_key(
         eventually(lambda: any(entry.alive for entry in anna.status().robots))
         assert anna.explore("r0").order.by == "anna" and control.report is not None
         assert control.report.order.by == "anna"
+
+        with Session(bus("anna"), KEYS, "r0", "vera", "anna"):
+            pass
+        link.report(Status("standing", "", 7, 0, Pose2(), False), 2)
+        eventually(lambda: any("r0: the drive by hand is over, by anna since" in one for one in words()))
+        assert any(one.startswith("r0: driven by hand, by anna since") for one in words())
+        assert any(one.startswith("r0: explore, by anna (mission") for one in words())
 
         with pytest.raises(InvalidValue, match="with this key you are anna, not bob"):
             Fleet(endpoint, "demo", "bob", anna_key)

@@ -161,6 +161,9 @@ def test_a_robot_passes_places_on_its_way(page: Browser, services: StubServices)
     page.type("#via", "east wing, 3.1,-2.0 r0.1.1, east\n")
     eventually(lambda: services.ways == [("home", ("east wing", "3.1,-2.0", "r0.1.1", "east"))])
     eventually(lambda: "r0 stays where it is" in page.run(text_of("selected")))
+    page.type("#mission-because", "a guest & a dog wait")
+    page.run("[...document.querySelectorAll('#selected button')].find(b => b.textContent === 'Stop').click()")
+    eventually(lambda: services.reasons == ["", "a guest & a dog wait"])
 
 
 def test_errors_are_shown_on_the_page(page: Browser, services: StubServices, image: Path) -> None:
