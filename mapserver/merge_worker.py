@@ -11,7 +11,7 @@ from itertools import islice
 
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.counted import counted
-from mapweave.hybridmap.errors import MapweaveError
+from mapweave.hybridmap.errors import InvalidFile, MapweaveError
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.node import Node
@@ -76,6 +76,8 @@ class MergeWorker:
         self._share = share
         self._merger = Merger(places, merge, compare, schedule.pause)
         self._fresh: dict[NodeId, Node] = {}
+        self._last: dict[MapId, int] = {}
+        """The last change of each log that was taken in."""
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._unprepared = False
         self._read_all = self._begun = False
@@ -179,6 +181,15 @@ class MergeWorker:
         """Hold the frames of components by exactly these pins from now on, oldest first. Returns at once."""
         self._post(lambda: self._merger.pin(pins))
 
+    def follow_pruning(self) -> None:
+        """Let go what another server has pruned, if any has. Returns at once; for any thread.
+
+        Raises:
+            InvalidFile: the store cannot be read.
+        """
+        if self._pruning and self._pruning.outdated:
+            self._post(self._adopt_pruning)
+
     def settle(self, timeout: float) -> bool:
         """Wait until everything that came before this call is merged; False if the time is over first."""
         merged = threading.Event()
@@ -207,12 +218,22 @@ class MergeWorker:
 
     def _restore(self) -> None:
         if self._pruning:
-            self._pruning.restore(self._merger)
+            try:
+                self._pruning.restore(self._merger)
+            except InvalidFile as error:  # a store that servers share says later that it has it
+                log.error("what was pruned cannot be read: %s", error)
         if self._keeper:
             try:
                 self._keeper.restore(self._merger)
             except Exception:  # it can all be found out again
                 log.exception("what was found before cannot be read: nodes are compared again")
+
+    def _adopt_pruning(self) -> None:
+        if self._pruning:
+            try:
+                self._pruning.adopt(self._merger)
+            except InvalidFile as error:  # it is looked again with the next news
+                log.warning("%s", error)
 
     def _save(self, last: bool = False) -> None:
         if self._keeper:
@@ -262,14 +283,23 @@ class MergeWorker:
                 return  # The same node is put again by a change that waits: the last one counts.
             self._apply(change)
             self._forget(change.body.node)
+            self._check_pruned(change.body.node.id)
         else:
             self._apply(change)
+
+    def _check_pruned(self, node: NodeId) -> None:
+        if self._pruning:
+            try:
+                self._pruning.came(node, self._merger)
+            except InvalidFile as error:  # it stays until the next start
+                log.warning("%s", error)
 
     def _forget(self, node: Node) -> None:
         if self._fresh.get(node.id) is node:
             del self._fresh[node.id]
 
     def _read(self, changes: list[Change]) -> None:
+        self._last |= {change.map: change.sequence for change in changes}
         try:
             self._merger.read((change.map, change.body) for change in changes)
         except Exception:  # a log may be replayed: a defect in one change must not stop the others
@@ -278,6 +308,8 @@ class MergeWorker:
                 self._apply(change)
 
     def _apply(self, change: Change) -> None:
+        # A change that was damaged comes again behind later ones.
+        self._last[change.map] = max(change.sequence, self._last.get(change.map, 0))
         try:
             self._merger.on_change(change)
         except MapweaveError as error:
@@ -337,7 +369,8 @@ class MergeWorker:
         except Exception:  # a defect here must not end all merging
             log.exception("the history of the maps could not be written")
         try:
-            if self._pruning and self._pruning.prune(self._merger, self._schedule.time_ns()):
+            now_ns = self._schedule.time_ns()
+            if self._pruning and self._pruning.prune(self._merger, now_ns, self._last):
                 self._dirty = True
         except Exception:  # it is tried again the next day
             log.exception("what has been superseded for long could not be pruned")

@@ -13,7 +13,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.entry import words_of
 from mapweave.mapserver.log.integrity import checksum
-from mapweave.mapserver.log.store import HISTORY, Store
+from mapweave.mapserver.log.store import HISTORY, PRUNING, Store
 from mapweave.storage.database_reader import reading
 from mapweave.wire.codec import decode_body
 from mapweave.wire.log_messages import Refusal
@@ -64,10 +64,11 @@ def all_of(store: Store) -> Salvage:
     for map_id in store.maps():
         for change in store.replay(map_id):
             maps.setdefault(map_id, HybridMap()).apply(change.body)
-    history = store.result(HISTORY)
+    # Last: what is pruned meanwhile is there twice rather than not at all.
+    results = {name: store.result(name) for name in (HISTORY, PRUNING)}
     return Salvage(
         maps, 0, True, tuple(store.constraints()), tuple(store.annotations()),
-        {} if history is None else {HISTORY: history},
+        {name: value for name, value in results.items() if value is not None},
         {m: words_of(refusal) for m in store.maps() for refusal in store.refusals(m)[:1]},
     )  # fmt: skip
 

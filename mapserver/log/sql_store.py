@@ -9,6 +9,7 @@ from mapweave.hybridmap.annotation import MAX_ANNOTATIONS
 from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
+from mapweave.hybridmap.limits import MAX_NUMBER
 from mapweave.mapserver.log.entry import Applied, Entry, Position
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.mapserver.log.sql_sizes import SqlSizes
@@ -92,27 +93,46 @@ class SqlStore(SqlSizes, Store):
                 except InvalidMessage as error:
                     log.error("change %d of %s cannot be read (%s); it is left out", last, map_id, error)
 
-    def prune(self, nodes: Iterable[NodeId], edges: Iterable[EdgeId], results: Mapping[str, bytes]) -> None:
+    def prune(
+        self,
+        nodes: Iterable[NodeId],
+        edges: Iterable[EdgeId],
+        results: Mapping[str, bytes],
+        last: Mapping[MapId, int] | None = None,
+        unchanged: Mapping[str, bytes | None] | None = None,
+    ) -> bool:
         """Delete what logs say of some nodes and edges, for good; see `Store`."""
         node_numbers, edge_numbers = _numbers(nodes), _numbers(edges)
+        maps = {map_id for map_id, _ in (*node_numbers, *edge_numbers)}
         with self._transaction():
+            self._lock_table("result")
+            if any(self.result(name) != value for name, value in (unchanged or {}).items()):
+                return False
+            # No other server may put one of the nodes between the queries.
+            self._begin([Run(map_id, at.log_id, ()) for map_id, at in self.positions(maps).items()])
             for kinds, numbers in (
                 ((NodePut, NodeRetired), node_numbers),
                 ((EdgePut, EdgeRetired), edge_numbers),
             ):
                 names = [kind.__name__ for kind in kinds]
                 for map_id, some in numbers:
-                    marks = ", ".join("?" * len(some))
                     self._write(
-                        "DELETE FROM change WHERE agent = ? AND epoch = ? AND kind IN (?, ?) "
-                        f"AND number IN ({marks})",
-                        (*map_id, *names, *some),
+                        "DELETE FROM change WHERE agent = ? AND epoch = ? AND sequence <= ? "
+                        f"AND kind IN (?, ?) AND number IN ({_marks(some)})",
+                        (*map_id, MAX_NUMBER if last is None else last.get(map_id, 0), *names, *some),
                     )
             for map_id, some in node_numbers:
-                self._delete_nodes(map_id, some)
+                put_again = self._read(
+                    "SELECT DISTINCT number FROM change WHERE agent = ? AND epoch = ? AND kind = ? "
+                    f"AND number IN ({_marks(some)})",
+                    (*map_id, NodePut.__name__, *some),
+                )
+                if gone := sorted({*some} - {number for (number,) in put_again}):
+                    self._delete_nodes(map_id, gone)
             for name, value in results.items():
                 self._put("result", (name, value))
         self._count_again()
+        return True
 
     def damaged(self, map_id: MapId | None = None) -> list[Gap]:
         """Changes that were found damaged and are not restored yet, of one map or of all."""
@@ -254,9 +274,9 @@ class SqlStore(SqlSizes, Store):
 
     def _delete_nodes(self, map_id: MapId, numbers: Sequence[int]) -> None:
         """Of one map, no more than `_numbers` gives at once."""
-        marks = ", ".join("?" * len(numbers))
         self._write(
-            f"DELETE FROM node WHERE agent = ? AND epoch = ? AND number IN ({marks})", (*map_id, *numbers)
+            f"DELETE FROM node WHERE agent = ? AND epoch = ? AND number IN ({_marks(numbers)})",
+            (*map_id, *numbers),
         )
 
     def _take(
@@ -314,6 +334,11 @@ class SqlStore(SqlSizes, Store):
                 if count is not None and highest >= count:
                     return f"edge {edge.id} shares landmark {highest} of {end}, which has {count}"
         return ""
+
+
+def _marks(values: Sequence[object]) -> str:
+    """Of values in a query."""
+    return ", ".join("?" * len(values))
 
 
 def _numbers(elements: Iterable[NodeId]) -> list[tuple[MapId, Sequence[int]]]:

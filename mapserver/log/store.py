@@ -24,6 +24,8 @@ HISTORY = "history"
 """Among the results, too: see mapweave.mapserver.map_history."""
 PRUNING = "pruning"
 """Likewise: see mapweave.mapserver.merging.pruning."""
+PRUNING_MARK = "pruning_mark"
+"""A random number that is drawn with each change of that record."""
 MOST_REFUSED_KEPT = 100
 """Refused changes of a map of which the bytes are kept; of further ones only the reason."""
 MOST_REFUSALS = 1000
@@ -147,7 +149,14 @@ class Store(Protocol):
         Those that cannot be read, or are out of bounds since they were taken, are left out.
         """
 
-    def prune(self, nodes: Iterable[NodeId], edges: Iterable[EdgeId], results: Mapping[str, bytes]) -> None:
+    def prune(
+        self,
+        nodes: Iterable[NodeId],
+        edges: Iterable[EdgeId],
+        results: Mapping[str, bytes],
+        last: Mapping[MapId, int] | None = None,
+        unchanged: Mapping[str, bytes | None] | None = None,
+    ) -> bool:
         """Delete what logs say of some nodes and edges, for good, and store results in their place.
 
         All in one transaction. The logs' watermarks stay, so robots do not send them again.
@@ -156,6 +165,11 @@ class Store(Protocol):
             nodes: that have left the map.
             edges: likewise.
             results: by their names, see `put_result`.
+            last: up to which change of each log this is decided; what comes behind stays. None: all.
+            unchanged: results that must still be these, since this is decided by them; None: not stored.
+
+        Returns:
+            Whether it is done: not if another server has written one of those results, and then nothing is.
 
         Raises:
             InvalidFile: the disk does not take it; nothing is pruned.

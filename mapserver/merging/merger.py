@@ -421,24 +421,30 @@ class Merger:
     def prune(self, plan: PrunePlan) -> None:
         """Let the nodes of a plan go, as if their robots had retired them, and keep what is left of them."""
         self.pruning.take(plan)
-        if not plan.nodes:
-            return
+        if plan.nodes:
+            self.let_go(plan.nodes)
+            self._pipeline.replace_marginals(self.pruning.marginals, self.pruning.standing)
+
+    def restore_pruning(self, pruning: Pruning) -> None:
+        """Go on with what another process has pruned; what has left since is let go besides."""
+        self.pruning = pruning
+        self._pipeline.replace_marginals(pruning.marginals, pruning.standing)
+        # Nothing else may have changed in the maps that the links join.
+        self._touched |= {end.map for link in pruning.marginals for end in link.pair} & self.maps.keys()
+        self._dirty = True
+
+    def let_go(self, nodes: Collection[NodeId]) -> None:
+        """Let nodes go that were pruned, as if their robots had retired them."""
         for map_id, hybrid_map in list(self.maps.items()):
-            for node in plan.nodes:
+            for node in nodes:
                 if node in hybrid_map.nodes or hybrid_map.edges_at(node):
                     self._replay(map_id, NodeRetired(node))
             if not (hybrid_map.nodes or hybrid_map.edges):
                 del self.maps[map_id]
                 self._changed.discard(map_id)
                 self._kept.pop(map_id, None)
-        self.alike.remove(plan.nodes)
-        self.reaches.remove(plan.nodes)
-        self._pipeline.replace_marginals(self.pruning.marginals, self.pruning.standing)
-
-    def restore_pruning(self, pruning: Pruning) -> None:
-        """Go on with what another process has pruned, before anything is merged."""
-        self.pruning = pruning
-        self._pipeline.replace_marginals(pruning.marginals, pruning.standing)
+        self.alike.remove(nodes)
+        self.reaches.remove(nodes)
 
     def _replay(self, map_id: MapId, change: ChangeBody) -> None:
         """Take a change into its map, and forget what no longer holds."""

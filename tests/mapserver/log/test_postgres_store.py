@@ -115,10 +115,17 @@ def test_both_stores_give_the_same_for_the_same(
         @rule(
             nodes=st.sets(st.sampled_from([NodeId(*m, k) for m in (MAP, OTHER) for k in (1, 2)])),
             edges=st.sets(st.sampled_from([EdgeId(*MAP, 11), EdgeId(*MAP, 12)])),
+            last=st.none() | st.dictionaries(st.sampled_from([MAP, OTHER]), st.integers(0, 8)),
+            known=st.none() | st.sampled_from([b"pruned", b""]),
         )
-        def prune(self, nodes: set[NodeId], edges: set[EdgeId]) -> None:
-            for store in self.stores:
-                store.prune(nodes, edges, {"poses": b"pruned"})
+        def prune(
+            self, nodes: set[NodeId], edges: set[EdgeId], last: dict[MapId, int] | None, known: bytes | None
+        ) -> None:
+            one, other = (
+                store.prune(nodes, edges, {"poses": b"pruned"}, last, {"poses": known})
+                for store in self.stores
+            )
+            assert one == other
 
         @rule(map_id=st.sampled_from([MAP, OTHER]), first=st.integers(1, 5), more=st.integers(0, 3))
         def lose(self, map_id: MapId, first: int, more: int) -> None:

@@ -273,6 +273,32 @@ def test_what_is_pruned_is_gone_and_is_not_taken_again(
     store.close()
 
 
+def test_what_comes_while_nodes_are_pruned_stays(store: Store) -> None:
+    """A node that is put again behind what was known then is there again, by its new change alone."""
+    bodies: list[ChangeBody] = [node_put(1, 3), node_put(2, 5), edge_put(11, 1, 2)]
+    store.apply(MAP, 5, [entry(k, body) for k, body in enumerate(bodies, 1)])
+    store.apply(MAP, 5, [entry(4, node_put(2, 4)), entry(5, edge_put(11, 1, 2))])
+    nodes, edges = [NodeId(*MAP, 1), NodeId(*MAP, 2)], [EdgeId(*MAP, 11)]
+    assert store.prune(nodes, edges, {"pruned 0": b"two nodes"}, {OTHER: 9}), "nothing of this log was known"
+    assert sequences(store) == [1, 2, 3, 4, 5] and store.kept("r0") == {MAP: (2, 7)}
+    assert store.prune(nodes, edges, {"pruned 0": b"two nodes"}, {MAP: 3})
+    assert sequences(store) == [4, 5] and store.kept("r0") == {MAP: (1, 4)}
+    assert [store.landmarks(node) for node in nodes] == [None, 4]
+
+
+def test_what_another_server_has_pruned_by_then_is_not_written_over(store: Store) -> None:
+    store.apply(MAP, 5, [entry(1, node_put(1, 3)), entry(2, node_put(2, 5))])
+    nodes = [NodeId(*MAP, 1)]
+    assert store.prune(nodes, [], {"mark": b"1", "pruned 0": b"one"}, None, {"mark": None})
+    for known in (None, b"0", b""):
+        assert not store.prune(
+            [NodeId(*MAP, 2)], [], {"mark": b"2", "pruned 0": b"two"}, None, {"mark": known}
+        )
+    assert sequences(store) == [2] and (store.result("mark"), store.result("pruned 0")) == (b"1", b"one")
+    assert store.prune([NodeId(*MAP, 2)], [], {"mark": b"2"}, None, {"mark": b"1"})
+    assert sequences(store) == [] and store.result("mark") == b"2"
+
+
 def test_what_a_lost_retirement_undid_goes_when_the_robot_has_dropped_it(place: Path | str) -> None:
     store = open_store(place)
     bodies: list[ChangeBody] = [
