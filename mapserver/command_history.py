@@ -54,8 +54,15 @@ class CommandHistory:
         self._events: tuple[MapEvent, ...] = ()
         self._said: set[str] = set()
         self._drives: dict[str, HandDrive] = {}
+        self._count = 0
         self._unwritten = self._write_is_due = self._write_fails = False
         self.reload()
+
+    @property
+    def count(self) -> int:
+        """How many were noted since the start; for any thread."""
+        with self._lock:
+            return self._count
 
     @property
     def events(self) -> tuple[MapEvent, ...]:
@@ -126,6 +133,7 @@ class CommandHistory:
                 return
             self._take((*self._events, event))
             self._unwritten = True
+            self._count += 1
             if self._write_is_due:
                 return
             self._write_is_due = True

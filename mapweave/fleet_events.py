@@ -37,6 +37,10 @@ FleetEvent = AgentStatus | MapEvent | MapChanged
 """A robot's status, what has become of the maps, or another merged map."""
 
 
+NEWS = "event", "constraints", "commands", "summary"
+"""Of a server's status: where one differs, its history may have more."""
+
+
 class FleetEvents:
     """Listens until it is closed; what is not read in time is replaced by what is newer."""
 
@@ -80,7 +84,7 @@ class FleetEvents:
     def _of_map(self, key: str, status: dict[str, Scalar]) -> Iterator[FleetEvent]:
         """What a server's status has news of."""
         shown = self._shown.get(key, {})
-        if any(shown.get(name) != status.get(name) for name in ("event", "constraints", "summary")):
+        if any(shown.get(name) != status.get(name) for name in NEWS):
             try:
                 history = self._history()
             except NotConnected:

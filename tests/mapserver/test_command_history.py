@@ -12,7 +12,7 @@ from mapweave.cli import main
 from mapweave.hybridmap.agent_status import AgentStatus, HandDrive, Status
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.map_event import MapEventKind
+from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.command_history import MOST, CommandHistory
@@ -62,6 +62,16 @@ def test_missions_and_stops_are_in_the_history_with_who_and_why(house: House) ->
     house.start_server()
     assert commands(house) == before
     assert not any(event.kind is MapEventKind.COMMANDED for event in house.person.map().history)
+    link.close()
+
+
+def test_a_command_is_an_event_at_once(house: House) -> None:
+    link, _ = house.robot()
+    events = house.person.events(30.0)
+    house.person.explore("r0")
+    event = next(one for one in events if isinstance(one, MapEvent) and one.kind is MapEventKind.COMMANDED)
+    assert event.words.startswith("r0: explore, by anna (mission ")
+    events.close()  # type: ignore[attr-defined]
     link.close()
 
 
