@@ -36,7 +36,7 @@ from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.libraries import library_jobs
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.opening import open_store
-from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, HISTORY, News
+from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, HISTORY, PRUNING_MARK, News
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.pruning_record import PruningRecord
@@ -140,10 +140,9 @@ class MapServer:
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)
         self._history = MapHistory(self._store, clock=clock.time_ns)
         self._metrics = Metrics()
-        # The servers of a shared store merge each by itself: what one prunes the others would still have.
-        pruning = None if self._store.shared else PruningRecord(
+        pruning = PruningRecord(
             self._store, s.merge.keep_superseded_days, self._said, base.maps if base else ()
-        )  # fmt: skip
+        )
         self._worker = MergeWorker(
             clock, MERGE_SHARE, places, s.merge, findings, self._history, self._cluster.compare,
             self._metrics.merged, pruning,
@@ -466,6 +465,8 @@ class MapServer:
             self._commands.reload()
         if news.names(HISTORY) and not self._store.leads:
             self._history.reload()
+        if news.names(PRUNING_MARK):
+            self._worker.follow_pruning()
 
     def _damaged(self) -> int:
         """Changes that are damaged on the disk."""
