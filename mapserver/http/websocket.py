@@ -40,7 +40,12 @@ class WebSocketConnection(WSProtocol):
         for begin in range(0, len(data), PIECE):
             if self.transport.is_closing():
                 return
-            super().data_received(data[begin : begin + PIECE])
+            try:
+                super().data_received(data[begin : begin + PIECE])
+            except ValueError:
+                # wsproto reads the lists in a head as ASCII. With the exception the connection would go to
+                # asyncio, which drops it, and it would count as an open one for ever.
+                self._refuse()
 
     def pause_writing(self) -> None:
         """The peer is slower than what is sent."""
@@ -58,6 +63,13 @@ class WebSocketConnection(WSProtocol):
         if self._stalled is not None:
             self._stalled.cancel()
         super().connection_lost(exc)
+
+    def _refuse(self) -> None:
+        """Answer a head that cannot be read."""
+        lines = [b"HTTP/1.1 400 Bad Request", b"connection: close", b"content-length: 0"]
+        lines += [name + b": " + value for name, value in self.default_headers]
+        self.transport.write(b"\r\n".join([*lines, b"", b""]))
+        self.transport.close()
 
     def _watch(self, before: int) -> None:
         def check() -> None:

@@ -7,11 +7,15 @@ import tracemalloc
 import zlib
 from typing import Any
 
+import pytest
 import uvicorn
 from uvicorn.server import ServerState
 
 from mapweave.mapserver.http.serving import MAX_VIEWER_BYTES
+from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.http.websocket import WebSocketConnection
+from tests.mapserver.http.client import raw
+from tests.waiting import eventually
 
 HEAD = (
     b"GET /live HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
@@ -95,3 +99,13 @@ def test_a_short_message_comes_as_it_was() -> None:
     text += bytes([0x80]) + bytes([0x80 | 126]) + (400).to_bytes(2, "big") + bytes(4) + b"b" * 400
     _, _, came = sent_after(text)
     assert [message["text"] for message in came] == ["a" * 600 + "b" * 400]
+
+
+@pytest.mark.parametrize("header", [b"Sec-WebSocket-Extensions: \x84", b"Sec-WebSocket-Protocol: \xe9"])
+def test_a_head_that_cannot_be_read_is_refused_and_leaves_nothing(served: Web, header: bytes) -> None:
+    """Before, each was counted as a connection for ever: a thousand of them, and no page came any more."""
+    head = HEAD.removesuffix(b"\r\n") + header + b"\r\n\r\n"
+    eventually(lambda: served.connections == 0)
+    got = raw(served, head)
+    assert got.startswith(b"HTTP/1.1 400 ") and b"nosniff" in got
+    eventually(lambda: served.connections == 0)
