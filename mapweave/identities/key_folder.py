@@ -36,7 +36,7 @@ from mapweave.identities.key_file import (
 from mapweave.identities.tokens import add_token, end_tokens, time_of
 from mapweave.storage.atomic_file import read_whole, write_whole
 from mapweave.storage.os_errors import reason_of
-from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.bus_settings import DEFAULT_ENDPOINT, ENDPOINT, BusSettings
 from mapweave.wire.conversion import json_value
 from mapweave.wire.credentials import Access, Credentials, Member, Role
 
@@ -81,7 +81,8 @@ class Identity:
     void: tuple[tuple[str, str], ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse an end that is no time (ValueError)."""
+        """Refuse a name that leaves its folder or key, and an end that is no time (ValueError)."""
+        _named(self.name)
         if self.expires:
             time_of(self.expires)
 
@@ -113,6 +114,20 @@ class Catalogue:
     endpoints: tuple[str, ...]
     hosts: tuple[str, ...]
     identities: tuple[Identity, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        """Refuse a name that leaves its key, and places where no router can listen (ValueError)."""
+        _named(self.fleet)
+        if not self.listen or not all(map(ENDPOINT.fullmatch, self.listen)):
+            raise ValueError(f"listen: give endpoints such as {DEFAULT_ENDPOINT}")
+
+
+def _named(name: str) -> None:
+    try:
+        check_name(name)
+    except InvalidValue as error:
+        # What is damaged in a file, msgspec names with its place.
+        raise ValueError(str(error)) from None
 
 
 class KeyFolder:

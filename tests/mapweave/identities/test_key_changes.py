@@ -265,3 +265,27 @@ def test_a_damaged_date_is_one_line_and_lets_no_client_in(
         assert logins.login(token) is not None
     with pytest.raises(SettingsError, match="no keys are here"):
         KeyFolder(folder.path / "elsewhere")
+
+
+@pytest.mark.parametrize(
+    ("field", "value"),
+    [
+        ("name", "../r1"),
+        ("name", "*"),
+        ("name", "r/1"),
+        ("fleet", "**"),
+        ("listen", []),
+        ("listen", ["here"]),
+    ],
+)
+def test_a_name_that_leaves_its_folder_or_key_is_one_line(
+    field: str, value: object, folder: KeyFolder, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Names are parts of files and of the keys in the router's rules. Before, any was taken."""
+    path = folder.path / "fleet.json"
+    content = json.loads(path.read_text())
+    row = content["identities"][-1] if field == "name" else content
+    row[field] = value
+    path.write_text(json.dumps(content))
+    line = complaint(capfd, "keys", "list", "--keys", folder.path)
+    assert "fleet.json" in line and ("use 1 to 32 of a-z" in line or "give endpoints" in line)
