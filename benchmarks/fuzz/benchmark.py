@@ -1,4 +1,4 @@
-"""Hostile input to every decoder: messages, map files, stores, journals, recordings, images, settings, HTTP.
+"""Hostile input to every decoder: messages, maps, stores, recordings, images, settings, keys, HTTP.
 
     python -m benchmarks.fuzz [--seconds S] [--seed N] [--targets NAME ...] [--keep DIR] [--json]
 

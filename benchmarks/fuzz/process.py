@@ -33,7 +33,7 @@ DECODERS = [
     "mapweave.wire", "mapweave.storage", "mapweave.agent.recordings", "mapweave.agent.ros_messages",
     "mapweave.agent.drivers", "mapweave.agent.replication", "mapweave.mapserver.http",
     "mapweave.mapserver.log",
-    "mapweave.hybridmap", "mapweave.identities", "mapweave.formats",
+    "mapweave.hybridmap", "mapweave.identities", "mapweave.formats", "mapweave.sim.worlds",
 ]  # fmt: skip
 COMPILED = ["mapweave.wire.landmark_reader", "mapweave.wire.rans", "mapweave.hybridmap.jit"]
 """Modules with kernels: numba cannot compile functions that count their branches."""
@@ -108,6 +108,8 @@ class Fuzzing:
         name = f"{what}-{hashlib.sha256(place.encode()).hexdigest()[:12]}"
         (self._folder / name).write_bytes(data)
         (self._folder / f"{name}.txt").write_text("".join(traceback.format_exception(error)))
+        # libFuzzer ends the process without coming back.
+        self.write()
 
     @staticmethod
     def _out_of_time(*_: object) -> None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import base64
 import sqlite3
 import tempfile
+import zlib
 from pathlib import Path
 
 import cv2
@@ -35,12 +37,14 @@ from mapweave.hybridmap.query import (
     View,
     Whereabouts,
 )
+from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.offline_merge import merge_parts
 from mapweave.storage.map_file import MapFile, pack_map_file
 from mapweave.wire.codec import encode_change
+from mapweave.wire.credentials import Role
 from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, Mark, Refusal, encode_record
 from mapweave.wire.messages import encode, encode_view
 from mapweave.wire.ros2.attachment import Attachment, encode_attachment
@@ -99,6 +103,16 @@ class Samples:
             encode_record({"a": 1, "b": 0.5, "c": "text", "d": True}),
         ]
 
+    def keys(self) -> tuple[bytes, bytes]:
+        """The list of a fleet's identities, with one that was revoked, and that of its tokens."""
+        with tempfile.TemporaryDirectory() as folder:
+            keys = KeyFolder.create(Path(folder), "demo", Profile.PRODUCTION, ["192.168.1.10"], "s0")
+            keys.add("r0", Role.ROBOT)
+            keys.add("anna", Role.OPERATOR)
+            keys.token("anna", 30.0)
+            keys.revoke("r0", "stolen")
+            return (Path(folder) / "fleet.json").read_bytes(), (Path(folder) / "tokens.json").read_bytes()
+
     def bases(self) -> list[bytes]:
         """What a robot base and its driver say to each other."""
         image = np.arange(48 * 64, dtype=np.uint8).reshape(48, 64)
@@ -117,6 +131,19 @@ class Samples:
             for kind in (".png", ".jpg", ".pgm", ".bmp", ".webp") for image in (grey, colour)
             if (kind, image.ndim) != (".pgm", 3)
         ]  # fmt: skip
+
+    def viewers(self) -> list[bytes]:
+        """What browsers send that look at the live view and say something: plain, compressed, nothing."""
+        head = b"GET /live HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+        head += b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: " + base64.b64encode(bytes(16)) + b"\r\n"
+        plain = [_frame(1, b"hello"), _frame(2, bytes(200)), _frame(9, b"1"), _frame(8, b"\x03\xe8gone")]
+        packed = zlib.compress(b"hello" * 20, wbits=-15)
+        offer = b"Sec-WebSocket-Extensions: permessage-deflate; client_max_window_bits\r\n"
+        return [
+            head + b"\r\n" + b"".join(plain),
+            head + b"Origin: http://127.0.0.1\r\n" + offer + b"\r\n" + _frame(0x41, packed),
+            head.replace(b"/live", b"/live?token=a", 1) + b"Cookie: session=a; b=c\r\n\r\n",
+        ]
 
     def store(self) -> bytes:
         """A server's store, as a file."""
@@ -191,6 +218,18 @@ def description() -> RobotDescription:
         path.write_text(CAMERA_TOML)
         camera, _ = read_camera(path)
     return RobotDescription(camera=camera, radius=0.12, axle=0.15, ranger_bearings=(0.8, 0.0, -0.8))
+
+
+def _frame(kind: int, payload: bytes) -> bytes:
+    """A frame of a WebSocket, by a browser, whose mask is zero.
+
+    Args:
+        kind: its opcode, and 0x40 if it is compressed.
+        payload: at most 65535 bytes.
+    """
+    short = len(payload) < 126
+    size = bytes([0x80 | len(payload)]) if short else b"\xfe" + len(payload).to_bytes(2, "big")
+    return bytes([0x80 | kind]) + size + bytes(4) + payload
 
 
 def _whole_database(path: Path) -> bytes:

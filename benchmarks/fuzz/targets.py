@@ -7,7 +7,6 @@ that it is not.
 
 from __future__ import annotations
 
-import asyncio
 import dataclasses
 import math
 from collections.abc import Callable, Mapping
@@ -20,7 +19,21 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from benchmarks.fuzz.texts import CAMERA_TOML, FORM, G2O, KEY, ROBOT_TOML, TUM
+from benchmarks.fuzz.recordings import RECORDINGS, RecordingTarget
+from benchmarks.fuzz.texts import (
+    CAMERA_TOML,
+    FORM,
+    G2O,
+    KEY,
+    NAV2_MAP,
+    PLACE,
+    PLAN_FORM,
+    RETIRE,
+    ROBOT_TOML,
+    TUM,
+    UNMERGE,
+    WORLD_TOML,
+)
 from mapweave.agent.drivers.arduino import parse_state
 from mapweave.agent.drivers.koala import parse_numbers
 from mapweave.agent.drivers.messages import decode_description, decode_observation, decode_step
@@ -34,20 +47,27 @@ from mapweave.agent.ros_messages.values import camera_of, pose_of
 from mapweave.formats.g2o import read_g2o
 from mapweave.hybridmap.constraint_subject import read_end
 from mapweave.hybridmap.errors import InvalidMessage, MapweaveError
+from mapweave.hybridmap.ids import NAME
 from mapweave.identities.key_file import read_key_file
+from mapweave.identities.key_folder import KeyFolder
+from mapweave.identities.tokens import read_tokens
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.settings import load_settings
+from mapweave.sim.worlds.file import load_world
 from mapweave.storage.image_file import decode_grey
 from mapweave.storage.map_file import pack_map_file, unpack_map_file
+from mapweave.storage.nav2_map import parse_nav2_map
 from mapweave.wire import messages
 from mapweave.wire.codec import decode_change, encode_change
+from mapweave.wire.credentials import Credentials, Role
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, Mark, NewestMap, decode_record
 from mapweave.wire.messages import LIMITS, decode_view, encode_view
 from mapweave.wire.pose_messages import PoseNews
 from mapweave.wire.ros2.attachment import decode_attachment
 from mapweave.wire.ros2.messages import decode as decode_ros2
+from mapweave.wire.zenoh_config import session_values
 
 if TYPE_CHECKING:
     from benchmarks.fuzz.http_application import HttpApplication
@@ -167,16 +187,45 @@ def _photo(data: bytes, _: Path) -> None:
 
 
 @cache
-def _application() -> HttpApplication:
+def application() -> HttpApplication:
     from benchmarks.fuzz.http_application import HttpApplication
 
     return HttpApplication()
 
 
 def _http(data: bytes, _: Path) -> None:
-    status = asyncio.run(_application().answer(data))
+    status = application().answer(data)
     if status >= HTTPStatus.INTERNAL_SERVER_ERROR and status != HTTPStatus.SERVICE_UNAVAILABLE:
         raise RuntimeError(f"HTTP {status}")
+
+
+def _live(data: bytes, _: Path) -> None:
+    application().watch(data)
+
+
+def _plans(data: bytes, folder: Path) -> None:
+    """An upload: the image of a floor plan, or a form of it and a map.yaml."""
+    _http(b"POST /plans multipart/form-data; boundary=b\n" + data, folder)
+
+
+def _nav2_map(data: bytes, folder: Path) -> None:
+    check_finite(parse_nav2_map(data, folder / "map.yaml"))
+
+
+def _fleet_file(path: Path) -> None:
+    """The list of a fleet's identities, and the rules of its router."""
+    folder = KeyFolder(path.parent)
+    check_finite(folder.catalogue)
+    for identity in folder.catalogue.identities:
+        _ = identity.state
+        if not NAME.fullmatch(identity.name):
+            raise AcceptedInvalid(f"the name {identity.name!r}")
+    session_values(folder.router("s0", own=Credentials("s0", Role.SERVER, password="secret")))
+
+
+def _tokens(path: Path) -> None:
+    for token in read_tokens(path.parent):
+        _ = token.expired
 
 
 def _file(name: str, read: Callable[[Path], object]) -> Callable[[bytes, Path], None]:
@@ -220,6 +269,10 @@ def _read_recording(path: Path) -> None:
     recording = open_recording(path)
     for number in range(min(len(recording.stamps_ns), 3)):
         recording.read(number)
+
+
+def _of_recordings(recordings: RecordingTarget) -> Target:
+    return Target(recordings.run, lambda _: recordings.samples(), 65536)
 
 
 def check_again(value: Any, encode: Callable[[Any], bytes], decode: Callable[[bytes], Any]) -> None:
@@ -267,7 +320,22 @@ TARGETS: dict[str, Target] = {
     "http": Target(_http, lambda s: [
         b"GET /status", b"GET /explain?a=r0.1&b=r1.1", b"GET /route?a=r0.1.1&b=r1.1.5",
         b"POST /relocalize\n" + s.images()[0], b"POST /robots/r0/go?goal=r0.1.1",
-        b"GET /static/../web.py", b"POST /stop"]),
+        b"GET /static/../web.py", b"POST /stop", b"GET /history", b"GET /missions", b"GET /map",
+        b"POST /relocalize?hfov=60 image/jpeg\n" + s.images()[2], b"POST /stop application/json\n{}",
+        b"POST /relocalize multipart/form-data; boundary=b\n" + FORM % s.images()[0],
+        b"POST /plans application/octet-stream\n" + s.images()[0],
+        b"POST /plans application/x-www-form-urlencoded\nimage=a", b"POST /constraints text/plain\n{}",
+        b"POST /constraints application/json; charset=utf-16\n" + UNMERGE.encode("utf-16"),
+        b"POST /constraints application/json\n" + UNMERGE.encode(),
+        b"POST /constraints application/json\n" + RETIRE.encode(),
+        b"POST /annotations application/json\n" + PLACE.encode(), b'POST /login\n{"token": "mw_a"}']),
+    "plans": Target(_plans, lambda s: [PLAN_FORM % s.images()[0], FORM % s.images()[0]], 16384),
+    "live": Target(_live, lambda s: s.viewers()),
+    "nav2_map": Target(_nav2_map, lambda _: [NAV2_MAP]),
+    "world": Target(_file("world.toml", load_world), lambda _: [WORLD_TOML.encode()]),
+    "fleet_file": Target(_file("fleet.json", _fleet_file), lambda s: [s.keys()[0]]),
+    "tokens": Target(_file("tokens.json", _tokens), lambda s: [s.keys()[1]]),
+    **{name: _of_recordings(recordings) for name, recordings in RECORDINGS.items()},
     "store": Target(_file("s0.sqlite", _read_store), lambda s: [s.store()], 131072),
     "journal": Target(_file("r0.sqlite", _read_journal), lambda s: [s.journal()], 131072),
     "recording": Target(_file("drive.mcap", _read_recording), lambda s: [s.recording()], 65536),

@@ -5,16 +5,34 @@ from __future__ import annotations
 import importlib
 import json
 import math
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
-from benchmarks.fuzz import benchmark, process
-from benchmarks.fuzz.targets import AcceptedInvalid, check_again, check_finite
+from benchmarks.fuzz import benchmark, http_application, process, targets
+from benchmarks.fuzz.http_application import HttpApplication
+from benchmarks.fuzz.recordings import RECORDINGS
+from benchmarks.fuzz.samples import Samples
+from benchmarks.fuzz.targets import TARGETS, AcceptedInvalid, check_again, check_finite
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.pose import Pose2
+
+
+@pytest.fixture(scope="module")
+def samples() -> Samples:
+    return Samples(1)
+
+
+@pytest.fixture
+def application() -> Iterator[HttpApplication]:
+    """The one that targets ask."""
+    made = targets.application()
+    yield made
+    made.close()
+    targets.application.cache_clear()
 
 
 class TwoLines(InvalidMessage):
@@ -47,6 +65,55 @@ def test_what_is_wrong_is_found_and_sorted(tmp_path: Path, monkeypatch: pytest.M
     assert counts.pop("peak_rss_mb") > 0
     assert counts == {"inputs": 7, "accepted": 1, "crashes": 2, "hangs": 1, "accepted_invalid": 1}
     assert {path.read_bytes() for path in tmp_path.glob("crashes-????????????")} == {b"crash", b"two lines"}
+
+
+def test_a_finding_is_counted_at_once(tmp_path: Path) -> None:
+    """LibFuzzer ends the process without coming back: before, findings of its last 0.2 s were not counted."""
+
+    def decode(data: bytes, _: Path) -> None:
+        if data == b"invalid":
+            raise AcceptedInvalid("inf")
+
+    fuzzing = process.Fuzzing(SimpleNamespace(run=decode), tmp_path)
+    for data in (b"fine", b"invalid"):
+        fuzzing.one(data)
+    assert json.loads((tmp_path / "counts.json").read_text())["accepted_invalid"] == 1
+
+
+NEW = [*RECORDINGS, "plans", "live", "nav2_map", "world", "fleet_file", "tokens"]
+
+
+@pytest.mark.parametrize("name", NEW)
+@pytest.mark.usefixtures("application")
+def test_good_samples_are_taken(name: str, samples: Samples, tmp_path: Path) -> None:
+    """What is refused at its beginning hides all that lies behind it from the fuzzer."""
+    good = TARGETS[name].samples(samples)
+    assert len(good) >= 1 and max(map(len, good)) <= TARGETS[name].most
+    for sample in good:
+        TARGETS[name].run(sample, tmp_path)
+
+
+def test_uploads_of_good_samples_are_kept(samples: Samples, application: HttpApplication) -> None:
+    """A target of HTTP takes refusals as well."""
+    kept = [
+        application.answer(b"POST /plans multipart/form-data; boundary=b\n" + form)
+        for form in TARGETS["plans"].samples(samples)
+    ]
+    assert kept == [200] * len(kept)
+
+
+def test_a_viewer_is_let_in(
+    samples: Samples, application: HttpApplication, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the heads of all samples; so the frames behind them are read."""
+    sent: list[bytes] = []
+    monkeypatch.setattr(http_application.Transport, "write", lambda self, data: sent.append(bytes(data)))
+    for number, sample in enumerate(samples.viewers()):
+        sent.clear()
+        application.watch(sample)
+        assert sent[0].startswith(b"HTTP/1.1 101 "), number
+        compressed = b"permessage-deflate" in sent[0]
+        assert compressed == (number == 1) and (compressed or b'"hello"' in b"".join(sent))
 
 
 def test_an_invalid_value_is_noticed() -> None:
