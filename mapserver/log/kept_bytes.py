@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.store import ROW_BYTES, Store
+from mapweave.mapserver.log.store import PRUNING_MARK, ROW_BYTES, Store
 
 LEAST_GROWN = 2**22
 """Bytes of a map that must have come before it is compacted."""
@@ -54,6 +54,8 @@ class KeptBytes:
         self._maps: dict[MapId, _Kept] = {}
         self._behind: set[MapId] | None = None
         """Maps of which another server has taken changes; None: nothing has been read."""
+        self._mark: bytes | None = None
+        """Of what was pruned when they were read."""
 
     def grown(self, map_id: MapId) -> None:
         """Another server has taken changes of a map."""
@@ -61,13 +63,15 @@ class KeptBytes:
             self._behind.add(map_id)
 
     def read(self) -> None:
-        """Count what came since, by this process or another.
+        """Count what came since, by this process or another; all of it if some was pruned since.
 
         Raises:
             InvalidFile: the store cannot be read.
         """
-        if self._behind is None:
-            self._behind = set(self._store.maps(self._agent))
+        mark = self._store.result(PRUNING_MARK)
+        if self._behind is None or mark != self._mark:
+            self._maps, self._behind = {}, set(self._store.maps(self._agent))
+            self._mark = mark
         while self._behind:
             map_id = next(iter(self._behind))
             kept = self._maps.setdefault(map_id, _Kept())

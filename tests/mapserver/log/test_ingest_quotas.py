@@ -14,11 +14,12 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log import ingest, intake, kept_bytes, known_logs, pull_schedule, pulled
 from mapweave.mapserver.log.entry import Entry
 from mapweave.mapserver.log.intake import ADVICE
 from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.mapserver.log.store import PRUNING_MARK
 from mapweave.mapserver.quotas import BURST, Quotas, QuotaSettings
 from mapweave.wire.bus import Request
 from mapweave.wire.codec import encode_body
@@ -258,6 +259,22 @@ def test_bytes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
     server.quotas = Quotas(QuotaSettings(megabytes=1.0))
     server.begin()
     assert replicator.wait_acknowledged(60)
+
+
+def test_what_was_pruned_makes_room_for_the_robot(
+    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where its map grows no more, and where another server has pruned it."""
+    monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
+    server = Server(hub, tmp_path / "s0.sqlite", quotas=Quotas(QuotaSettings(megabytes=0.2)))
+    cleanup.callback(server.end)
+    map_id, replicator = robot(hub, tmp_path, cleanup)
+    rng = np.random.default_rng(1)
+    replicator.submit([node(map_id, number, rng) for number in range(1, 61)], 1)
+    eventually(lambda: "`megabytes`" in replicator.status().failure)
+    nodes = [NodeId(*map_id, number) for number in range(1, server.store.watermark(map_id) + 1)]
+    assert server.store.prune(nodes, [], {PRUNING_MARK: b"1"})
+    assert replicator.wait_acknowledged(60) and not replicator.status().failure
 
 
 def test_logs_that_never_answer_do_not_hold_up_one_that_does(
