@@ -113,6 +113,8 @@ class RobotContract:
     """Of a wheel, m/s: what the robot's command can say."""
     COUNT: float
     """Way of a wheel for a step of what it reads, m."""
+    CHILD: ClassVar[str] = CHILD
+    """A program that drives the robot of the settings that it is given, for ever."""
     OPTIONS: ClassVar[dict[str, Any]] = {}
     GEOMETRY: ClassVar[dict[str, Any]] = {}
 
@@ -225,7 +227,7 @@ class RobotContract:
         self, settings: Path, emulator: Any, end: signal.Signals
     ) -> None:
         child = subprocess.Popen(
-            [sys.executable, "-c", CHILD, str(settings)], stdout=subprocess.PIPE, cwd=ROOT,
+            [sys.executable, "-c", self.CHILD, str(settings)], stdout=subprocess.PIPE, cwd=ROOT,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
         )  # fmt: skip
         try:
