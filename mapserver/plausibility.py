@@ -125,9 +125,12 @@ def unreliable_robots(
 
 
 def scattered(maps: Mapping[MapId, HybridMap], pruned: Container[MapId] = ()) -> dict[MapId, str]:
-    """The first fragment of each robot that leaves very many; see `fragments`."""
+    """The fragments of each robot that leaves very many, in words; see `fragments`.
+
+    One view that comes again in many maps would move the nodes of others as often as it comes.
+    """
     by_robot: dict[str, list[MapId]] = {}
     for map_id in fragments(maps, pruned):
         by_robot.setdefault(map_id.agent, []).append(map_id)
     words = f"its robot has left {MOST_FRAGMENTS} maps and more with fewer than {LEAST_NODES} nodes each"
-    return {some[0]: words for some in by_robot.values() if len(some) >= MOST_FRAGMENTS}
+    return {one: words for some in by_robot.values() if len(some) >= MOST_FRAGMENTS for one in some}

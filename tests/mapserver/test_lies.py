@@ -263,7 +263,7 @@ def test_fragments_make_no_answer_ambiguous() -> None:
         for number, body in enumerate(views(map_id, Pose2(1.0, 2.0, 0.5), STEP)[:3], start=1):
             merger.on_change(Change(map_id, number, 0, body))
     merged = merger.merged()
-    assert list(merged.implausible) == [LAST]
+    assert list(merged.implausible) == [MapId(LAST.agent, epoch) for epoch in range(1, MOST_FRAGMENTS + 2)]
     relocalizer = Answers.of(merger, merged, merger.node).relocalizer
     assert [relocalizer.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
 
@@ -337,6 +337,35 @@ def test_many_maps_of_one_robot_that_contradict_each_other_make_no_answer_ambigu
     assert len(merged.implausible) == (count if count > MOST_FRAGMENTS else 0)
     if merged.implausible:
         assert certainties(merger, merged) == [Certainty.FOUND] * 2
+
+
+def test_a_view_that_comes_again_in_many_fragments_moves_no_nodes_of_others() -> None:
+    """It is true, and would count as often as it comes."""
+    merger, rng = Merger(), np.random.default_rng(3)
+    for log in sound_logs().values():
+        for message in log:
+            merger.on_change(decode_change(message))
+    before = merger.merged()
+    beside = Pose2(0.1, 0.1, 0.2)
+    nodes = take_map(WORLD, LAST, [TOUR[3], TOUR[3] @ beside, TOUR[0]], np.random.default_rng(8))[0]
+    # Of the third view less is seen: else nothing would be joined.
+    nodes[2] = replace(nodes[2], landmarks=nodes[2].landmarks.take(np.arange(0, 90, 2)))
+    for epoch in range(1, MOST_FRAGMENTS + 2):
+        steps = [beside, Pose2.from_vector(rng.uniform(-3.0, 3.0, 3))]
+        for number, body in enumerate(driven(MapId(LAST.agent, epoch), nodes, steps), start=1):
+            merger.on_change(Change(MapId(LAST.agent, epoch), number, 0, body))
+    after = merger.merged()
+    maps = {MapId(LAST.agent, epoch) for epoch in range(1, MOST_FRAGMENTS + 2)}
+    assert {end.map for link in after.links for end in link.pair} & maps, "some are joined"
+    first = min(before.poses)
+    moved = [
+        (before.pose(first).inverse() @ before.pose(node)).distance(
+            after.pose(first).inverse() @ after.pose(node)
+        )
+        for node in before.poses
+    ]
+    assert max(moved) < 1e-6
+    assert after.implausible.keys() == maps
 
 
 def test_places_of_an_implausible_map_answer_only_where_no_other_map_does() -> None:
