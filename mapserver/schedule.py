@@ -1,8 +1,12 @@
 """When the server's work runs and what time it is: on threads by the machine's clock, or in lock-step.
 
-The parts of the server use neither threads nor `time`: they hand their work to a schedule. Robots get
-`LiveSchedule`. A repeatable simulation drives the same parts by `LockstepSchedule`, where time stops and work
-runs in the calling thread, in the order in which it was handed over.
+Merging, answering and what is done now and then hand their work to a schedule. Robots get `LiveSchedule`. A
+repeatable simulation drives the same parts by `LockstepSchedule`, where time stops and work runs in the
+calling thread, in the order in which it was handed over.
+
+The intake of changes (log/ingest.py) has a thread and a clock of its own: what it takes in does not depend on
+them, and lock-step waits until all of it is taken. So has the place index above 100 000 landmarks, which no
+repeatable simulation reaches.
 """
 
 from __future__ import annotations
