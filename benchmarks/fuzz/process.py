@@ -33,7 +33,8 @@ DECODERS = [
     "mapweave.wire", "mapweave.storage", "mapweave.agent.recordings", "mapweave.agent.ros_messages",
     "mapweave.agent.drivers", "mapweave.agent.replication", "mapweave.mapserver.http",
     "mapweave.mapserver.log",
-    "mapweave.hybridmap", "mapweave.identities", "mapweave.formats", "mapweave.sim.worlds",
+    "mapweave.hybridmap", "mapweave.identities", "mapweave.formats", "mapweave.sim.worlds.file",
+    "mapweave.sim.worlds.design",
 ]  # fmt: skip
 COMPILED = ["mapweave.wire.landmark_reader", "mapweave.wire.rans", "mapweave.hybridmap.jit"]
 """Modules with kernels: numba cannot compile functions that count their branches."""
