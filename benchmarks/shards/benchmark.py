@@ -1,6 +1,7 @@
 """A server with its place index in shards of a Ray cluster, against one without: the same, and how fast?
 
-    python -m benchmarks.shards [--shards N ...] [--robots N] [--nodes N] [--seconds S] [--seed N] [--json]
+    python -m benchmarks.shards [--shards N ...] [--robots N] [--nodes N] [--seconds S] [--seed N]
+                                [--store sqlite|postgresql] [--json]
 
 Real `mapweave server` processes over Zenoh on loopback, and a Ray cluster of several nodes, all on the
 cores of this machine. Each server reads the logs of a fleet that has mapped one building, merges them, and
@@ -11,8 +12,14 @@ the links of the server without Ray; `max_pose_difference_m`, of any node's merg
 With the most shards, processes are killed (`--kills`) while robots ask and two robots map on: a shard, a
 worker, the gateway, the server (started again), the head (another is started once answers are whole).
 `recovery_s` is the longest time without a whole answer after a kill, `recovery_s_p95` that of all kills;
-`lost`, acknowledged nodes that are not in the map at the end, and questions without an answer; `wrong`,
-answers "found" further than 0.5 m from the truth, with or without kills.
+`acknowledged_s`, how long after a kill what robots sent first behind it is acknowledged; `lost`, nodes that
+are not in the map of each server at the end, robots of which not all is acknowledged, and questions without
+an answer; `wrong`, answers "found" further than 0.5 m from the truth, with or without kills.
+
+With `--store postgresql` two front servers, each with its gateway and shards, share a PostgreSQL, which is a
+primary with a synchronous standby, and robots reach them by a router. `server` is then the first of them. The
+second one (`front`) is killed as well, and the primary: the standby is promoted at once, so in a real set-up
+the time in which a primary is taken for dead is added. The server without Ray is alone, with SQLite.
 """
 
 from __future__ import annotations
@@ -22,9 +29,9 @@ import json
 import os
 import signal
 import tempfile
-import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -35,88 +42,23 @@ from rich.progress import Progress
 from rich.table import Table
 
 from benchmarks.command_line import command_line
-from benchmarks.shards.askers import ASK_WITHIN, PATIENCE, Askers
-from benchmarks.shards.fleet import FLEET, BuildingFleet, MappingRobot
-from benchmarks.shards.ray_nodes import RayNodes, descendants
+from benchmarks.shards.askers import PATIENCE, Askers
+from benchmarks.shards.fleet import BuildingFleet, MappingRobot
+from benchmarks.shards.ray_nodes import RayNodes
+from benchmarks.shards.servers import MapServers
+from benchmarks.shards.shared_store import SharedStore
 from mapweave.hybridmap.change import EdgePut
-from mapweave.scenarios.children import Children, free_port
-from mapweave.storage.map_file import MapFile, unpack_map_file
-from mapweave.wire.bus_settings import BusSettings
-from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import decode_record
-from mapweave.wire.zenoh_bus import ZenohBus
+from mapweave.scenarios.children import ChildFailed
+from mapweave.storage.map_file import MapFile
 
 KILLS = ("worker", "shard", "gateway", "server", "head")
+SHARED_KILLS = ("front", "primary")
+"""With PostgreSQL also these."""
+SQLITE, POSTGRESQL = "sqlite", "postgresql"
 LATE = 2
 """Robots that join later."""
 AFTER = 4.0
 """s after a kill before the next one, at least."""
-PERIOD = 0.3
-"""s between two changes of a robot that maps on."""
-
-
-class Server:
-    """A `mapweave server` process. A context manager."""
-
-    def __init__(self, folder: Path, shards: int, cluster: RayNodes | None) -> None:
-        """Choose its folder, which has its store.
-
-        Args:
-            folder: for all its files.
-            shards: parts of the place index.
-            cluster: None: without Ray.
-        """
-        self.endpoint = f"tcp/127.0.0.1:{free_port()}"
-        self._folder, self._shards, self._cluster = folder, shards, cluster
-        (folder / "server.toml").write_text(f"[cluster]\nshards = {shards}\n")
-        self.children = Children(folder / "logs")
-
-    def __enter__(self) -> Server:
-        """Start it."""
-        self.start()
-        self.bus = ZenohBus(BusSettings(endpoints=(self.endpoint,)))
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """End it."""
-        self.bus.close()
-        self.children.end("server")
-
-    def start(self) -> None:
-        """Start it, or start it again."""
-        ray = [] if self._cluster is None else ["--ray", self._cluster.address]
-        self.children.start("server", [
-            "server", "--fleet", FLEET, "--listen", self.endpoint, "--data", str(self._folder),
-            "--settings", str(self._folder / "server.toml"), *ray,
-        ])  # fmt: skip
-
-    def kill(self) -> None:
-        """Kill -9."""
-        self.children.kill("server")
-
-    def gateway(self) -> int:
-        """The process between it and Ray."""
-        ours = descendants(self.children.pid("server"))
-        return next(pid for pid in ours if b"gateway_process" in Path(f"/proc/{pid}/cmdline").read_bytes())
-
-    def wait(self, nodes: int) -> None:
-        """Wait until so many nodes are merged, and shards, if there are any, answer themselves."""
-        end = time.monotonic() + PATIENCE
-        wanted = f"{self._shards} of {self._shards} shards" if self._cluster else ""
-        status: dict[str, Any] = {}
-        while time.monotonic() < end:
-            self.children.check()
-            for reply in self.bus.ask(Keys(FLEET).server_status("s0"), b"", ASK_WITHIN):
-                if not reply.error:
-                    status = decode_record(reply.payload)
-            if status.get("settled") and int(status["nodes"]) >= nodes and status["cluster"] == wanted:
-                return
-            time.sleep(0.1)
-        raise SystemExit(f"the server is not ready in {PATIENCE:g} s: {status}")
-
-    def map(self) -> MapFile:
-        """The merged map."""
-        return unpack_map_file(self.bus.ask(Keys(FLEET).server_map("s0"), b"", PATIENCE)[0].payload)
 
 
 def links_of(content: MapFile) -> set[tuple[str, str]]:
@@ -141,27 +83,43 @@ def compared(content: MapFile, reference: MapFile) -> dict[str, Any]:
     }
 
 
+def all_compared(contents: Sequence[MapFile], reference: MapFile) -> dict[str, Any]:
+    """The same of the merged maps of several servers: what differs most."""
+    rows = [compared(content, reference) for content in contents]
+    return {
+        "links": rows[0]["links"],
+        "same_links": all(row["same_links"] for row in rows),
+        "max_pose_difference_m": max(row["max_pose_difference_m"] for row in rows),
+    }
+
+
 def measure(
-    fleet: BuildingFleet, folder: Path, shards: int, cluster: RayNodes | None, o: argparse.Namespace
-) -> tuple[dict[str, Any], MapFile]:
-    """One server: its figures, and its map."""
+    fleet: BuildingFleet,
+    folder: Path,
+    shards: int,
+    cluster: RayNodes | None,
+    store: SharedStore | None,
+    o: argparse.Namespace,
+) -> tuple[dict[str, Any], list[MapFile]]:
+    """One server, or two on a store that they share: their figures, and their maps."""
     early = o.robots - LATE
-    fleet.write(folder / "s0.sqlite", range(early))
+    servers = MapServers(folder, shards, cluster, store)
+    fleet.write(servers.address, range(early))
     began = time.monotonic()
-    with Server(folder, shards, cluster) as server:
-        server.wait(early * o.nodes)
+    with servers:
+        servers.wait(early * o.nodes)
         start_s = time.monotonic() - began
         began = time.monotonic()
-        robots = [MappingRobot(log, server.endpoint, folder) for log in fleet.logs[early:]]
+        robots = [MappingRobot(log, servers.endpoint, folder, servers.names) for log in fleet.logs[early:]]
         for robot in robots:
             while robot.map_on():
                 pass
-        server.wait(len(fleet.nodes))
+        servers.wait(len(fleet.nodes))
         merge_s = time.monotonic() - began
         for robot in robots:
             robot.close()
-        content = server.map()
-        askers = Askers(fleet, server.endpoint, o.askers)
+        contents = servers.maps()
+        askers = Askers(fleet, servers.endpoint, o.askers)
         time.sleep(o.seconds)
         tally = askers.close()
     took = 1e3 * np.array(tally.seconds)
@@ -175,7 +133,7 @@ def measure(
         "partial": sum(not whole for _, whole in tally.answers),
         "wrong": tally.wrong,
         "lost": tally.unanswered,
-    }, content
+    }, contents
 
 
 def killed(
@@ -183,66 +141,73 @@ def killed(
     folder: Path,
     shards: int,
     cluster: RayNodes,
+    store: SharedStore | None,
     reference: MapFile,
     o: argparse.Namespace,
 ) -> dict[str, Any]:
     """Kill processes while robots ask and map on."""
     early = o.robots - LATE
-    fleet.write(folder / "s0.sqlite", range(early))
     recovery: dict[str, float] = {}
-    with Server(folder, shards, cluster) as server:
-        server.wait(early * o.nodes)
-        robots = [MappingRobot(log, server.endpoint, folder) for log in fleet.logs[early:]]
-        stop = threading.Event()
-
-        def map_on() -> None:
-            left = robots
-            while left := [robot for robot in left if robot.map_on()]:
-                stop.wait(PERIOD)
-
-        mapping = threading.Thread(target=map_on)
-        mapping.start()
-        askers = Askers(fleet, server.endpoint, o.askers)
+    acknowledged: dict[str, float] = {}
+    servers = MapServers(folder, shards, cluster, store)
+    fleet.write(servers.address, range(early))
+    with servers:
+        servers.wait(early * o.nodes)
+        robots = [MappingRobot(log, servers.endpoint, folder, servers.names) for log in fleet.logs[early:]]
+        askers = Askers(fleet, servers.endpoint, o.askers)
+        # Behind each kill as much of their logs, and a part is on its way when it happens.
+        share = max(len(fleet.logs[-1]) // (2 * len(o.kills)), 1)
         for kind in o.kills:
-            wait_until(partial(askers.tally.whole, time.monotonic()))
+            wait_until(partial(askers.tally.whole, time.monotonic()), f"before {kind}: no whole answers")
+            for robot in robots:
+                robot.map_on(share)
             since = time.monotonic()
-            kill(kind, server, cluster)
-            time.sleep(AFTER)
-            wait_until(partial(askers.tally.whole, since + AFTER))
+            kill(kind, servers, cluster, store)
+            for robot in robots:
+                robot.map_on(share)
+            if not all(robot.acknowledged(PATIENCE) for robot in robots):
+                raise SystemExit(f"not all is acknowledged {PATIENCE:g} s after a kill: {kind}")
+            acknowledged[kind] = round(time.monotonic() - since, 2)
+            time.sleep(max(since + AFTER - time.monotonic(), 0.0))
+            wait_until(partial(askers.tally.whole, since + AFTER), f"after {kind}: no whole answers")
             if kind == "head":
                 cluster.start_head()
-            server.wait(0)
+            servers.wait(0)
             recovery[kind] = round(askers.tally.recovery(since), 2)
-        stop.set()
-        mapping.join()
+        for robot in robots:
+            while robot.map_on():
+                pass
         unacknowledged = sum(not robot.acknowledged(PATIENCE) for robot in robots)
-        server.wait(len(fleet.nodes))
-        content = server.map()
+        servers.wait(len(fleet.nodes))
+        contents = servers.maps()
         tally = askers.close()
         for robot in robots:
             robot.close()
-    missing = sum(node.id not in content.poses for node in fleet.nodes)
+    missing = sum(node.id not in content.poses for content in contents for node in fleet.nodes)
     return {
         "recovery_s": recovery,
         "recovery_s_p95": round(float(np.percentile([*recovery.values()], 95)), 2),
+        "acknowledged_s": acknowledged,
         "lost": missing + unacknowledged + tally.unanswered,
         "wrong": tally.wrong,
         "found": tally.found,
         "partial": sum(not whole for _, whole in tally.answers),
         "asked_again": tally.asked_again,
-        **compared(content, reference),
+        **all_compared(contents, reference),
     }
 
 
-def kill(kind: str, server: Server, cluster: RayNodes) -> None:
-    """Kill -9 one process of a kind."""
-    if kind == "server":
-        server.kill()
-        server.start()
+def kill(kind: str, servers: MapServers, cluster: RayNodes, store: SharedStore | None) -> None:
+    """Kill -9 one process of a kind, of PostgreSQL all."""
+    if kind in ("server", "front"):
+        servers.restart(servers.names[0 if kind == "server" else 1])
+    elif kind == "primary":
+        assert store is not None
+        store.lose_primary()
     elif kind == "head":
         cluster.kill_head()
     elif kind == "gateway":
-        os.kill(server.gateway(), signal.SIGKILL)
+        os.kill(servers.gateway(), signal.SIGKILL)
     else:
         titles = {"shard": ("ray::ShardServer",), "worker": ("ray::answer_work", "ray::IDLE")}[kind]
 
@@ -250,16 +215,16 @@ def kill(kind: str, server: Server, cluster: RayNodes) -> None:
             return [pid for title in titles for pid in cluster.processes(title)]
 
         # Ray starts a worker when there is work.
-        wait_until(found)
+        wait_until(found, f"no {kind} to kill")
         os.kill(found()[0], signal.SIGKILL)
 
 
-def wait_until(condition: Callable[[], object]) -> None:
-    """Wait for a condition; end the benchmark if it does not come true."""
+def wait_until(condition: Callable[[], object], what: str) -> None:
+    """Wait for a condition; end the benchmark, and say what is missing, if it does not come true."""
     end = time.monotonic() + PATIENCE
     while not condition():
         if time.monotonic() > end:
-            raise SystemExit(f"no whole answers, or no process to kill, for {PATIENCE:g} s")
+            raise SystemExit(f"{what} for {PATIENCE:g} s")
         time.sleep(0.05)
 
 
@@ -271,7 +236,7 @@ def table(rows: dict[str, dict[str, Any]]) -> Table:
     return out
 
 
-def main() -> None:
+def main(arguments: Sequence[str] | None = None) -> None:
     """Measure and print."""
     parser = command_line("shards", __doc__, whole=True)
     parser.add_argument("--shards", type=int, nargs="+", default=[1, 2, 4], metavar="N")
@@ -280,32 +245,46 @@ def main() -> None:
     parser.add_argument("--askers", type=int, default=4, help="lost robots that ask at once")
     parser.add_argument("--seconds", type=float, default=5.0, help="of asking")
     parser.add_argument("--ray-nodes", type=int, default=3, help="of the cluster")
-    parser.add_argument("--kills", nargs="*", choices=KILLS, default=list(KILLS))
-    o = parser.parse_args()
+    parser.add_argument("--store", choices=(SQLITE, POSTGRESQL), default=SQLITE)
+    parser.add_argument("--kills", nargs="*", choices=KILLS + SHARED_KILLS, help="default: all of the store")
+    o = parser.parse_args(arguments)
+    of_store = KILLS + (SHARED_KILLS if o.store == POSTGRESQL else ())
+    if o.kills is None:
+        o.kills = list(of_store)
+    if not {*o.kills} <= {*of_store}:
+        parser.error(f"--kills {' '.join(SHARED_KILLS)}: with --store {POSTGRESQL} alone")
     if min(*o.shards, o.robots - LATE, o.nodes, o.askers, o.ray_nodes) < 1 or o.seconds <= 0.0:
         parser.error(f"numbers must be positive, and there must be more than {LATE} robots")
     fleet = BuildingFleet(o.robots, o.nodes, o.seed)
     rows: dict[str, dict[str, Any]] = {}
-    with tempfile.TemporaryDirectory() as name, Progress(console=Console(stderr=True)) as progress:
-        folder = Path(name)
+    with ExitStack() as stack:
+        folder = Path(stack.enter_context(tempfile.TemporaryDirectory()))
+        progress = stack.enter_context(Progress(console=Console(stderr=True)))
         step = progress.add_task("one server without Ray", total=len(o.shards) + 2)
-        rows["without"], reference = measure(fleet, folder / "without", 1, None, o)
+        store = None
+        if o.store == POSTGRESQL:
+            try:
+                store = stack.enter_context(SharedStore(folder))
+            except ChildFailed as failed:
+                raise SystemExit(str(failed)) from None
+        rows["without"], (reference,) = measure(fleet, folder / "without", 1, None, None, o)
         progress.update(step, advance=1, description="a cluster")
-        with RayNodes(o.ray_nodes, folder) as cluster:
-            os.environ.update(cluster.token)
-            for shards in o.shards:
-                progress.update(step, advance=1, description=f"{shards} shards")
-                row, content = measure(fleet, folder / str(shards), shards, cluster, o)
-                rows[f"{shards} shards"] = row | compared(content, reference)
-            if o.kills:
-                progress.update(step, description="processes are killed")
-                rows["killed"] = killed(fleet, folder / "killed", max(o.shards), cluster, reference, o)
-            progress.update(step, advance=1)
+        cluster = stack.enter_context(RayNodes(o.ray_nodes, folder))
+        os.environ.update(cluster.token)
+        for shards in o.shards:
+            progress.update(step, advance=1, description=f"{shards} shards")
+            row, contents = measure(fleet, folder / str(shards), shards, cluster, store, o)
+            rows[f"{shards} shards"] = row | all_compared(contents, reference)
+        if o.kills:
+            progress.update(step, description="processes are killed")
+            rows["killed"] = killed(fleet, folder / "killed", max(o.shards), cluster, store, reference, o)
+        progress.update(step, advance=1)
     Console(stderr=o.json).print(table(rows))
     if o.json:
         sharded = [row for name, row in rows.items() if name != "without"]
         print(json.dumps({
             "robots": o.robots, "nodes": len(fleet.nodes), "seed": o.seed, "cores": os.cpu_count(),
+            "store": o.store,
             "same_links": all(row["same_links"] for row in sharded),
             "max_pose_difference_m": max(row["max_pose_difference_m"] for row in sharded),
             "lost": sum(row["lost"] for row in rows.values()),

@@ -14,12 +14,13 @@ from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RelocalizeAnswer
+from mapweave.mapserver.log.opening import open_store
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import encode_view
 from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.building import Building
-from synthetic.maps import write_store
+from synthetic.maps import fill_store
 
 FLEET = "shards"
 WRONG_M = 0.5
@@ -50,11 +51,12 @@ class BuildingFleet:
         self.nodes = [body.node for log in self.logs for _, body in log if isinstance(body, NodePut)]
         self._seed = seed
 
-    def write(self, store: Path, robots: Sequence[int]) -> None:
-        """Write the logs of some robots to a store."""
-        store.parent.mkdir(parents=True, exist_ok=True)
+    def write(self, address: Path | str, robots: Sequence[int]) -> None:
+        """Write the logs of some robots to an empty store: a file, or a PostgreSQL database."""
         logs = [self.logs[robot] for robot in robots]
-        write_store(store, {log[0][0]: [body for _, body in log] for log in logs})
+        store = open_store(address)
+        fill_store(store, {log[0][0]: [body for _, body in log] for log in logs})
+        store.close()
 
     def questions(self, count: int) -> list[tuple[bytes, Pose2]]:
         """Views a little beside nodes, as messages, and where each was taken."""
@@ -76,24 +78,33 @@ class BuildingFleet:
 class MappingRobot:
     """Sends a log, a node at a time, as an agent does."""
 
-    def __init__(self, log: list[tuple[MapId, ChangeBody]], endpoint: str, folder: Path) -> None:
-        """Connect."""
+    def __init__(
+        self, log: list[tuple[MapId, ChangeBody]], endpoint: str, folder: Path, servers: Sequence[str]
+    ) -> None:
+        """Connect.
+
+        Args:
+            log: to be sent.
+            endpoint: where.
+            folder: for its journal.
+            servers: that all have to have it.
+        """
         self._bus = ZenohBus(BusSettings(endpoints=(endpoint,)))
         self.agent = log[0][0].agent
         self._journal = Journal(folder / f"{self.agent}.sqlite", self.agent)
         self._map = self._journal.open_map(1)
         assert self._map == log[0][0], self._map
-        self._replicator = Replicator(self._bus, Keys(FLEET), self._journal, self._map, ["s0"])
+        self._replicator = Replicator(self._bus, Keys(FLEET), self._journal, self._map, servers)
         self._left = [body for _, body in log][::-1]
 
-    def map_on(self) -> bool:
-        """Send the next change, if there is one."""
-        if self._left:
+    def map_on(self, changes: int = 1) -> bool:
+        """Send the next changes, as far as there are any; says whether more are left."""
+        for _ in range(min(changes, len(self._left))):
             self._replicator.submit([self._left.pop()], time.time_ns())
         return bool(self._left)
 
     def acknowledged(self, timeout: float) -> bool:
-        """Whether the server has all that was sent, within so many seconds."""
+        """Whether all servers have all that was sent, within so many seconds."""
         return self._replicator.wait_acknowledged(timeout)
 
     def close(self) -> None:

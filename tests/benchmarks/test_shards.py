@@ -2,14 +2,30 @@
 
 from __future__ import annotations
 
-import importlib.util
 import json
 import subprocess
 import sys
+import tempfile
+from importlib.util import find_spec
+from pathlib import Path
 
 import pytest
 
+from benchmarks.shards import benchmark
 from benchmarks.shards.askers import IN_A_ROW, Tally
+from benchmarks.shards.benchmark import all_compared, main
+from benchmarks.shards.fleet import BuildingFleet
+from benchmarks.shards.shared_store import NEEDED, SharedStore
+from mapweave.mapserver.log.opening import open_store
+from synthetic.postgres_server import binaries
+
+WITHOUT = "needs the extra `postgres` and Debian's package postgresql"
+
+
+def standbys() -> bool:
+    """Whether there is a PostgreSQL that can have standbys."""
+    found = binaries()
+    return bool(find_spec("psycopg") and found and all((found / name).exists() for name in NEEDED))
 
 
 def test_recovery_by_hand() -> None:
@@ -19,10 +35,50 @@ def test_recovery_by_hand() -> None:
     assert tally.whole(4.55) and not tally.whole(5.0)
 
 
+@pytest.mark.parametrize("kind", ["primary", "front"])
+def test_a_file_has_no_second_server_and_no_primary(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["--kills", "shard", kind])
+    assert "with --store postgresql alone" in capsys.readouterr().err
+
+
+def test_maps_of_two_servers_are_as_good_as_the_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+    rows = iter([
+        {"links": 30, "same_links": True, "max_pose_difference_m": 0.0},
+        {"links": 29, "same_links": False, "max_pose_difference_m": 0.25},
+    ])  # fmt: skip
+    monkeypatch.setattr(benchmark, "compared", lambda content, reference: next(rows))
+    assert all_compared([None, None], None) == {  # type: ignore[arg-type, list-item]
+        "links": 30, "same_links": False, "max_pose_difference_m": 0.25,
+    }  # fmt: skip
+
+
 @pytest.mark.slow
-@pytest.mark.skipif(importlib.util.find_spec("ray") is None, reason="needs the extra cluster: Ray")
-def test_a_small_run() -> None:
-    arguments = "--shards 2 --robots 4 --nodes 12 --seconds 1 --ray-nodes 2 --kills shard --seed 1 --json"
+def test_a_lost_primary_has_a_standby_with_all_that_was_stored(tmp_path: Path) -> None:
+    """The address names both machines: the standby is found by it."""
+    if not standbys():
+        pytest.skip(WITHOUT)
+    fleet = BuildingFleet(2, 4, 8963)
+    # A socket's path is short.
+    with tempfile.TemporaryDirectory() as place, SharedStore(Path(place)) as shared:
+        address = shared.database()
+        fleet.write(address, range(2))
+        shared.lose_primary()
+        store = open_store(address)
+        assert {map_id for map_id, _ in (log[0] for log in fleet.logs)} == set(store.positions())
+        for log in fleet.logs:
+            assert len([*store.replay(log[0][0])]) == len(log)
+        store.close()
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra cluster: Ray")
+@pytest.mark.parametrize(("store", "kind"), [("sqlite", "shard"), ("postgresql", "primary")])
+def test_a_small_run(store: str, kind: str) -> None:
+    if store == "postgresql" and not standbys():
+        pytest.skip(WITHOUT)
+    sizes = "--shards 2 --robots 4 --nodes 12 --seconds 1 --ray-nodes 2"
+    arguments = f"{sizes} --store {store} --kills {kind} --seed 1 --json"
     run = subprocess.run(
         [sys.executable, "-m", "benchmarks.shards", *arguments.split()],
         capture_output=True, text=True, timeout=220,
@@ -32,4 +88,5 @@ def test_a_small_run() -> None:
     assert figures["same_links"] and figures["max_pose_difference_m"] <= 0.001
     assert (figures["lost"], figures["wrong"]) == (0, 0)
     assert figures["sizes"]["2 shards"]["links"] > 20 and figures["sizes"]["2 shards"]["found"] > 10
-    assert figures["sizes"]["killed"]["recovery_s"]["shard"] < 60.0
+    assert figures["sizes"]["killed"]["recovery_s"][kind] < 60.0
+    assert 0.0 < figures["sizes"]["killed"]["acknowledged_s"][kind] < 60.0
