@@ -18,6 +18,7 @@ from mapweave.hybridmap.agent_status import Status, one_line
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import (
+    AT_START,
     MAX_KEPT,
     MissionKind,
     MissionOrder,
@@ -29,8 +30,6 @@ log = logging.getLogger(__name__)
 
 GONE = 10.0
 """A server that is out of reach for so long is gone, s: a router that is started again is back by then."""
-FIRST = "start"
-"""Gives the mission that the agent begins with."""
 MAPPING = (MissionKind.EXPLORE, MissionKind.CARRIED)
 NEVER_HOLDS = (MissionState.REFUSED, MissionState.REPLACED)
 """States of missions that no longer hold, whatever their stamp."""
@@ -112,7 +111,7 @@ class MissionControl:
         report = self.report
         newest = 0 if report is None else report.order.stamp_ns
         with self._lock:
-            self._taken(MissionOrder.new(self._robot, kind, FIRST, after_ns=newest))
+            self._taken(MissionOrder.new(self._robot, kind, AT_START, after_ns=newest))
         self.save()
 
     def take(self, order: MissionOrder) -> MissionReport:

@@ -25,6 +25,8 @@ MAX_VIA = 16
 MOST_APART_NS = 86_400_000_000_000
 """By which the stamps of two orders differ at most if both clocks are right: none is under way for a day."""
 
+AT_START = "start"
+"""In place of a person: the mission with which an agent is started."""
 MAX_TEXT = 64
 MAX_BECAUSE = 300
 Because = Annotated[str, Meta(max_length=MAX_BECAUSE)]

@@ -14,7 +14,7 @@ from mapweave.hybridmap.agent_status import HandDrive
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.limits import MAX_WORDS
 from mapweave.hybridmap.map_event import History, MapEvent, MapEventKind
-from mapweave.hybridmap.mission_order import MissionOrder
+from mapweave.hybridmap.mission_order import AT_START, MissionOrder
 from mapweave.wire.messages import decode, encode
 
 log = logging.getLogger(__name__)
@@ -90,6 +90,8 @@ class CommandHistory:
             order: the mission.
             heard: whether the robot says so: then who has given it is that robot's word.
         """
+        if heard and order.by == AT_START:
+            return  # A person has started the agent, and not sent the robot.
         because = f': "{order.because}"' if order.because else ""
         known = f"mission {order.id}" + (f", as {order.robot} says" if heard else "")
         self._note(f"{order.robot}: {order.words}, by {order.by or 'a person'}{because} ({known})")

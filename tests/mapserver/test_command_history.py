@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import re
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -13,7 +14,7 @@ from mapweave.hybridmap.agent_status import AgentStatus, HandDrive, Status
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
-from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
+from mapweave.hybridmap.mission_order import AT_START, MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.command_history import MOST, CommandHistory
 from mapweave.mapserver.http.web import Web
@@ -148,6 +149,7 @@ def test_a_robots_first_report_of_an_order_that_a_person_gave_it_names_the_robot
     order = MissionOrder.new("r0", MissionKind.EXPLORE, "eve")
     report = MissionReport(order, MissionState.RUNNING)
     status = AgentStatus(Status("standing", "", 7, 0, Pose2(), False), 1, "r0", 1, mission=report)
-    for _ in range(2):
-        house.server._hear(status)
-    assert commands(house) == ["r0: explore, by eve (mission ID, as r0 says)"]
+    first = MissionReport(MissionOrder.new("r0", MissionKind.EXPLORE, AT_START), MissionState.RUNNING)
+    for one in (replace(status, mission=first), status, status):
+        house.server._hear(one)
+    assert commands(house) == ["r0: explore, by eve (mission ID, as r0 says)"], "no person has said the first"
