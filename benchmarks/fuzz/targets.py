@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
+from benchmarks.fuzz import cluster_messages
 from benchmarks.fuzz.recordings import RECORDINGS, RecordingTarget
 from benchmarks.fuzz.texts import (
     CAMERA_TOML,
@@ -310,6 +311,7 @@ def check_finite(value: Any, nan_allowed: bool = False) -> None:
 
 TARGETS: dict[str, Target] = {
     "messages": Target(_messages, _messages_samples),
+    "cluster": Target(cluster_messages.run, lambda _: cluster_messages.cluster_messages().samples, 65536),
     "map_file": Target(_map_file, lambda s: s.map_files, 65536),
     "bases": Target(_base, lambda s: s.bases()),
     "lines": Target(_lines, lambda _: [b"1,2,3", b"S 1 2 0 50 -1", b'{"T":1001,"L":0.1,"R":0.1}', b"r0.1.17",

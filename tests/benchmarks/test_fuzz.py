@@ -80,7 +80,7 @@ def test_a_finding_is_counted_at_once(tmp_path: Path) -> None:
     assert json.loads((tmp_path / "counts.json").read_text())["accepted_invalid"] == 1
 
 
-NEW = [*RECORDINGS, "plans", "live", "nav2_map", "world", "fleet_file", "tokens"]
+NEW = [*RECORDINGS, "cluster", "plans", "live", "nav2_map", "world", "fleet_file", "tokens"]
 
 
 @pytest.mark.parametrize("name", NEW)
