@@ -26,14 +26,14 @@ class HypothesisSupport:
         inliers: landmarks of its best node that agree.
         share: of the matches that could have agreed.
         seen: share of the landmarks that should be in the view that are.
-        sightings: recognised nodes.
+        matches: recognised nodes.
         others: features that the strongest other place explains, as a share of those that this one does.
     """
 
     inliers: int
     share: float
     seen: float
-    sightings: int
+    matches: int
     others: float
 
     @property
@@ -45,7 +45,7 @@ class HypothesisSupport:
                 math.log(self.inliers),
                 self.share,
                 self.seen,
-                min(self.sightings, 3),
+                min(self.matches, 3),
                 min(self.others, 3.0),
             ]
         )

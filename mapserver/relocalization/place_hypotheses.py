@@ -51,13 +51,13 @@ class PlaceHypothesis:
     """Recognitions that agree on one pose, best first.
 
     Attributes:
-        sightings: of one place.
+        matches: with nodes of one place.
         best_from_robot: pose in the first one's frame, combined.
         features: of the view that they explain together.
         nodes_around: of another place, whose aliases imply this one; 0 if it was recognised.
     """
 
-    sightings: list[NodeMatch]
+    matches: list[NodeMatch]
     best_from_robot: PoseGaussian
     features: frozenset[int]
     nodes_around: int = 0
@@ -65,7 +65,7 @@ class PlaceHypothesis:
     @property
     def best(self) -> NodeMatch:
         """The recognition with most landmarks."""
-        return self.sightings[0]
+        return self.matches[0]
 
 
 def is_lonely(node: Node, view: View, recognition: Recognition) -> bool:
@@ -135,7 +135,7 @@ def supported(places: Sequence[PlaceHypothesis]) -> list[HypothesisSupport]:
         )
         supports.append(
             HypothesisSupport(
-                recognition.inliers, share, recognition.evidence["seen"], len(place.sightings), against
+                recognition.inliers, share, recognition.evidence["seen"], len(place.matches), against
             )
         )
     return supports

@@ -122,7 +122,7 @@ def _reason(verdict: Verdict, merged: MergedMap, least_features: int) -> str:
     """The outcome in words."""
     words = ""
     if verdict.places:
-        first, others = verdict.places[0].best, len(verdict.places[0].sightings) - 1
+        first, others = verdict.places[0].best, len(verdict.places[0].matches) - 1
         words = f"{first.recognition.inliers} landmarks of {first.node} agree"
     match verdict.outcome:
         case Outcome.FOUND:

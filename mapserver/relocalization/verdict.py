@@ -113,7 +113,7 @@ class HypothesisSelector:
         rivals: Sequence[PlaceHypothesis],
     ) -> Outcome | None:
         """Why no single place is certain, the first reason that holds; None if none does."""
-        matches, ranked = places[0].sightings if places else [], registration.candidates.ranked
+        matches, ranked = places[0].matches if places else [], registration.candidates.ranked
         reasons = (
             (Outcome.FEW_FEATURES, not ranked and len(registration.candidates.view) < self._least_features),
             (Outcome.NO_CANDIDATE, not ranked),

@@ -287,13 +287,13 @@ def test_fusing_never_claims_more_than_the_better_estimate_and_both_allow(
 
 def test_probability_grows_with_support_and_falls_with_rivals() -> None:
     def probability(**changes: float) -> float:
-        known = {"inliers": 20, "share": 0.7, "seen": 0.4, "sightings": 1, "others": 0.0}
+        known = {"inliers": 20, "share": 0.7, "seen": 0.4, "matches": 1, "others": 0.0}
         return probabilities([HypothesisSupport(**{**known, **changes})])[0]  # type: ignore[arg-type]
 
     more = [probability(inliers=n) for n in (10, 20, 40, 80)]
     rivals = [probability(others=share) for share in (0.0, 0.5, 1.0, 2.0)]
     assert more == sorted(more) and rivals == sorted(rivals, reverse=True)
-    assert probability(share=0.9) > probability(share=0.4) and probability(sightings=3) >= probability()
+    assert probability(share=0.9) > probability(share=0.4) and probability(matches=3) >= probability()
     assert probability(inliers=60) > 0.95, "nothing speaks against it"
     twin = HypothesisSupport(60, 0.8, 0.5, 2, 1.0)
     assert probabilities([twin, twin]) == pytest.approx([0.5, 0.5], abs=0.1), "one of two that look the same"
