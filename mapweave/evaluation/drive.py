@@ -6,6 +6,7 @@ import math
 import time
 from collections.abc import Iterable, Iterator, Mapping
 
+from mapweave.agent.calibration.correction import OdometryCorrection, corrected, geometry_of
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
 from mapweave.agent.pipeline import Pipeline
@@ -22,7 +23,6 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.offline_relocalization import relocalizer_in
-from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
 REACH = 1.5
@@ -98,11 +98,15 @@ class DriveMap:
 
     def questions(self, robot: Replay) -> Iterator[Verdict]:
         """Ask where each image of another pass was taken; at the end `trials` has what robots make of it."""
-        description = robot.describe()
-        sift = Sift(Lens(description.camera, description.distortion))
+        declared = robot.describe()
+        geometry, wheels = geometry_of(declared), OdometryCorrection()
+        # As an agent does: a camera that is declared to look up or aside is turned level.
+        description, lens = corrected(declared, geometry)
+        sift = Sift(lens)
         asked, true_poses = list[Asked](), list[Pose2 | None]()
         odom_from_robot, way, turned = Pose2(), 0.0, 0.0
-        while (observation := robot.sense()) is not None:
+        while (sensed := robot.sense()) is not None:
+            observation = wheels.step(sensed, geometry)
             assert observation.image is not None, "a recording has all its images"
             began = time.perf_counter()
             view = sift.extract(observation.image).view(description.camera)
