@@ -340,35 +340,38 @@ def test_a_second_agent_of_one_robot_is_refused_and_says_nothing_to_the_wheels(
     first = start(emulator)
     first.describe()
     drive_until(first, Command(0.1, 0.0), lambda: emulator.wheels.way()[0] > 0.03)
-    monkeypatch.setattr("mapweave.agent.drivers.wheeled.PATIENCE", 2.0)
-    heard = RosPeer(emulator.endpoint, bridge=bridge)
-    commands = heard.subscriber("/cmd_vel", KINDS_OF_COMMANDS)
-    try:
-        drive_until(first, Command(0.1, 0.0), lambda: len(commands) > 0)
-        refused, said = threading.Event(), list[str]()
+    refused, said, published = threading.Event(), list[str](), list[Command]()
 
-        def begin() -> None:
-            second = start(emulator)
+    def begin() -> None:
+        second: Any = start(emulator)
+        monkeypatch.setattr(second._robot._ros, "publish", published.append)
+        # On a busy machine no message may have come before: it is asked again.
+        while not (said and "another agent" in said[-1]):
             try:
                 second.describe()
+                said.append("another agent was not found")
             except DeviceError as error:
                 said.append(str(error))
-            second.close()
-            refused.set()
+        second.close()
+        refused.set()
 
-        threading.Thread(target=begin, daemon=True).start()
-        drive_until(first, Command(0.1, 0.0), refused.is_set)
-        drive(first, Command(0.1, 0.0), 0.3)
-        assert said and said[0].startswith(
-            f"another agent drives the robot by {bridge or ''}/cmd_vel; stop it"
-        )
-        forward = [peer.Reader(data).several("d", 6)[0] for data in commands]
-        assert min(forward) > 0.09, "the second has not stopped the wheels of the first"
-    finally:
-        heard.close()
+    threading.Thread(target=begin, daemon=True).start()
+    drive_until(first, Command(0.1, 0.0), refused.is_set, 30.0)
+    assert said[-1].startswith(f"another agent drives the robot by {bridge or ''}/cmd_vel; stop it")
+    assert not published, "not even that the wheels shall stop: they are those of the first"
+    way = emulator.wheels.way()[0]
+    drive_until(first, Command(0.1, 0.0), lambda: emulator.wheels.way()[0] > way + 0.03)
     first.close()
     third = start(emulator)
-    assert third.describe().camera.width == WIDTH, "the first has left"
+
+    def described() -> bool:
+        try:
+            return third.describe().camera.width == WIDTH
+        except DeviceError as error:
+            assert "another agent" not in str(error), "the first has left"
+            return False
+
+    until(described, 30.0)
 
 
 def test_others_who_publish_commands_are_named(start: Start, caplog: pytest.LogCaptureFixture) -> None:
