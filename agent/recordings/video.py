@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable
 from pathlib import Path
 
@@ -15,6 +16,7 @@ from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
 from mapweave.agent.recordings.recording import Images, Recording
 from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.limits import MAX_STAMP_NS
 
 SUFFIXES = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
 
@@ -47,8 +49,10 @@ def video_images(path: Path) -> Images:
     """
     capture = cv2.VideoCapture(str(path))
     stamps: list[int] = []
-    while capture.grab():
-        stamps.append(round(1e6 * capture.get(cv2.CAP_PROP_POS_MSEC)))
+    while _grabbed(capture):
+        stamp = 1e6 * capture.get(cv2.CAP_PROP_POS_MSEC)
+        # A damaged header gives times that are no numbers.
+        stamps.append(round(stamp) if abs(stamp) < MAX_STAMP_NS else 0)
     if len(stamps) < 2:
         lost = "; an MP4 that was cut off has lost its index" if path.suffix.lower() in INDEXED else ""
         raise DeviceError(f"{path}: no video that can be read{lost}")
@@ -56,9 +60,19 @@ def video_images(path: Path) -> Images:
     if not all(before < after for before, after in itertools.pairwise(stamps)):
         # Some containers give no stamps for each frame.
         rate = capture.get(cv2.CAP_PROP_FPS)
+        if not math.isfinite(rate) or rate * MAX_STAMP_NS < 1e9 * len(stamps):
+            rate = 0.0
         assumed = "" if rate > 0 else f"frames without stamps: {ASSUMED_RATE:g} images a second are assumed"
         stamps = [round(1e9 * k / (rate if rate > 0 else ASSUMED_RATE)) for k in range(len(stamps))]
     return Images(np.array(stamps, np.int64), _sequential(path), damage, assumed)
+
+
+def _grabbed(capture: cv2.VideoCapture) -> bool:
+    """Whether there is a further frame; OpenCV raises at some damage."""
+    try:
+        return capture.grab()
+    except cv2.error:
+        return False
 
 
 def _cut_off(path: Path, capture: cv2.VideoCapture, frames: int, last_s: float) -> str:
@@ -86,10 +100,13 @@ def _sequential(path: Path) -> Callable[[int], NDArray[np.uint8]]:
         nonlocal at
         if "capture" not in state or k < at:
             state["capture"], at = cv2.VideoCapture(str(path)), 0
-        while at < k and state["capture"].grab():
+        while at < k and _grabbed(state["capture"]):
             at += 1
-        good, frame = state["capture"].read()
-        if not good:
+        try:
+            good, frame = state["capture"].read()
+        except cv2.error:
+            good, frame = False, None
+        if not good or frame is None:
             raise DeviceError(f"{path}: frame {k} cannot be decoded")
         at += 1
         grey = frame if frame.ndim == 2 else cv2.cvtColor(frame, cv2.COLOR_BGR2GRAY)
