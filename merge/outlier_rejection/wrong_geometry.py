@@ -242,7 +242,10 @@ def thinned(links: Sequence[Link]) -> list[Link]:
 def link_sets(
     links: Sequence[Link], first: Fragment, second: Fragment, s: ConsistencySettings
 ) -> list[list[Link]]:
-    """Sets of links in which each agrees with each, grown greedily; largest first.
+    """Sets of links in which each agrees with nearly all, grown greedily; largest first.
+
+    If each had to agree with each, one pair of links in a hundred that just fails the gate would cost a tenth
+    of 60 sound links.
 
     Args:
         links: from `first` to `second`, at least one.
@@ -255,11 +258,11 @@ def link_sets(
     left, sets = np.ones(len(links), np.bool_), list[list[Link]]()
     while left.any():
         support = np.where(left, (agree & left).sum(axis=1), 0)
-        free, members = left.copy(), list[int]()
+        against, members = np.zeros(len(links), np.int64), list[int]()
         for k in np.argsort(-support, kind="stable").tolist():
-            if free[k]:
+            if left[k] and against[k] <= (1.0 - AGREEING) * len(members):
                 members.append(k)
-                free &= agree[k]
+                against += ~agree[k]
         sets.append([links[k] for k in sorted(members)])
         left[members] = False
     return sorted(sets, key=len, reverse=True)

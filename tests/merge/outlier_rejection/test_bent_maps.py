@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,12 +14,14 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.merge.outlier_rejection.bent_maps import is_bent
+from mapweave.merge.outlier_rejection.bent_maps import AGREEING, is_bent
 from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
-from mapweave.merge.outlier_rejection.pairwise_consistency import sort_links
+from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances2, sort_links
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
+from mapweave.merge.outlier_rejection.wrong_geometry import link_sets
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.settings import ConsistencySettings
 from synthetic.world import CAMERA
 
 SIGMAS = np.array([0.015, 0.015, 0.008])
@@ -48,6 +51,24 @@ def links(rng: np.random.Generator, shift: Pose2) -> list[Link]:
             pose = PoseGaussian(there.inverse() @ TOUR[j] @ noise, np.diag(SIGMAS**2))
             out.append(Link(NodeId("b", 1, 2 * k + 1), NodeId("a", 1, 2 * j + 1), pose))
     return out
+
+
+def test_a_sound_map_hangs_together_though_links_are_a_little_off() -> None:
+    """One pair of links in a hundred that fails the gate makes no second set of them; a bend does."""
+    steps = [a.inverse() @ b for a, b in pairwise(TOUR)]
+    fixed, sound = piece("a", steps), piece("b", steps)
+    bent = piece("b", [Pose2(1.1 * s.x, 1.1 * s.y, s.heading) for s in steps])
+    for seed in range(12):
+        rng, s = np.random.default_rng(seed), ConsistencySettings()
+        off = [
+            replace(link, a_from_b=replace(link.a_from_b, mean=link.a_from_b.mean @ Pose2.from_vector(noise)))
+            for link in links(rng, Pose2())
+            for noise in [rng.normal(0.0, 2.5 * SIGMAS)]
+        ]
+        agree = loop_distances2(off, sound, fixed, s)[np.triu_indices(len(off), 1)] < s.gate
+        assert 0.0 < (~agree).mean() < 0.05
+        assert len(link_sets(off, sound, fixed, s)[0]) >= AGREEING * len(off)
+        assert len(link_sets(off, bent, fixed, s)[0]) < AGREEING * len(off)
 
 
 @pytest.mark.parametrize(
