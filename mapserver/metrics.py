@@ -82,6 +82,7 @@ class Sources:
         merger: counters of the merger.
         counts: of the merged map, by name.
         held_back: by the quotas since the start, by kind.
+        dropped: messages and questions for which the queue of the bus had no room.
         admission: counters of the questions that take long.
         lags: how far the store is behind each robot.
         robots: that are heard of.
@@ -97,6 +98,7 @@ class Sources:
     merger: Callable[[], MergerCounters]
     counts: Callable[[], Mapping[str, int]]
     held_back: Callable[[], Mapping[str, int]]
+    dropped: Callable[[], int]
     admission: Callable[[], Mapping[str, int | float]]
     lags: Callable[[], Mapping[str, Lag]]
     robots: Callable[[], Mapping[str, Presence]]
@@ -192,6 +194,7 @@ class _Reader(Collector):
         held_back = self._sources.held_back()
         quotas = {f"quota_{what}": held_back.get(what, 0) for what in QUOTAS}
         reasons = {"invalid_change": ingest.refused, "damaged_message": ingest.damaged, **quotas}
+        reasons["queue_full"] = self._sources.dropped()
         words = "What the server did not take or answer, by reason."
         return _counter("refusals", words, {**reasons, "busy": admission["busy"]}, "reason")
 

@@ -447,8 +447,9 @@ class MapServer:
         worker, ingest = self._worker, self._ingest
         return Sources(
             self._path, ingest.counters, worker.counters, lambda: worker.answers.merged.counts(),
-            self._quotas.totals, self._admission.counters, ingest.lags, self._roster.presence,
-            self._quotas.over, self._damaged, lambda: {"ingest": ingest.waiting, **worker.queues()},
+            self._quotas.totals, lambda: self._bus.dropped, self._admission.counters, ingest.lags,
+            self._roster.presence, self._quotas.over, self._damaged,
+            lambda: {"ingest": ingest.waiting, **worker.queues()},
             lambda: bool(ingest.failure), lambda: worker.settled,
         )  # fmt: skip
 

@@ -133,6 +133,11 @@ class Bus(Protocol):
         """Call the handler with (key, alive) for those alive now and at each change."""
         ...
 
+    @property
+    def dropped(self) -> int:
+        """Messages and questions for which the queue of the handlers had no room, since the start."""
+        ...
+
     def connected(self) -> bool:
         """Whether messages can leave now. Always true on an in-memory bus."""
         ...

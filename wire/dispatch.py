@@ -94,6 +94,11 @@ class Dispatcher:
         """Hand over that liveliness has changed; see mapweave.wire.alive_keys, which does so rarely."""
         self._put(report, key, bounded=False)
 
+    @property
+    def dropped(self) -> int:
+        """Messages and questions that found the queue full."""
+        return self.lost + self.refused
+
     def close(self) -> None:
         """Finish the running handler, forget what waits. Twice is no error.
 

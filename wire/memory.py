@@ -199,6 +199,11 @@ class MemoryBus:
         declared = Watcher(check_pattern(pattern), self._dispatcher, self._remove, handler)
         return self._add(self._watchers, declared)
 
+    @property
+    def dropped(self) -> int:
+        """What found the queue of the handlers full."""
+        return self._dispatcher.dropped
+
     def connected(self) -> bool:
         """True unless the hub has cut this bus or it is closed."""
         return not (self._cut or self._closed)

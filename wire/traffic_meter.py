@@ -70,6 +70,11 @@ class TrafficMeter:
         """See who is alive; the transport's own messages are not counted."""
         return self._bus.watch(pattern, handler)
 
+    @property
+    def dropped(self) -> int:
+        """What found the queue of the handlers full."""
+        return self._bus.dropped
+
     def connected(self) -> bool:
         """Whether messages can leave now."""
         return self._bus.connected()

@@ -153,6 +153,11 @@ class ZenohBus:
         """Whether it was closed; it does not connect again."""
         return self._closed.is_set()
 
+    @property
+    def dropped(self) -> int:
+        """What found the queue of the handlers full."""
+        return self.owner.dispatcher.dropped
+
     def connected(self) -> bool:
         """Whether messages can leave now. A router is always connected."""
         session = self._session

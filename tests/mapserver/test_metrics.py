@@ -110,6 +110,18 @@ def test_a_gap_and_a_silent_robot_are_seen_by_name(fleet: Fleet) -> None:
     assert closed("changes_pulled_total") > 0 and closed("robot_status_age_seconds", "r0") > 0
 
 
+def test_what_found_the_queue_of_the_bus_full_is_counted(
+    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert Scrape(fleet)("refusals_total", "queue_full") == 0
+    dispatcher = fleet.server._bus._dispatcher
+    monkeypatch.setattr(dispatcher, "_put", lambda *_, **__: False)
+    fleet.bus.publish(KEYS.head(FIRST[0]), b"\xc1")
+    assert fleet.bus.ask(KEYS.robots("s0"), b"", 5.0)[0].error
+    monkeypatch.undo()
+    assert Scrape(fleet)("refusals_total", "queue_full") == 2
+
+
 def test_refusals_have_few_reasons(fleet: Fleet) -> None:
     map_id, log = FIRST
     names = {sample for sample in Scrape(fleet).samples if sample[0] == "mapweave_refusals_total"}
