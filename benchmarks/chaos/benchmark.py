@@ -1,12 +1,15 @@
 """Whether anything is lost, whatever is killed, frozen, cut off or deleted.
 
-    python -m benchmarks.chaos [--agents N] [--seconds S] [--seed N] [--store sqlite|URL] [--json]
+    python -m benchmarks.chaos [--agents N] [--seconds S] [--seed N] [--store sqlite|postgresql|URL ...]
+                               [--json]
 
 Real processes over TCP on loopback: agents (journal, replicator, fleet client), two map servers, two routers,
 and a link between each of them and each router that can be cut, slowed, frozen and half closed. The schedule
 is drawn with the seed and printed: at least 20 kill -9, a third as many SIGSTOP, two thirds as many links.
 With SQLite a server is also killed and its store deleted; it gets everything from the agents again. With
-PostgreSQL both servers share a database, which is killed as well.
+PostgreSQL both servers share a database, which is killed as well. Without `--store` the fleet runs on both,
+one after the other, where there is a PostgreSQL: counts are summed, times are those of the worse store, and
+`stores` has each by itself.
 
 Each agent writes its own log, flushed to the disk, of what it hands over and of what its journal has then
 committed: that is `sent`. When all is over the stores are read and compared with it. `undone` changes are
@@ -29,6 +32,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import asdict
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -48,6 +52,8 @@ from mapweave.scenarios.children import ChildFailed
 from synthetic.postgres_server import PostgresServer, binaries
 
 POSTGRESQL = "postgresql"
+COUNTED = ("kills", "lost_stores", "stops", "cuts")
+"""Disturbances, in a report."""
 START = 120.0
 """Longest wait until both servers answer, s."""
 SETTLE = 120.0
@@ -131,7 +137,7 @@ def relocalize_gaps(fleet: FleetProcesses, seed: int, progress: Progress) -> lis
 
 def run(
     folder: Path, agents: int, seconds: float, seed: int, store: str, progress: Progress
-) -> dict[str, object]:
+) -> dict[str, Any]:
     """Start a fleet, disturb it, let it come to rest and count."""
     names = [f"r{k}" for k in range(agents)]
     postgres = start_postgres(folder) if store == POSTGRESQL else None
@@ -181,6 +187,19 @@ def run(
     }  # fmt: skip
 
 
+def together(reports: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The reports of several stores as one."""
+    if len(reports) == 1:
+        return reports[0]
+    out = dict(reports[0], store=" and ".join(report["store"] for report in reports))
+    for key in ("sent", "stored", "undone", "lost", "duplicated", "out_of_order", *COUNTED):
+        out[key] = sum(report[key] for report in reports)
+    for key in ("recovery_s_p50", "recovery_s_p95", "relocalize_gap_s", "frozen_router_gap_s"):
+        out[key] = max(report[key] for report in reports)
+    out["maps_equal"] = all(report["maps_equal"] for report in reports)
+    return out | {"stores": list(reports)}
+
+
 def start_postgres(folder: Path) -> PostgresServer:
     """A cluster in a folder that its own user may read, and whose commits are on the disk when they return.
 
@@ -191,7 +210,7 @@ def start_postgres(folder: Path) -> PostgresServer:
         raise ChildFailed("there is no PostgreSQL: neither Debian's package postgresql nor PyPI's pgserver")
     place = folder / DATABASE
     place.mkdir()
-    for part in (folder, place):
+    for part in (folder.parent, folder, place):
         part.chmod(0o755)
     return PostgresServer(place, "-c", "fsync=on")
 
@@ -204,7 +223,7 @@ def acknowledged(folder: Path, names: Sequence[str]) -> bool:
     )
 
 
-def good(report: dict[str, object]) -> bool:
+def good(report: dict[str, Any]) -> bool:
     """Whether nothing is lost."""
     return report["maps_equal"] is True and not any(
         report[key] for key in ("lost", "duplicated", "out_of_order")
@@ -217,9 +236,9 @@ def main() -> None:
     parser.add_argument("--agents", type=int, default=5)
     parser.add_argument("--seconds", type=float, default=60.0, help="of mapping and disturbances")
     parser.add_argument(
-        "--store", default=SQLITE,
+        "--store", nargs="+", default=[SQLITE] if binaries() is None else [SQLITE, POSTGRESQL],
         help="sqlite: a file a server; postgresql: one database for both, which is started here and killed; "
-        "or the URL of one",
+        "or the URL of one (default: sqlite, and postgresql where it is installed)",
     )  # fmt: skip
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep journals, stores and logs here")
     options = parser.parse_args()
@@ -230,9 +249,12 @@ def main() -> None:
         tempfile.TemporaryDirectory() as place,
         Progress(*columns, console=Console(stderr=True)) as progress,
     ):
-        folder = Path(place)
+        folder, reports = Path(place), []
         try:
-            report = run(folder, options.agents, options.seconds, options.seed, options.store, progress)
+            for number, store in enumerate(options.store):
+                own = folder / f"store-{number}"
+                own.mkdir()
+                reports.append(run(own, options.agents, options.seconds, options.seed, store, progress))
         except ChildFailed as failed:
             progress.stop()
             sys.exit(f"seed {options.seed}: {failed}")
@@ -240,8 +262,11 @@ def main() -> None:
             if options.keep is not None:
                 without = shutil.ignore_patterns(DATABASE)
                 shutil.copytree(folder, options.keep, ignore=without, dirs_exist_ok=True)
+    report = together(reports)
     table = Table("", "", title="chaos", show_header=False)
     for key, value in report.items():
+        if key == "stores":
+            continue
         table.add_row(key, str(value))
     Console(stderr=options.json).print(table)
     if options.json:

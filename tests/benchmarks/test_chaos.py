@@ -16,6 +16,7 @@ import pytest
 
 from benchmarks.chaos.account import Account, BrokenLog, account, sent_changes
 from benchmarks.chaos.agent_process import STAMP, digest
+from benchmarks.chaos.benchmark import good, together
 from benchmarks.chaos.recovery import NEVER, RobotTimes, recoveries
 from benchmarks.chaos.schedule import KILLS, LEAST_KILLS, Kind, draw_schedule
 from benchmarks.chaos.scripted_robot import ScriptedRobot
@@ -171,11 +172,26 @@ def test_a_schedule_is_that_of_its_seed_and_kills_often_enough() -> None:
             assert mine and all(a.at + a.lasts <= b.at for a, b in pairwise(mine))
 
 
+def test_what_is_lost_on_one_store_is_lost_on_both() -> None:
+    one = {
+        "store": "sqlite", "sent": 3, "stored": 3, "undone": 0, "lost": 0, "duplicated": 0, "out_of_order": 0,
+        "maps_equal": True, "recovery_s_p50": 1.0, "recovery_s_p95": 2.0, "relocalize_gap_s": 0.3,
+        "frozen_router_gap_s": 5.0, "kills": 20, "lost_stores": 1, "stops": 7, "cuts": 13,
+    }  # fmt: skip
+    other = dict(one, store="postgresql", stored=2, lost=1, maps_equal=False, relocalize_gap_s=0.7)
+    assert together([one]) == one and good(one)
+    both = together([one, other])
+    assert not good(both) and both["stores"] == [one, other] and both["store"] == "sqlite and postgresql"
+    assert (both["sent"], both["stored"], both["lost"], both["maps_equal"]) == (6, 5, 1, False)
+    assert both["relocalize_gap_s"] == 0.7 and both["kills"] == 40
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_nothing_is_lost_in_a_short_chaos() -> None:
     ran = subprocess.run(
-        [sys.executable, "-m", "benchmarks.chaos", "--agents", "2", "--seconds", "10", "--json"],
+        [sys.executable, "-m", "benchmarks.chaos", "--agents", "2", "--seconds", "10", "--json",
+         "--store", "sqlite"],
         capture_output=True, text=True, env=dict(os.environ),
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr[-2000:]
