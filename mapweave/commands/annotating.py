@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -33,8 +34,7 @@ def add_record_options(parser: argparse.ArgumentParser, changes: bool) -> None:
         parser.add_argument(
             "-o", "--out", type=Path, metavar="OUT", help="with --map: write a map file there instead"
         )
-    else:
-        parser.add_argument("--json", action="store_true", help="print one JSON object")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     add_network(parser)
 
@@ -61,13 +61,22 @@ def add_remove(actions: Any, kind: str, words: str, of: str, description: str) -
 
     def run(arguments: argparse.Namespace) -> int:
         with record_of(arguments) as record:
-            print(record.withdraw(kind, arguments.name, arguments.because, check=arguments.check))
+            said = record.withdraw(kind, arguments.name, arguments.because, check=arguments.check)
+        print_said(arguments, said)
         return 0
 
     remove: argparse.ArgumentParser = actions.add_parser("remove", help=words, description=description)
     remove.add_argument("name", metavar="NAME", help=of)
     add_record_options(remove, changes=True)
     remove.set_defaults(run=run)
+
+
+def print_said(arguments: argparse.Namespace, *said: str, **values: object) -> None:
+    """Print what the server or the file has said: lines, or with `--json` one object with these values."""
+    if arguments.json:
+        print(json.dumps({"said": "; ".join(said), **values}))
+    else:
+        print("\n".join(said))
 
 
 def area_fields(arguments: argparse.Namespace) -> dict[str, object]:

@@ -5,12 +5,19 @@ from __future__ import annotations
 import argparse
 import hashlib
 import json
+import sys
 import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_area_options, add_record_options, area_fields, record_of
+from mapweave.commands.annotating import (
+    add_area_options,
+    add_record_options,
+    area_fields,
+    print_said,
+    record_of,
+)
 from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.errors import InvalidValue
 
@@ -94,11 +101,15 @@ def run_close(arguments: argparse.Namespace) -> int:
         if text is not None:
             with arguments_read():
                 times[field] = stamp_ns = read_time(text, now_ns, begin_ns=times.get("begin_ns", 0))
-            print(f"{word} {local_words(stamp_ns)} ({utc_words(stamp_ns)})")
+            print(
+                f"{word} {local_words(stamp_ns)} ({utc_words(stamp_ns)})",
+                file=sys.stderr if arguments.json else sys.stdout,
+            )
     with record_of(arguments) as record:
         name, fields = _meant(arguments, "closure", record)
         fields |= times
-        print(record.annotate("closure", name, arguments.because, check=arguments.check, **fields))
+        said = record.annotate("closure", name, arguments.because, check=arguments.check, **fields)
+    print_said(arguments, said)
     return 0
 
 
@@ -116,7 +127,8 @@ def run_prefer(arguments: argparse.Namespace) -> int:
     with record_of(arguments) as record:
         name, fields = _meant(arguments, "preference", record)
         fields["factor"] = arguments.factor
-        print(record.annotate("preference", name, arguments.because, check=arguments.check, **fields))
+        said = record.annotate("preference", name, arguments.because, check=arguments.check, **fields)
+    print_said(arguments, said)
     return 0
 
 
@@ -158,8 +170,9 @@ def _without_effect(record: Fleet | OfflineAnnotations, entry: Annotation) -> st
 
 def _withdraw(arguments: argparse.Namespace, kind: str) -> int:
     with record_of(arguments) as record:
-        for name in _names(arguments, kind, record):
-            print(record.withdraw(kind, name, arguments.because, check=arguments.check))
+        names = _names(arguments, kind, record)
+        said = [record.withdraw(kind, name, arguments.because, check=arguments.check) for name in names]
+    print_said(arguments, *said)
     return 0
 
 

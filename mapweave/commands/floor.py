@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
+import json
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_record_options, record_of
+from mapweave.commands.annotating import add_record_options, print_said, record_of
 from mapweave.commands.usage import UsageError
 
 
@@ -18,10 +19,12 @@ def add_to(commands: Any) -> None:
         description="Label the map of a node with its floor: `mapweave floor first r0.1.17`. Maps on "
         "different floors are never linked, so twin rooms above each other are kept apart; answers name the "
         "floor. Maps without a label are on the floor of those with which they have most in common. "
-        "`mapweave floor --undo r0.1.17` withdraws the label.",
+        "`mapweave floor --undo r0.1.17` withdraws the label; `mapweave floor list` lists all.",
     )
     parser.add_argument("label", nargs="?", type=values.title, metavar="NAME", help="of the floor")
-    parser.add_argument("node", type=values.node, metavar="NODE|PLACE", help="any node of the map")
+    parser.add_argument(
+        "node", type=values.node, metavar="NODE|PLACE", help="any node of the map; `list` alone lists all"
+    )
     parser.add_argument("--undo", action="store_true", help="take it back")
     add_record_options(parser, changes=True)
     parser.set_defaults(run=run)
@@ -31,16 +34,35 @@ def run(arguments: argparse.Namespace) -> int:
     """Label a map, or withdraw its label."""
     from mapweave.hybridmap.query import ResolveRequest
 
+    if (arguments.label, arguments.node, arguments.undo) == (None, "list", False):
+        return _list(arguments)
     if (arguments.label is None) != arguments.undo:
         raise UsageError("give the name of a floor and a node; with --undo a node alone")
     with record_of(arguments) as record:
         node = record.resolve(ResolveRequest((arguments.node,))).found[0].node
         name, because = str(node.map), arguments.because
         if arguments.undo:
-            print(record.withdraw("floor", name, because, check=arguments.check))
+            said = [record.withdraw("floor", name, because, check=arguments.check)]
         else:
             fields = {"node": str(node), "label": arguments.label}
-            print(record.annotate("floor", name, because, check=arguments.check, **fields))
+            said = [record.annotate("floor", name, because, check=arguments.check, **fields)]
     if arguments.map is not None and not arguments.check:
-        print("links between floors fall when the file is merged again: mapweave map merge FILE -o OUT")
+        said.append("links between floors fall when the file is merged again: mapweave map merge FILE -o OUT")
+    print_said(arguments, *said)
+    return 0
+
+
+def _list(arguments: argparse.Namespace) -> int:
+    from mapweave.hybridmap.annotation import Floor
+    from mapweave.mapserver.http.json_values import json_values
+
+    with record_of(arguments) as record:
+        entries = [entry for entry, _ in record.annotations().in_force(Floor)]
+    if arguments.json:
+        print(json.dumps({"floors": [json_values(entry) for entry in entries]}))
+        return 0
+    for entry in entries:
+        print(entry.words)
+    if not entries:
+        print("no map has a label yet: mapweave floor NAME NODE")
     return 0

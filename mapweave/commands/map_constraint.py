@@ -5,10 +5,12 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapweave.commands.annotating import print_said
 from mapweave.commands.map_input import SOURCES, map_source, merge_progress, merged_with_progress, opened
 from mapweave.commands.network import (
     add_network,
@@ -35,6 +37,7 @@ def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -
     if undo:
         parser.add_argument("--undo", action="store_true", help="take it back")
     parser.add_argument("--check", action="store_true", help="only say what it would do; change nothing")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.add_argument(
         "--map", type=map_source, metavar="FILE", help=f"in {SOURCES}; no server is asked, and only a merged "
         "map file is changed",
@@ -46,10 +49,17 @@ def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -
     add_network(parser)
 
 
-def constrain(arguments: argparse.Namespace, about: Subject) -> None:
-    """Set the constraint, and print its effect; afterwards `arguments.map` is the file that holds it.
+def constrain(
+    arguments: argparse.Namespace, about: Subject, more: Callable[[], Sequence[str]] = tuple
+) -> None:
+    """Set the constraint, and print its effect and its number, by which `mapweave map undo` takes it back.
 
-    With `--check` only print.
+    Afterwards `arguments.map` is the file that holds it. With `--check` only print.
+
+    Args:
+        arguments: of the command.
+        about: what the constraint is about.
+        more: further lines, asked for when it is set.
 
     Raises:
         MapweaveError: the constraint has no effect, or there is no place to keep it.
@@ -67,10 +77,21 @@ def constrain(arguments: argparse.Namespace, about: Subject) -> None:
         constraint = ManualConstraint(about, not arguments.undo, by, time.time_ns(), arguments.because)
         request = ConstraintRequest(constraint, arguments.check)
     if arguments.map is None:
-        _send_to_server(arguments, request, "" if holder is None else holder.name)
+        said = _send_to_server(arguments, request, "" if holder is None else holder.name)
     else:
-        _rewrite(arguments, constraint)
+        said = _rewrite(arguments, constraint)
         arguments.map = arguments.map if arguments.check else arguments.out or arguments.map
+    number = None if arguments.check else _number(arguments, constraint)
+    if number is not None and constraint.holds:
+        said[0] += f" (number {number})"
+    print_said(arguments, *said, *more(), number=number)
+
+
+def _number(arguments: argparse.Namespace, constraint: ManualConstraint) -> int | None:
+    """Which of the record it is, from 1."""
+    made = constraints_of(arguments).made
+    key = constraint.stamp_ns, constraint.holds
+    return next((k for k, one in enumerate(made, 1) if (one.stamp_ns, one.holds) == key), None)
 
 
 def constraints_of(arguments: argparse.Namespace) -> ManualConstraints:
@@ -87,20 +108,19 @@ def constraints_of(arguments: argparse.Namespace) -> ManualConstraints:
     )
 
 
-def _send_to_server(arguments: argparse.Namespace, request: ConstraintRequest, sender: str) -> None:
+def _send_to_server(arguments: argparse.Namespace, request: ConstraintRequest, sender: str) -> list[str]:
     from mapweave.commands.map_ends import ask
     from mapweave.wire.log_messages import decode_record
     from mapweave.wire.messages import encode
     from mapweave.wire.senders import sent_by
 
-    for reply in ask(arguments, lambda keys: sent_by(keys.any_constrain(), sender), encode(request)):
-        print(decode_record(reply.payload)["said"])
-    if not arguments.check:
-        _settled(arguments)
+    replies = ask(arguments, lambda keys: sent_by(keys.any_constrain(), sender), encode(request))
+    said = [str(decode_record(reply.payload)["said"]) for reply in replies]
+    return said if arguments.check else said + _settled(arguments)
 
 
-def _settled(arguments: argparse.Namespace) -> None:
-    """Wait until the server has merged with it, or the time is over."""
+def _settled(arguments: argparse.Namespace) -> list[str]:
+    """Wait until the server has merged with it; what is to be said if the time is over."""
     from mapweave.commands.map_ends import ask
     from mapweave.wire.keys import Keys
     from mapweave.wire.log_messages import decode_record
@@ -113,12 +133,12 @@ def _settled(arguments: argparse.Namespace) -> None:
         if all(
             decode_record(reply.payload)["settled"] for reply in ask(arguments, Keys.server_statuses, b"")
         ):
-            return
+            return []
         time.sleep(0.1)
-    print("it is kept; the server is still merging, ask `mapweave map explain` later")
+    return ["it is kept; the server is still merging, ask `mapweave map explain` later"]
 
 
-def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> None:
+def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> list[str]:
     from mapweave.hybridmap.annotation import Annotations
     from mapweave.hybridmap.manual_constraint import ManualConstraints
     from mapweave.mapserver.annotation_effects import without_effect
@@ -151,13 +171,11 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> Non
     constraint = checked.constraint
     words = "; ".join(filter(None, (checked.words, without_effect(constraint, before, said))))
     if arguments.check:
-        print(f"only checked, nothing is changed: {words}")
-        return
+        return [f"only checked, nothing is changed: {words}"]
     assert out is not None
     changed = replace(one, content=replace(content, constraints=(*content.constraints, constraint)))
     with merge_progress() as report:
         merged = changed.merged_again(settings, report)
     history = (*content.history, *between(before, merged, constraint.stamp_ns))
     changed.written(out, map_file_of(merged, history, said, content.images))
-    print(words)
-    print(f"{out}: {merged.summary()}")
+    return [words, f"{out}: {merged.summary()}"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 from typing import Any
 
@@ -19,6 +20,7 @@ def add_to(actions: Any) -> None:
         "`mapweave map fetch office.mapweave`. The fleet goes on; `mapweave map show` shows the file.",
     )
     parser.add_argument("out", type=Path, metavar="OUT", help="the map file")
+    parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_network(parser)
     parser.set_defaults(run=run)
 
@@ -33,5 +35,8 @@ def run(arguments: argparse.Namespace) -> int:
     with fleet_of(arguments) as fleet, Bar(plain_or_terminal(), "fetching the map", None, transient=True):
         content, data = fleet.map_and_bytes()
     write_whole(arguments.out, data)
-    print(f"{arguments.out}: {content.title}, {len(data) / 1e6:.1f} MB")
+    if arguments.json:
+        print(json.dumps({"file": str(arguments.out), "title": content.title, "bytes": len(data)}))
+    else:
+        print(f"{arguments.out}: {content.title}, {len(data) / 1e6:.1f} MB")
     return 0

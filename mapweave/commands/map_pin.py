@@ -8,7 +8,7 @@ import math
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_record_options, record_of
+from mapweave.commands.annotating import add_record_options, print_said, record_of
 from mapweave.commands.usage import UsageError
 
 
@@ -27,7 +27,6 @@ def add_to(actions: Any) -> None:
     parser.add_argument("pose", nargs="?", metavar="X,Y,DEGREES", help="its pose (default: as it is now)")
     parser.add_argument("--undo", action="store_true", help="take the pin out")
     add_record_options(parser, changes=True)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(run=run)
 
 
@@ -49,7 +48,7 @@ def run(arguments: argparse.Namespace) -> int:
             node = str(record.resolve(ResolveRequest((arguments.node,))).found[0].node)
             fields["node"] = node
             said = record.annotate("pin", node, arguments.because, check=arguments.check, **fields)
-    print(json.dumps({"said": said}) if arguments.json else said)
+    print_said(arguments, said)
     return 0
 
 

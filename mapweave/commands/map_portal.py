@@ -7,7 +7,7 @@ import json
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_record_options, add_remove, record_of
+from mapweave.commands.annotating import add_record_options, add_remove, print_said, record_of
 from mapweave.commands.usage import UsageError
 
 KINDS = ("lift", "ramp", "door")
@@ -61,7 +61,8 @@ def run_add(arguments: argparse.Namespace) -> int:
         raise UsageError(f"{a.a} twice: a portal leads from one node to another")
     with record_of(a) as record:
         fields = {"a": a.a, "b": a.b, "means": a.kind, "note": a.note}
-        print(record.annotate("portal", a.name, a.because, check=a.check, **fields))
+        said = record.annotate("portal", a.name, a.because, check=a.check, **fields)
+    print_said(a, said)
     return 0
 
 

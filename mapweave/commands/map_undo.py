@@ -18,7 +18,6 @@ def add_to(actions: Any) -> None:
         "one back: `mapweave map undo 3`. Nothing is deleted: the record keeps who did what, when and why.",
     )
     parser.add_argument("number", nargs="?", type=int, metavar="NUMBER", help="take this one back")
-    parser.add_argument("--json", action="store_true", help="print the whole record as one JSON object")
     add_constraint_options(parser, undo=False)
     parser.set_defaults(run=run, undo=True)
 

@@ -36,10 +36,11 @@ def run(arguments: argparse.Namespace) -> int:
 
     ends = different_ends_of(own_ids_of(arguments.ends, *names_of(arguments)))
     first, second = (MapId(end[0], end[1]) for end in ends)
-    constrain(arguments, Apart(ends))
-    if first != second:
+
+    def reasons() -> list[str]:
         found = explanation_of(arguments, ExplainRequest((first, second)))
         assert isinstance(found, FleetExplanation), "maps were asked about"
-        for explanation in found.maps:
-            print(explanation.reason)
+        return [explanation.reason for explanation in found.maps]
+
+    constrain(arguments, Apart(ends), reasons if first != second else list)
     return 0

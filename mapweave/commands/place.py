@@ -12,6 +12,7 @@ from mapweave.commands.annotating import (
     add_record_options,
     add_remove,
     area_fields,
+    print_said,
     record_of,
 )
 from mapweave.commands.usage import UsageError, arguments_read
@@ -79,7 +80,8 @@ def run_add(arguments: argparse.Namespace) -> int:
     if arguments.where is not None:
         fields["node"] = arguments.where
     with record_of(arguments) as record:
-        print(record.annotate("place", arguments.name, arguments.because, check=arguments.check, **fields))
+        said = record.annotate("place", arguments.name, arguments.because, check=arguments.check, **fields)
+    print_said(arguments, said)
     return 0
 
 

@@ -10,7 +10,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_near, add_record_options, add_remove, record_of, two_numbers
+from mapweave.commands.annotating import (
+    add_near,
+    add_record_options,
+    add_remove,
+    print_said,
+    record_of,
+    two_numbers,
+)
 from mapweave.commands.network import settings_of
 from mapweave.commands.usage import UsageError
 from mapweave.hybridmap.errors import InvalidFile
@@ -130,9 +137,10 @@ def run_add(arguments: argparse.Namespace) -> int:
     name = arguments.name or path.stem
     with record_of(arguments) as record:
         record.put_plan_image(kept.png)
-        print(record.annotate("plan", name, arguments.because, check=arguments.check, **fields))
+        said = [record.annotate("plan", name, arguments.because, check=arguments.check, **fields)]
         if not arguments.check:
-            print("\n".join(plan_words(record.plans().plan(name))))
+            said += plan_words(record.plans().plan(name))
+    print_said(arguments, *said)
     return 0
 
 

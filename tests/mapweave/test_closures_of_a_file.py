@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -75,3 +77,27 @@ def test_what_a_retirement_leaves_without_effect_is_named(
     # What has none already is not named again.
     assert main(["map", "retire", "r0.1", "--undo", *at]) == 0
     assert "without effect" not in capfd.readouterr().out
+
+
+def test_what_a_person_says_is_said_again_for_a_script(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    at = ["--map", str(map_of("r0", tmp_path)), "--json"]
+
+    def said(*words: str) -> dict[str, Any]:
+        capfd.readouterr()
+        assert main([*words, *at]) == 0
+        out: dict[str, Any] = json.loads(capfd.readouterr().out)
+        return out
+
+    assert said("floor", "list") == {"floors": []}
+    assert said("floor", "ground", "r0.1.3")["said"].startswith("floor r0.1 is on floor ground")
+    (entry,) = said("floor", "list")["floors"]
+    assert entry["name"] == "r0.1" and entry["body"]["label"] == "ground"
+    assert said("close", "r0.1.1", "r0.1.3", "--until", "2099-01-01")["said"].startswith("closure ")
+    assert said("reopen", "r0.1.1", "r0.1.3")["said"].startswith("closure ")
+    assert said("prefer", "r0.1.1", "r0.1.3")["said"].startswith("preference ")
+    assert said("place", "add", "kitchen", "r0.1.3")["said"].startswith("place kitchen is node r0.1.3")
+    assert said("place", "remove", "kitchen")["said"].startswith("place kitchen")
+    assert main(["floor", "list", *at[:2]]) == 0
+    assert capfd.readouterr().out.startswith("floor r0.1 is on floor ground")

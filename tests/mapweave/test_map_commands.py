@@ -185,6 +185,22 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     assert links(tmp_path / "one.mapweave") == [other for other in links(path) if other != pair]
 
 
+def test_what_a_correction_says_for_a_script_takes_it_back(
+    files: list[Path], said: Said, tmp_path: Path
+) -> None:
+    path = tmp_path / "m.mapweave"
+    path.write_bytes(files[3].read_bytes())
+    checked = json.loads(said("map", "retire", "r1.1", "--check", "--json", "--map", path))
+    assert checked["said"].startswith("only checked") and checked["number"] is None
+    assert "(number 1)" in said("map", "retire", "r2.1", "--map", path).splitlines()[0]
+    done = json.loads(said("map", "retire", "r1.1", "--json", "--map", path))
+    assert done["said"].startswith("map r1.1 is retired") and done["number"] == 2 and not links(path)
+    back = json.loads(said("map", "undo", done["number"], "--json", "--map", path))
+    assert back["number"] == 3 and links(path) == links(files[3])
+    apart = json.loads(said("map", "unmerge", "r0.1", "r1.1", "--json", "--map", path))
+    assert apart["number"] == 4 and "r0.1 and r1.1 are not one map" in apart["said"]
+
+
 def test_an_entry_that_was_taken_back_is_not_undone_again(
     files: list[Path], said: Said, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:
