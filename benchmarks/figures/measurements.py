@@ -1,6 +1,6 @@
 """Which command measures what: one stored result each.
 
-Seeds from 700 on were used for nothing before. `DATA` is the folder of recordings (`--data`).
+`DATA` is the folder of recordings (`--data`).
 """
 
 from __future__ import annotations
@@ -34,4 +34,8 @@ MEASUREMENTS: dict[str, str] = {
     "agent": "python -m benchmarks.agent --seed 724 --json",
     "fleet": "python -m benchmarks.fleet --agents 50 200 1000 --seconds 30 --seed 733 --json",
     "life": "python -m benchmarks.life --drives 6 --stops 4 --seed 713 --json",
+    "life_year": "python -m benchmarks.life --drives 100 --seed 735 --json",
+    "chaos": "python -m benchmarks.chaos --agents 5 --seconds 60 --seed 734 --json",
+    "photographs_corridor": "mapweave eval relocalize DATA/corridor --json",
+    "photographs_street": "mapweave eval relocalize DATA/kitti03 --json",
 }
