@@ -48,7 +48,10 @@ MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
 """Rules on links, for fleets without images."""
 TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {
     **MERGE_RULES,
-    "mutual exclusion": ((Refutation, "impossible", lambda *_: {}), (Refutation, "verdict", lambda *_: "")),
+    "mutual exclusion": (
+        (Refutation, "impossible", lambda *_: ({}, {})),
+        (Refutation, "verdict", lambda *_: ""),
+    ),
     "aliased landmarks": ((merging, "weigh", lambda links, *_: list(links)),),
 }
 """Rules on links, for robots with images and bodies."""
