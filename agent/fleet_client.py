@@ -10,7 +10,7 @@ from collections import Counter
 from collections.abc import Callable
 from dataclasses import replace
 
-from mapweave.agent.mission import Answer, AnswerContent, Driven, Question, WhereAmI, WhoIsNear
+from mapweave.agent.mission import AnswerContent, Driven, Question, ServerAnswer, WhereAmI, WhoIsNear
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.queries import best, decode_answer, encode_query, settles
 from mapweave.agent.teleoperation import Teleoperation
@@ -91,7 +91,7 @@ class FleetClient:
         self._timeout = answer_timeout
         self._teleoperation, self._limits = teleoperation or Teleoperation(), limits
         self._asked: queue.SimpleQueue[Question | None] = queue.SimpleQueue()
-        self._answered: queue.SimpleQueue[Answer] = queue.SimpleQueue()
+        self._answered: queue.SimpleQueue[ServerAnswer] = queue.SimpleQueue()
         self._open_questions = 0
         self.asked: Counter[type[Question]] = Counter()
         self.relocalized: Counter[str] = Counter()
@@ -144,14 +144,14 @@ class FleetClient:
         self.asked[type(question)] += 1
         self._asked.put(question)
 
-    def answers(self, wait: bool = False) -> tuple[Answer, ...]:
+    def answers(self, wait: bool = False) -> tuple[ServerAnswer, ...]:
         """Answers that have come.
 
         Args:
             wait: until every question has its answer or its time is over. A simulation in lock-step waits,
                 so that its result does not depend on the machine's speed; a robot never does.
         """
-        out: list[Answer] = []
+        out: list[ServerAnswer] = []
         while self._open_questions and (wait or not self._answered.empty()):
             out.append(self._answered.get())
             self._open_questions -= 1
@@ -227,15 +227,15 @@ class FleetClient:
                 self.relocalized[outcome] += 1
             self._answered.put(answer)
 
-    def _answer(self, question: Question) -> Answer:
+    def _answer(self, question: Question) -> ServerAnswer:
         # An older server does not answer that: the robot maps as without one.
         optional = isinstance(question, WhoIsNear)
         if optional and not self.server_in_reach():
-            return Answer(question.number, None, NO_ANSWER)
+            return ServerAnswer(question.number, None, NO_ANSWER)
         try:
             key, payload = encode_query(self._keys, question, self._agent)
         except InvalidValue as unspeakable:
-            return Answer(question.number, None, str(unspeakable))
+            return ServerAnswer(question.number, None, str(unspeakable))
         answers: list[AnswerContent] = []
         error, retry_after = NO_ANSWER, 0.0
 
@@ -261,7 +261,7 @@ class FleetClient:
             time.sleep(ASK_AGAIN)
         if answers:
             self._troubles.answered(type(question))
-            return Answer(question.number, best(answers))
+            return ServerAnswer(question.number, best(answers))
         if not optional:
             self._troubles.begin(type(question), error, error == NO_ANSWER)
-        return Answer(question.number, None, error, retry_after)
+        return ServerAnswer(question.number, None, error, retry_after)

@@ -22,7 +22,7 @@ from mapweave.agent.global_localization.resumption import Resumption
 from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mapping.node_retirement import Released, alone
-from mapweave.agent.mission import Answer, Question
+from mapweave.agent.mission import Question, ServerAnswer
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.ranger_monitor import not_exploring
 from mapweave.agent.settings import AgentSettings
@@ -141,7 +141,12 @@ class MapMaking:
             self.restart()
 
     def step(
-        self, observation: Observation, answers: tuple[Answer, ...], alone: bool, blind: bool, held: bool
+        self,
+        observation: Observation,
+        answers: tuple[ServerAnswer, ...],
+        alone: bool,
+        blind: bool,
+        held: bool,
     ) -> tuple[Command, list[Question]]:
         """One tick of a mission to map.
 
@@ -170,7 +175,7 @@ class MapMaking:
         return command, questions
 
     def _behave(
-        self, observation: Observation, answers: tuple[Answer, ...], alone: bool, held: bool
+        self, observation: Observation, answers: tuple[ServerAnswer, ...], alone: bool, held: bool
     ) -> tuple[Command, list[Question]]:
         """What the robot does while it knows where it is."""
         pose = self.mapper.map_from_robot.mean

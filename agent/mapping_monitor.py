@@ -39,7 +39,7 @@ STANDING = (0.005, 0.005)
 """Way, m, and turn, rad, within the window below which they stand."""
 
 
-class Moment(NamedTuple):
+class MonitoredTick(NamedTuple):
     """One tick.
 
     Attributes:
@@ -66,7 +66,7 @@ class MappingMonitor:
         """Nothing is seen yet."""
         self._tick = description.tick
         self._driven = description.max_forward > 0.0
-        self._moments: deque[Moment] = deque(maxlen=max(round(WINDOW / description.tick), 2))
+        self._moments: deque[MonitoredTick] = deque(maxlen=max(round(WINDOW / description.tick), 2))
         self._command = Command()
         self._fault = ""
         self._nodes = 0
@@ -123,7 +123,7 @@ class MappingMonitor:
             reduced = cv2.resize(image, SMALL_PX, interpolation=cv2.INTER_AREA)
             small = np.asarray(reduced, np.float32)
         self._moments.append(
-            Moment(
+            MonitoredTick(
                 observation.stamp_ns, abs(odometry.forward), abs(odometry.turn),
                 abs(command.forward) * self._tick, abs(command.turn) * self._tick, small,
             )

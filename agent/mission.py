@@ -167,8 +167,8 @@ AnswerContent = RelocalizeAnswer | RouteAnswer | KnownAnswer | ReserveAnswer | N
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """An answer.
+class ServerAnswer:
+    """A server's answer to a question of this robot.
 
     Attributes:
         number: of the question.

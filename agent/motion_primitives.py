@@ -6,7 +6,7 @@ import math
 from collections.abc import Generator
 
 from mapweave.agent.clearance import clearance
-from mapweave.agent.mission import Answer, Question
+from mapweave.agent.mission import Question, ServerAnswer
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.hybridmap.pose import Pose2
 
@@ -39,7 +39,7 @@ class MotionPrimitives:
         self._description = description
         self._patience = patience
         self._observation: Observation | None = None
-        self._answers: dict[int, Answer] = {}
+        self._answers: dict[int, ServerAnswer] = {}
         self._questions: list[Question] = []
         self.next_number = first
 
@@ -49,7 +49,7 @@ class MotionPrimitives:
         assert self._observation is not None, "take_in comes first"
         return self._observation
 
-    def take_in(self, observation: Observation, answers: tuple[Answer, ...]) -> None:
+    def take_in(self, observation: Observation, answers: tuple[ServerAnswer, ...]) -> None:
         """Begin a tick."""
         self._observation = observation
         self._answers.update({answer.number: answer for answer in answers})
@@ -72,19 +72,19 @@ class MotionPrimitives:
         """Ask without waiting; `answer` has the answer later."""
         self._questions.append(question)
 
-    def answer(self, number: int) -> Answer | None:
+    def answer(self, number: int) -> ServerAnswer | None:
         """The answer to a question, once; None if it has not come."""
         return self._answers.pop(number, None)
 
     # Behaviours
 
-    def ask(self, question: Question) -> Generator[Command, None, Answer]:
+    def ask(self, question: Question) -> Generator[Command, None, ServerAnswer]:
         """Ask the fleet's map, and stand until the answer comes or is overdue.
 
         A busy server says when to ask again.
         """
         self._questions.append(question)
-        answer, again = Answer(question.number, None, NO_ANSWER), math.inf
+        answer, again = ServerAnswer(question.number, None, NO_ANSWER), math.inf
         for _ in range(self._patience):
             yield Command()
             if question.number in self._answers:

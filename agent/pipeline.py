@@ -26,14 +26,14 @@ from mapweave.agent.map_making import MapMaking
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mapping.node_retirement import Released, alone
 from mapweave.agent.mapping.view import RawImage
-from mapweave.agent.mission import Answer, Carried, Driven, Explore, GoTo, Idle, Mission, Question
+from mapweave.agent.mission import Carried, Driven, Explore, GoTo, Idle, Mission, Question, ServerAnswer
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.navigation.portal_crossing import PortalCrossing
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.robots_in_view import RobotsInView, nodes_around
 from mapweave.agent.sensor_health.odometry_convention import OdometryConvention
-from mapweave.agent.sensor_health.sensor_monitor import Fault, SensorMonitor
+from mapweave.agent.sensor_health.sensor_monitor import SensorFault, SensorMonitor
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
@@ -49,8 +49,8 @@ drive for ever."""
 
 
 @dataclass(frozen=True)
-class Step:
-    """What one tick gives.
+class TickResult:
+    """The result of one tick.
 
     Attributes:
         command: for the wheels; already safe by the proximity sensors.
@@ -65,7 +65,7 @@ class Step:
     changes: tuple[ChangeBody, ...]
     questions: tuple[Question, ...]
     status: Status
-    fault: Fault | None = None
+    fault: SensorFault | None = None
     images: tuple[tuple[NodeId, RawImage], ...] = ()
 
 
@@ -232,8 +232,8 @@ class Pipeline:
             self._navigator.crossing.taken_through()
 
     def step(
-        self, observation: Observation, answers: tuple[Answer, ...] = (), driven: Driven | None = None
-    ) -> Step:
+        self, observation: Observation, answers: tuple[ServerAnswer, ...] = (), driven: Driven | None = None
+    ) -> TickResult:
         """Take one observation and decide.
 
         Args:
@@ -290,7 +290,7 @@ class Pipeline:
         own = isinstance(self._mission, Explore | GoTo) and driven is None and not self._lifted
         self._command = safe if own else None
         images = self.mapper.take_images()
-        return Step(safe, changes, tuple(questions), self._status(warning), self._fault, images)
+        return TickResult(safe, changes, tuple(questions), self._status(warning), self._fault, images)
 
     def finish(self) -> tuple[tuple[ChangeBody, ...], tuple[tuple[NodeId, RawImage], ...]]:
         """Make at once what is left of the last mapping episode, before the process ends.
@@ -353,7 +353,7 @@ class Pipeline:
         return fault.words if fault is not None and isinstance(self._mission, Explore | GoTo) else ""
 
     @property
-    def _fault(self) -> Fault | None:
+    def _fault(self) -> SensorFault | None:
         """The sensor that cannot be believed. Who is moved by a person needs no rangers."""
         fault = self._sensors.fault
         if fault is not None and fault.sensor == "rangers" and not isinstance(self._mission, Explore | GoTo):

@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
-from mapweave.agent.mission import Answer, WhoIsNear
+from mapweave.agent.mission import ServerAnswer, WhoIsNear
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
@@ -101,7 +101,10 @@ class RobotsInView:
         self._seen: tuple[float, Pose2, tuple[NearbyRobot, ...]] | None = None
 
     def mark(
-        self, observation: Observation, answers: Sequence[Answer], landmarks: Callable[[], LandmarkEstimates]
+        self,
+        observation: Observation,
+        answers: Sequence[ServerAnswer],
+        landmarks: Callable[[], LandmarkEstimates],
     ) -> Observation:
         """Begin a tick: the observation with the regions of its image in which others may stand.
 
@@ -157,7 +160,7 @@ class RobotsInView:
         height, speed = d.camera.mount_height + ABOVE, d.max_forward or CARRIED
         return WhoIsNear(NUMBER, starts, min(sigma, 100.0), min(turn, 4.0), d.radius, height, speed)
 
-    def _take(self, answer: Answer, at: float, odom_then: Pose2) -> None:
+    def _take(self, answer: ServerAnswer, at: float, odom_then: Pose2) -> None:
         self.aside = answer.content.aside if isinstance(answer.content, NearbyAnswer) else None
         if not isinstance(answer.content, NearbyAnswer):
             self._due = self._now + EVERY[1]

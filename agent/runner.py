@@ -12,10 +12,10 @@ from dataclasses import replace
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mapping_monitor import MappingMonitor
-from mapweave.agent.mission import Answer, Question
+from mapweave.agent.mission import Question, ServerAnswer
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Observation
-from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.synchronization import FreeRunning, Synchronization
 
@@ -45,7 +45,7 @@ class Runner:
         missions: MissionControl,
         monitor: MappingMonitor,
         synchronization: Synchronization | None = None,
-        on_step: Callable[[Observation, Step], None] = lambda observation, step: None,
+        on_step: Callable[[Observation, TickResult], None] = lambda observation, step: None,
         print_line: Callable[[str], None] = lambda line: None,
         clock: Callable[[], float] = time.monotonic,
         recorded: bool = False,
@@ -77,17 +77,17 @@ class Runner:
         self._synchronization = synchronization or FreeRunning()
         self._on_step = on_step
         self._questions: tuple[Question, ...] = ()
-        self._answers: tuple[Answer, ...] = ()
+        self._answers: tuple[ServerAnswer, ...] = ()
         self._ticks, self._reported = 0, -math.inf
         self.why_no_node = ""
 
-    def tick(self, observation: Observation) -> Step:
+    def tick(self, observation: Observation) -> TickResult:
         """Take one observation; changes and status go their way, questions wait for `exchange`."""
         step = self._think(observation)
         self._hand_over(observation, step)
         return step
 
-    def _think(self, observation: Observation) -> Step:
+    def _think(self, observation: Observation) -> TickResult:
         home = min(self._pipeline.map.nodes, default=None)
         mission = self._missions.next(self._fleet.server_in_reach(), observation.stamp_ns * 1e-9, home)
         if mission is not None:
@@ -99,7 +99,7 @@ class Runner:
         self._questions = step.questions
         return step
 
-    def _hand_over(self, observation: Observation, step: Step) -> None:
+    def _hand_over(self, observation: Observation, step: TickResult) -> None:
         """Changes come before the status: one that counts a node also counts that it is not sent yet."""
         if step.changes:
             self._replicator.submit(step.changes, observation.stamp_ns)
@@ -123,7 +123,7 @@ class Runner:
         """Whether servers want a status again of which nothing new is known."""
         return self._clock() - self._reported >= self._replicator.status_period
 
-    def _report_fault(self, step: Step) -> None:
+    def _report_fault(self, step: TickResult) -> None:
         """One line when a sensor fails, and one when it is back."""
         faulty = "" if step.fault is None else step.fault.sensor
         if faulty == self._faulty:

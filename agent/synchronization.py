@@ -7,7 +7,7 @@ from collections.abc import Callable
 from typing import Protocol
 
 from mapweave.agent.fleet_client import FleetClient
-from mapweave.agent.mission import Answer
+from mapweave.agent.mission import ServerAnswer
 from mapweave.agent.replication.replicator import Replicator
 
 log = logging.getLogger(__name__)
@@ -38,7 +38,7 @@ class Synchronization(Protocol):
         """Called before questions are sent."""
         ...
 
-    def answers(self, fleet: FleetClient) -> tuple[Answer, ...]:
+    def answers(self, fleet: FleetClient) -> tuple[ServerAnswer, ...]:
         """Answers to the questions that were just sent, as far as the loop waits for them."""
         ...
 
@@ -54,12 +54,12 @@ class FreeRunning:
     def before_questions(self) -> None:
         """Nothing."""
 
-    def answers(self, fleet: FleetClient) -> tuple[Answer, ...]:
+    def answers(self, fleet: FleetClient) -> tuple[ServerAnswer, ...]:
         """None: they come with a later tick."""
         return ()
 
 
-class Lockstep:
+class LockstepWaiting:
     """Simulated time stops until disk, server and answers are done, however slow the machine is."""
 
     answer_timeout = LOCKSTEP_PATIENCE
@@ -88,6 +88,6 @@ class Lockstep:
         """Wait until every other robot has finished the tick: the server then has all that it will have."""
         self._rendezvous()
 
-    def answers(self, fleet: FleetClient) -> tuple[Answer, ...]:
+    def answers(self, fleet: FleetClient) -> tuple[ServerAnswer, ...]:
         """Wait for every answer."""
         return fleet.answers(wait=True)

@@ -22,7 +22,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection.independent_support import ChanceSupport
 from mapweave.merge.outlier_rejection.pairwise_consistency import CHANCE, sort_links
 from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.settings import ConsistencySettings
@@ -39,7 +39,7 @@ LINK = np.diag([0.03**2, 0.03**2, 0.01**2])
 def chain(agent: str, count: int, beside: float) -> Fragment:
     """A robot that drives straight on, with a node every 0.8 m."""
     ids = [NodeId(agent, 1, k) for k in range(count)]
-    way = [Measurement(a, b, STEP) for a, b in pairwise(ids)]
+    way = [RelativePose(a, b, STEP) for a, b in pairwise(ids)]
     return Fragment(ids[0], solve_graph(ids[0], Pose2(0.0, beside, 0.0), way), tuple(way))
 
 

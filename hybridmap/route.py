@@ -62,7 +62,7 @@ class _Hop:
     choices: list[tuple[float, EdgeId]] = field(default_factory=list)
 
 
-class Ways:
+class RouteTable:
     """All ways through a map at one time: made once, asked from several starts."""
 
     def __init__(

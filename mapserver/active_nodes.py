@@ -19,7 +19,7 @@ from mapweave.mapserver.wire_limits import FARTHEST
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
-class Places(Protocol):
+class NodeRetrieval(Protocol):
     """Finds nodes, but for some; for example mapweave.mapserver.retrieval.place_database.PlaceDatabase."""
 
     def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> Ranked:
@@ -36,7 +36,7 @@ class ActiveNodes:
 
     def __init__(
         self,
-        places: Places,
+        places: NodeRetrieval,
         node_of: Callable[[NodeId], Node | None],
         merged: MergedMap,
         set_apart: Iterable[NodeId] = (),

@@ -12,7 +12,7 @@ from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.portal import Portal
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.route_rules import RouteRules
 from mapweave.merge.floors import parted_by
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -22,7 +22,7 @@ MOST_LOST = 8
 """Of what loses its effect, so many are named."""
 
 
-def effects_of(annotation: Annotation, places: Places) -> Iterator[str]:
+def effects_of(annotation: Annotation, places: PlaceResolver) -> Iterator[str]:
     """Counts of the nodes, ways or links that it is about, and the entry that it replaces.
 
     Args:

@@ -27,7 +27,7 @@ from mapweave.mapserver.annotation_effects import effects_of
 from mapweave.mapserver.annotation_words import not_there
 from mapweave.mapserver.floor_plans import check_plan
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.places import Places, why_left_out
+from mapweave.mapserver.places import PlaceResolver, why_left_out
 from mapweave.mapserver.portals import Portals, check_portal
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.services import guarded
@@ -99,7 +99,7 @@ class Annotator:
         bus: Bus,
         keys: Keys,
         name: str,
-        places: Callable[[], Places],
+        places: Callable[[], PlaceResolver],
         record: AnnotationRecord,
         check: Callable[[Annotation], None],
         constraints: Callable[[], ManualConstraints],

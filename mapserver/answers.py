@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Node
 from mapweave.mapserver.active_nodes import ActiveNodes, doubted
-from mapweave.mapserver.coverage import Coverage
+from mapweave.mapserver.coverage import SharedCoverage
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.routes import Router
@@ -29,7 +29,7 @@ class Answers:
     merged: MergedMap
     relocalizer: Relocalizer
     router: Router
-    known: Coverage
+    known: SharedCoverage
 
     @classmethod
     def of(cls, merger: Merger, merged: MergedMap, node_of: Callable[[NodeId], Node | None]) -> Answers:
@@ -41,4 +41,4 @@ class Answers:
             first = Relocalizer(sure, sure.node, merged, alike=merger.alike)
         places = ActiveNodes(merger.places, node_of, merged, set_apart)
         relocalizer = Relocalizer(places, places.node, merged, alike=merger.alike, first=first)
-        return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), Coverage(merged))
+        return cls(merged, relocalizer, Router(merged, reaches=merger.reaches), SharedCoverage(merged))

@@ -11,7 +11,7 @@ from mapweave.hybridmap.query import MAX_KNOWN, KnownAnswer
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
-class Coverage:
+class SharedCoverage:
     """Answers what others have mapped. It belongs to one merged map; make another for the next."""
 
     def __init__(self, merged: MergedMap) -> None:

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.mapserver.places import Places, position_of
+from mapweave.mapserver.places import PlaceResolver, position_of
 
 HOME = "home"
 FORMS = "give a node (r0.1.17), a named place, a position in the merged map (3.1,-2.0) or home"
 
 
-def node_of_goal(goal: str, map_id: MapId, places: Places, name: str = "goal") -> NodeId:
+def node_of_goal(goal: str, map_id: MapId, places: PlaceResolver, name: str = "goal") -> NodeId:
     """The node where a robot shall park, or which it shall pass.
 
     Args:

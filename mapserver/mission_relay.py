@@ -31,7 +31,7 @@ from mapweave.hybridmap.mission_order import (
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.mapserver.goals import node_of_goal
 from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.places import Places, others_of
+from mapweave.mapserver.places import PlaceResolver, others_of
 from mapweave.mapserver.roster import Roster
 from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.each_robot import in_parallel
@@ -68,7 +68,7 @@ class MissionRelay:
         bus: Bus,
         keys: Keys,
         store: Store,
-        places: Callable[[], Places],
+        places: Callable[[], PlaceResolver],
         time_ns: Callable[[], int],
         later: Callable[[Callable[[], None]], None],
         note: Callable[[MissionOrder, bool], None] = lambda order, heard: None,

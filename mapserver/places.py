@@ -39,8 +39,8 @@ MOST_NAMES = 20
 FORMS = "give a node (r0.1.17), the name of a place, or a position in the merged map (3.1,-2.0)"
 
 
-class Places:
-    """The places of one merged map. Cheap to make: nothing is worked out before it is asked for."""
+class PlaceResolver:
+    """Resolves named places and node ids on one merged map. Cheap to make; works out only what is asked."""
 
     def __init__(self, router: Router, annotations: Annotations) -> None:
         """Take a map.

@@ -23,7 +23,7 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.known_logs import Lag
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.quotas import MOST_ROBOTS, Quotas
 from mapweave.merge.explanation.map_standing import MapStanding, map_standings
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -167,7 +167,7 @@ class Roster:
                 found[name] = Presence(bool(self._alive.get(name)), age, unsent)
         return found
 
-    def robots(self, places: Places) -> FleetStatus:
+    def robots(self, places: PlaceResolver) -> FleetStatus:
         """All robots, with where they are in a merged map."""
         merged = places.merged
         now = self._clock()

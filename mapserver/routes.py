@@ -19,7 +19,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.hybridmap.reachability import RECOGNISED
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
-from mapweave.hybridmap.route import Route, RouteSettings, Ways, joined
+from mapweave.hybridmap.route import Route, RouteSettings, RouteTable, joined
 from mapweave.mapserver.active_nodes import without_faded
 from mapweave.mapserver.obstacles import Disc, Discs
 from mapweave.mapserver.portals import Portals
@@ -260,8 +260,8 @@ class Router:
         wary: Collection[tuple[NodeId, NodeId]] = (),
         toll: float | None = None,
         within: Collection[Annotation] | None = (),
-    ) -> Ways:
-        """The ways over some nodes and edges; see `route` and mapweave.hybridmap.route.Ways.
+    ) -> RouteTable:
+        """The ways over some nodes and edges; see `route` and mapweave.hybridmap.route.RouteTable.
 
         Args:
             choice: which.
@@ -273,7 +273,7 @@ class Router:
         rules = self.rules
         closed = set() if within is None else rules.closed_for(within)
         barred = [*map(frozenset, blocked), *closed, *(self._discs.barred if self._discs else ())]
-        return Ways(
+        return RouteTable(
             self.roads.union, poses=choice.poses, penalties=self._penalties(wary), blocked=barred,
             closed=choice.closed, settings=self.costs, toll=toll,
             factors={} if within is None else rules.factors_for(within), portals=self.portals.edges,

@@ -46,7 +46,7 @@ from mapweave.mapserver.mission_relay import EVERY as RETRY_EVERY
 from mapweave.mapserver.mission_relay import KEPT as MISSIONS
 from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.mapserver.node_views import NodeViews
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.plan_service import PlanService
 from mapweave.mapserver.pose_broadcast import PoseBroadcast
 from mapweave.mapserver.prompt_reading import PromptReading
@@ -508,8 +508,8 @@ class MapServer:
         router = answers.router.at(self._annotations.annotations, self._schedule.time_ns())
         return replace(answers, router=router)
 
-    def _named_places(self) -> Places:
-        return Places(self._answers().router, self._annotations.annotations)
+    def _named_places(self) -> PlaceResolver:
+        return PlaceResolver(self._answers().router, self._annotations.annotations)
 
     def _events(self) -> tuple[MapEvent, ...]:
         """What has become of the maps, those of the base included."""

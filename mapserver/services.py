@@ -33,7 +33,7 @@ from mapweave.mapserver.nearby import Nearby, StandingRobot
 from mapweave.mapserver.obstacles import Disc, Discs, placed
 from mapweave.mapserver.packed_map import PackedMap
 from mapweave.mapserver.parked_robots import route_past_parked
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.quotas import Quotas
 from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.roster import Roster
@@ -70,7 +70,7 @@ class Services:
         relays: Executor,
         clock: Callable[[], float],
         executor: Executor,
-        places: Callable[[], Places],
+        places: Callable[[], PlaceResolver],
         images: Callable[[], Mapping[str, bytes]],
         quotas: Quotas,
         observe: Callable[[float, Future[RelocalizeAnswer]], None] = lambda seconds, done: None,

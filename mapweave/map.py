@@ -354,9 +354,9 @@ class FileMap(Map):
 
     def _answer(self, view: View) -> RelocalizeAnswer:
         router = self._router()
-        from mapweave.mapserver.places import Places
+        from mapweave.mapserver.places import PlaceResolver
 
-        return Places(router, router.annotations).named(self._read.relocalizer.answer(view))
+        return PlaceResolver(router, router.annotations).named(self._read.relocalizer.answer(view))
 
     def _explained(self, request: ExplainRequest) -> Explanation:
         router = self._router()
@@ -379,10 +379,10 @@ class FileMap(Map):
         """Nodes for words; see Map."""
         asked = asked_of(request)
         router = self._router()
-        from mapweave.mapserver.places import Places
+        from mapweave.mapserver.places import PlaceResolver
 
         with refusals():
-            return Places(router, router.annotations).answer(asked)
+            return PlaceResolver(router, router.annotations).answer(asked)
 
     def _router(self) -> Router:
         """Of the ways that are open now."""

@@ -21,7 +21,7 @@ from mapweave.mapserver.annotation_effects import effects_of
 from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.mapserver.annotator import CHECKED, check_annotation, check_edge
 from mapweave.mapserver.floor_plans import placed_plans
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
@@ -84,7 +84,7 @@ class OfflineAnnotations(AnnotationMethods):
         """
         asked = asked_of(request)
         with refusals():
-            return Places(self._router, self.annotations()).answer(asked)
+            return PlaceResolver(self._router, self.annotations()).answer(asked)
 
     def plans(self) -> PlacedPlans:
         """Floor plans under the map."""
@@ -133,7 +133,7 @@ class OfflineAnnotations(AnnotationMethods):
             check_annotation(self._router.merged, self.annotations(), annotation, constraints)
             check_edge(self._router, self.annotations(), annotation)
         words = "; ".join(
-            (annotation.words, *effects_of(annotation, Places(self._router, self.annotations())))
+            (annotation.words, *effects_of(annotation, PlaceResolver(self._router, self.annotations())))
         )
         body = annotation.body
         if isinstance(body, FloorPlan) and not annotation.removed:

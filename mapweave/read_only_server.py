@@ -24,7 +24,7 @@ from mapweave.mapserver.constraint_history import with_constraints
 from mapweave.mapserver.explanations import explained
 from mapweave.mapserver.floor_plans import placed_plans
 from mapweave.mapserver.node_views import NoView
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
@@ -234,9 +234,9 @@ class ReadOnlyServer:
         """The map as a map file."""
         return self._background.submit(lambda: self._packed)
 
-    def _places(self) -> Places:
+    def _places(self) -> PlaceResolver:
         router = self._router.result().at(self._annotations, time.time_ns())
-        return Places(router, self._annotations)
+        return PlaceResolver(router, self._annotations)
 
     @cached_property
     def _packed(self) -> bytes:

@@ -44,7 +44,7 @@ BOUNDS = {"gt": "more than", "ge": "at least", "lt": "less than", "le": "at most
 
 
 @dataclass(frozen=True)
-class Setting:
+class SettingLine:
     """One line of a settings file.
 
     Attributes:
@@ -73,7 +73,7 @@ class Section:
 
     name: str
     text: str
-    settings: tuple[Setting, ...]
+    settings: tuple[SettingLine, ...]
     optional: bool
 
 
@@ -88,7 +88,7 @@ def sections(cls: type = Settings, name: str = "", optional: bool = False) -> It
         if isinstance(kind, type):
             inner.append((kind, f"{name}.{one.name}" if name else one.name, default is None))
         else:
-            lines.append(Setting(one.name, _toml(default), texts[one.name], _bounds(hint)))
+            lines.append(SettingLine(one.name, _toml(default), texts[one.name], _bounds(hint)))
     if lines:
         yield Section(name, summary, tuple(lines), optional)
     for kind, path, absent in inner:

@@ -29,7 +29,7 @@ from mapweave.hybridmap.query import View
 from mapweave.photographs import LEAST_LANDMARKS, Stretch, changes_of, stretch_of
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
-from mapweave.visual_trajectory import FollowedImage, ImagePose, trajectory_of
+from mapweave.visual_trajectory import ImagePose, TrackedImage, trajectory_of
 
 PARALLAX = math.radians(2.5)
 """Of the points of a keyframe in the next one, the median, without what turning explains, rad. Depths are
@@ -59,7 +59,7 @@ class Keyframe:
 
     stamp_ns: int
     view: View
-    followed: list[FollowedImage] = field(default_factory=list)
+    followed: list[TrackedImage] = field(default_factory=list)
 
 
 @dataclass(frozen=True, eq=False)
@@ -100,7 +100,7 @@ def keyframes(recording: Recording, frames: Iterable[int]) -> tuple[list[Keyfram
             points, features = both[: len(corners)], both[len(corners) :]
         stamp_ns = int(recording.stamps_ns[k])
         if before is not None and not _is_next(camera, lens, corners, points):
-            walk[-1].followed.append(FollowedImage(stamp_ns, _undistorted(lens, features)))
+            walk[-1].followed.append(TrackedImage(stamp_ns, _undistorted(lens, features)))
         else:
             extracted = sift.extract(image)
             walk.append(Keyframe(stamp_ns, extracted.view(camera)))

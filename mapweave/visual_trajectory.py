@@ -28,7 +28,7 @@ INTERPOLATED = "# not found: interpolated from here\n"
 
 
 @dataclass(frozen=True, eq=False)
-class FollowedImage:
+class TrackedImage:
     """An image after a keyframe.
 
     Attributes:
@@ -58,7 +58,7 @@ class ImagePose:
 def trajectory_of(
     stretch: Stretch,
     stamps_ns: Sequence[int],
-    followed: Sequence[Sequence[FollowedImage]],
+    followed: Sequence[Sequence[TrackedImage]],
     camera: Camera,
 ) -> list[ImagePose]:
     """The poses of all images of a map, from its first keyframe to the last image that is found.

@@ -25,7 +25,7 @@ from mapweave.merge.outlier_rejection.loop_closures import distance2_of
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
 from mapweave.merge.pose_graph.marginalization import fused, is_marginal
-from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.pose_graph.verdicts import Verdict, Verdicts
 from mapweave.merge.retired_nodes import retired_nodes
 from mapweave.merge.settings import MergeSettings
@@ -320,7 +320,7 @@ def _together(
         key=lambda item: (-len(item[0].nodes), item[0].anchor),
     )
     solved = tuple(graph for graph, _ in graphs)
-    poses = Poses(solved)
+    poses = NodePoses(solved)
     links = sorted((link for merged in islands for link in merged.links), key=lambda link: link.pair)
     refused = [refusal for merged in islands for refusal in merged.refused]
     apart, between = _sorted_out(across)

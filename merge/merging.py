@@ -30,7 +30,7 @@ from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link, RefusedLink
-from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.settings import MergeSettings
 from mapweave.merge.standing_decisions import StandingDecisions
@@ -145,7 +145,7 @@ def decide(
         tuple(sorted((link.canonical() for link in kept), key=lambda link: link.pair)),
         tuple(sorted(refusals, key=lambda r: r.pair)),
         tuple(frozenset(graph.nodes) for graph in solved),
-        Poses(solved),
+        NodePoses(solved),
         tuple(solved),
         contradicted=contradicted,
     )

@@ -9,7 +9,7 @@ from mapweave.merge.manual_constraints import apply_constraints, link_by_hand
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import fragment_by_node
-from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.settings import ConsistencySettings
 
 
@@ -57,7 +57,7 @@ def with_unmerged_links(
         merged,
         links=tuple(sorted([*others, *links.values()], key=lambda link: link.pair)),
         components=tuple(frozenset(graph.nodes) for graph in solved),
-        poses=Poses(solved),
+        poses=NodePoses(solved),
         graphs=tuple(solved),
         constraints=ManualConstraints(
             [*merged.constraints.made, *made], merged.constraints.nodes, merged.constraints.floors

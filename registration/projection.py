@@ -43,7 +43,7 @@ class Optics(NamedTuple):
     area: float
 
 
-class Seen(NamedTuple):
+class CameraSightings(NamedTuple):
     """N sightings of one camera.
 
     Attributes:
@@ -67,7 +67,7 @@ class Seen(NamedTuple):
     optics: Optics
 
 
-class Poses(NamedTuple):
+class PoseHypotheses(NamedTuple):
     """H poses of the robot in the points' frame: (H,) m, m and the heading's cosine and sine."""
 
     x: Vector
@@ -77,7 +77,7 @@ class Poses(NamedTuple):
 
 
 @for_each_pair
-def _log_ratio(h: Index, n: Index, seen: Seen, poses: Poses) -> Vector:
+def _log_ratio(h: Index, n: Index, seen: CameraSightings, poses: PoseHypotheses) -> Vector:
     """Log likelihood ratio of sighting n under pose h against a wrong match, nats; see `log_ratios`."""
     optics, p = seen.optics, seen.covariances
     c, s = poses.cos[h], poses.sin[h]
@@ -111,7 +111,7 @@ def _log_ratio(h: Index, n: Index, seen: Seen, poses: Poses) -> Vector:
 
 
 @compiled
-def log_ratios(seen: Seen, poses: Poses) -> Matrix:
+def log_ratios(seen: CameraSightings, poses: PoseHypotheses) -> Matrix:
     """(H, N) log likelihood ratios of sightings under poses against wrong matches, nats; 0 where the point is
     behind the camera or outside the 99 % gate.
     """

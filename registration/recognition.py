@@ -82,7 +82,7 @@ class Recognition:
 
 
 @dataclass(frozen=True, eq=False)
-class Refusal:
+class RecognitionFailure:
     """A place was not recognised.
 
     Attributes:
@@ -123,7 +123,7 @@ def register(
 
 def examine_view(
     node: Node, view: View, settings: RecognitionSettings | None, rng: np.random.Generator
-) -> Recognition | Refusal:
+) -> Recognition | RecognitionFailure:
     """Compare a view with a node's landmarks that have a depth.
 
     Args:
@@ -145,7 +145,7 @@ def examine_matches(
     pairs: NDArray[np.int64],
     settings: RecognitionSettings | None,
     rng: np.random.Generator,
-) -> Recognition | Refusal:
+) -> Recognition | RecognitionFailure:
     """The same for features that are matched already.
 
     Args:
@@ -166,7 +166,7 @@ def examine_matches(
 
 def examine_nodes(
     a: Node, b: Node, settings: RecognitionSettings | None, rng: np.random.Generator
-) -> Recognition | Refusal:
+) -> Recognition | RecognitionFailure:
     """Compare two nodes, with the landmarks' depths on both sides, in one joint estimate.
 
     Where a's landmark has a depth, its point must project on b's pixel and, if b has a depth too, lie at that
@@ -194,14 +194,14 @@ def _examine(
     pairs: NDArray[np.int64],
     s: RecognitionSettings,
     rng: np.random.Generator,
-) -> Recognition | Refusal:
+) -> Recognition | RecognitionFailure:
     forward = a.has_depth[pairs[:, 0]]
     backward = ~forward & b.has_depth[pairs[:, 1]]
     usable = np.concatenate([pairs[forward], pairs[backward]])
     if len(usable) < s.least_inliers:
         many = "1 feature matches" if len(pairs) == 1 else f"{len(pairs)} features match"
         words = f"{many}, {len(usable)} with a depth; {s.least_inliers} are needed"
-        return Refusal(words, len(pairs))
+        return RecognitionFailure(words, len(pairs))
     # A view has no depths that could contradict the scale of the node's: then it is not part of each of them.
     measured = bool(b.has_depth.any())
     scale_share = 0.0 if measured else a.scale_share
@@ -211,14 +211,14 @@ def _examine(
     ]
     fix = solve_sightings(sightings, rng=rng, settings=s.pose)
     if fix is None:
-        return Refusal(f"{len(usable)} matches agree on no pose", len(pairs))
+        return RecognitionFailure(f"{len(usable)} matches agree on no pose", len(pairs))
     inliers = usable[fix.inliers]
     evidence = gather(a, camera_a, b, camera_b, inliers, len(pairs), len(usable), fix)
     evidence["depths"] = depth_agreement(sightings[0], fix)
     evidence["rival"] = fix.rival
     reason = _objection(evidence, s)
     if reason:
-        return Refusal(reason, len(pairs), inliers, fix.node_from_robot, evidence)
+        return RecognitionFailure(reason, len(pairs), inliers, fix.node_from_robot, evidence)
     unknown = min(a.scale_share, b.scale_share) if measured else a.scale_share
     pose = of_unknown_scale(fix.node_from_robot, unknown, camera_a, camera_b)
     return Recognition(pose, inliers, len(pairs), len(usable), evidence)

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
 from mapweave.registration.pose_arrays import inverse_poses
-from mapweave.registration.projection import Optics, Poses, Seen, log_ratios
+from mapweave.registration.projection import CameraSightings, Optics, PoseHypotheses, log_ratios
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ class Sightings:
         if self.inverted:
             poses = inverse_poses(poses)
         area = float(camera.width * camera.height)
-        seen = Seen(
+        seen = CameraSightings(
             self.points,
             self.covariances,
             self.slopes,
@@ -126,5 +126,5 @@ class Sightings:
         )
         heading = poses[:, 2]
         return log_ratios(
-            seen, Poses(poses[:, 0].copy(), poses[:, 1].copy(), np.cos(heading), np.sin(heading))
+            seen, PoseHypotheses(poses[:, 0].copy(), poses[:, 1].copy(), np.cos(heading), np.sin(heading))
         )

@@ -21,7 +21,7 @@ from mapweave.agent.drivers.remote import clip
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.sim.ground_truth_service import GroundTruthService
 from mapweave.sim.keys import SimKeys
-from mapweave.sim.lockstep import Lockstep, Seat
+from mapweave.sim.lockstep import Seat, StepBarrier
 from mapweave.sim.lockstep_robot import Rendezvous, decode_rendezvous
 from mapweave.sim.simulation_interface import Simulated
 from mapweave.wire.bus import Bus, Request
@@ -62,7 +62,7 @@ class SimBridge:
         self._keys = keys
         self._simulation = simulation
         self._farewell = farewell
-        self._lockstep = Lockstep(simulation.robots, patience)
+        self._lockstep = StepBarrier(simulation.robots, patience)
         self._wall = dict.fromkeys(("waiting", "replying", "control"), 0.0)
         self._ground_truth = GroundTruthService(simulation, lambda: self._lockstep.active, self._wall)
         self._changed = threading.Condition()

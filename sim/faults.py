@@ -11,7 +11,7 @@ from mapweave.hybridmap.pose import Array
 from mapweave.sim.events import Fail
 
 
-class Faults:
+class SensorFaults:
     """Faults of one robot's sensors. Healthy sensors pass unchanged."""
 
     def __init__(self, axle: float, seed: Sequence[int]) -> None:

@@ -85,7 +85,7 @@ def _distances(box: Rectangle, x: Array, y: Array) -> Array:
 
 
 @dataclass(frozen=True)
-class FloorPlan:
+class BuildingPlan:
     """A building seen from above.
 
     Attributes:

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.pose import Pose2
-from mapweave.sim.floorplan import FloorPlan, Grid, Rectangle, distances_to
+from mapweave.sim.floorplan import BuildingPlan, Grid, Rectangle, distances_to
 
 PASSAGE = 0.45
 """A disc of this radius gets from the middle of each room to all rooms to which it got before, m."""
@@ -31,7 +31,7 @@ TRIES = 40
 """Places that are tried for one piece."""
 
 
-class Site:
+class RoomSurroundings:
     """One room and what is next to it, while it is being furnished.
 
     Connections are compared within this part of the building alone: two places that are joined only by a
@@ -41,7 +41,7 @@ class Site:
         regions: of floor where a robot fits, in and around the room.
     """
 
-    def __init__(self, plan: FloorPlan, room: Rectangle, most_regions: int | None = None) -> None:
+    def __init__(self, plan: BuildingPlan, room: Rectangle, most_regions: int | None = None) -> None:
         """Measure the free floor.
 
         Args:
@@ -112,13 +112,13 @@ class Move:
 
 
 def rearrange(
-    plan: FloorPlan,
+    plan: BuildingPlan,
     movable: Sequence[int],
     wanted: int,
     rng: np.random.Generator,
     keep_clear: Sequence[Pose2],
     clearance: float,
-) -> tuple[FloorPlan, list[Move]]:
+) -> tuple[BuildingPlan, list[Move]]:
     """Move furniture to other places in its room.
 
     Args:
@@ -144,7 +144,9 @@ def rearrange(
         room = plan.room(name)
         others = (*plan.furniture[:index], *plan.furniture[index + 1 :])
         # The piece may have filled a corner that must not become a trap without it.
-        site = Site(replace(plan, furniture=others), room, most_regions=Site(plan, room).regions)
+        site = RoomSurroundings(
+            replace(plan, furniture=others), room, most_regions=RoomSurroundings(plan, room).regions
+        )
         for _ in range(TRIES):
             place = (against_wall if rng.random() < 0.6 else standing)(rng, room, piece)
             if math.hypot(place.x - piece.x, place.y - piece.y) < AWAY:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapweave.agent.drivers.messages import AGAIN
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue, NotConnected
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 from mapweave.sim.ground_truth_messages import (
     ANSWER,
     Advance,
@@ -25,10 +25,10 @@ from mapweave.sim.ground_truth_messages import (
     AskTrajectory,
     AskTruth,
     Done,
-    Kidnap,
+    KidnapRequest,
     Question,
     SimStatus,
-    Trajectory,
+    TrueTrajectory,
 )
 from mapweave.sim.keys import SimKeys
 from mapweave.sim.snapshot import Snapshot
@@ -61,7 +61,7 @@ class SimControl:
     def kidnap(self, robot: str, world_from_robot: Pose2) -> None:
         """Put a robot elsewhere."""
         pose = world_from_robot
-        self._ask(Kidnap(robot, (pose.x, pose.y, pose.heading)), Done)
+        self._ask(KidnapRequest(robot, (pose.x, pose.y, pose.heading)), Done)
 
     def status(self) -> SimStatus:
         """The simulation now."""
@@ -70,19 +70,19 @@ class SimControl:
     def truth_at(self, robot: str, stamps_ns: Sequence[int]) -> list[Pose2]:
         """`world_from_robot` at times that are over."""
         stamps = [int(stamp) for stamp in stamps_ns]
-        truth = self._ask(AskTruth(robot, stamps), Trajectory)
+        truth = self._ask(AskTruth(robot, stamps), TrueTrajectory)
         if truth.stamps_ns.tolist() != stamps:
             raise InvalidMessage(f"{len(truth.stamps_ns)} poses are no answer for {len(stamps)} times")
         return [Pose2.from_vector(row) for row in truth.world_from_robot]
 
     def trajectory(self, robot: str) -> tuple[NDArray[np.int64], Array]:
         """(N,) ns and (N, 3) `world_from_robot` (m, m, rad) of each tick."""
-        driven = self._ask(AskTrajectory(robot), Trajectory)
+        driven = self._ask(AskTrajectory(robot), TrueTrajectory)
         return driven.stamps_ns, driven.world_from_robot
 
-    def plan(self) -> FloorPlan:
+    def plan(self) -> BuildingPlan:
         """The floor plan."""
-        return self._ask(AskPlan(), FloorPlan)
+        return self._ask(AskPlan(), BuildingPlan)
 
     def apply(self, event: Mapping[str, object]) -> str:
         """Execute an event given as a scenario's table; returns what has happened, in words."""

@@ -26,7 +26,7 @@ class _Question(msgspec.Struct, tag_field="op"):
     pass
 
 
-class Kidnap(_Question, tag="kidnap"):
+class KidnapRequest(_Question, tag="kidnap"):
     """Put a robot elsewhere."""
 
     robot: Name
@@ -70,7 +70,7 @@ class AskPlan(_Question, tag="plan"):
     """What stands where?"""
 
 
-Question = Kidnap | Apply | Advance | AskSnapshot | AskStatus | AskTruth | AskTrajectory | AskPlan
+Question = KidnapRequest | Apply | Advance | AskSnapshot | AskStatus | AskTruth | AskTrajectory | AskPlan
 
 
 @dataclass(frozen=True)
@@ -114,8 +114,8 @@ class SimStatus:
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
-    """Where a robot was.
+class TrueTrajectory:
+    """Where a robot truly was.
 
     Attributes:
         stamps_ns: (N,).

@@ -24,11 +24,11 @@ from mapweave.sim.ground_truth_messages import (
     AskTrajectory,
     AskTruth,
     Done,
-    Kidnap,
+    KidnapRequest,
     Question,
     RobotStatus,
     SimStatus,
-    Trajectory,
+    TrueTrajectory,
 )
 from mapweave.sim.simulation_interface import Simulated
 from mapweave.wire.packing import unpack
@@ -79,7 +79,7 @@ class GroundTruthService:
     def _answer(self, question: Question) -> Any:
         simulation = self._simulation
         match question:
-            case Kidnap():
+            case KidnapRequest():
                 simulation.kidnap(self._robot(question.robot), Pose2(*question.world_from_robot))
             case Apply():
                 return Done(simulation.apply(parse_event(question.event)))
@@ -90,9 +90,9 @@ class GroundTruthService:
             case AskTruth():
                 name = self._robot(question.robot)
                 poses = [simulation.truth_at(name, stamp).vector for stamp in question.stamps_ns]
-                return Trajectory(np.array(question.stamps_ns, np.int64), np.array(poses).reshape(-1, 3))
+                return TrueTrajectory(np.array(question.stamps_ns, np.int64), np.array(poses).reshape(-1, 3))
             case AskTrajectory():
-                return Trajectory(*simulation.trajectory(self._robot(question.robot)))
+                return TrueTrajectory(*simulation.trajectory(self._robot(question.robot)))
             case AskPlan():
                 return simulation.world.plan
         return Done()

@@ -50,7 +50,7 @@ class Seat:
     drivers: set[int] = field(default_factory=set)
 
 
-class Lockstep:
+class StepBarrier:
     """Collects the robots' steps and says when a tick is due. Times are of any clock that only grows, s."""
 
     def __init__(self, robots: Sequence[str], patience: float) -> None:

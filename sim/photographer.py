@@ -10,7 +10,7 @@ import numpy as np
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.sim.camera import CameraSetup
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 from mapweave.sim.imager import Imager
 from mapweave.sim.scene import Scene
 from mapweave.sim.texture import Image
@@ -83,7 +83,7 @@ class _Way:
         return self.start @ Pose2(self.leg, 0.0, self.bend) @ Pose2(distance - self.leg)
 
 
-def _way(plan: FloorPlan, length: float, rng: np.random.Generator) -> _Way:
+def _way(plan: BuildingPlan, length: float, rng: np.random.Generator) -> _Way:
     points = plan.free_points(CLEARANCE)
     longest = (1.0 + STEP) * length
     for _ in range(TRIES if len(points) else 0):

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 from mapweave.sim.robots import RobotSetup
 from mapweave.sim.world import World
 
@@ -59,7 +59,7 @@ def starting_places(world: World, setups: Sequence[RobotSetup], seed: int) -> tu
     return tuple(chosen)
 
 
-def put_down(plan: FloorPlan, wanted: Pose2, radius: float, taken: NDArray[np.float64]) -> Pose2:
+def put_down(plan: BuildingPlan, wanted: Pose2, radius: float, taken: NDArray[np.float64]) -> Pose2:
     """The wanted place, or the nearest free one.
 
     Args:
@@ -85,7 +85,7 @@ def put_down(plan: FloorPlan, wanted: Pose2, radius: float, taken: NDArray[np.fl
 
 
 def somewhere(
-    plan: FloorPlan, rng: np.random.Generator, radius: float, taken: NDArray[np.float64], room: str = ""
+    plan: BuildingPlan, rng: np.random.Generator, radius: float, taken: NDArray[np.float64], room: str = ""
 ) -> Pose2:
     """A free place in a room, or anywhere, with any heading.
 
@@ -100,7 +100,7 @@ def somewhere(
 
 
 def beside(
-    plan: FloorPlan, rng: np.random.Generator, other: Pose2, radius: float, taken: NDArray[np.float64]
+    plan: BuildingPlan, rng: np.random.Generator, other: Pose2, radius: float, taken: NDArray[np.float64]
 ) -> Pose2:
     """A free place 0.6 to 2 m from another robot and visible from it, with any heading.
 
@@ -117,12 +117,12 @@ def beside(
     raise InvalidValue(f"there is no free place near ({other.x:.2f}, {other.y:.2f})")
 
 
-def is_clear(plan: FloorPlan, path: Points, radius: float) -> bool:
+def is_clear(plan: BuildingPlan, path: Points, radius: float) -> bool:
     """Whether a disc gets along a path without touching a wall or furniture."""
     return bool((plan.clearances(sampled(path)) >= radius).all())
 
 
-def check_path(plan: FloorPlan, path: Points, radius: float) -> None:
+def check_path(plan: BuildingPlan, path: Points, radius: float) -> None:
     """Refuse a path on which a disc cannot go.
 
     Raises:
@@ -136,7 +136,9 @@ def check_path(plan: FloorPlan, path: Points, radius: float) -> None:
             raise InvalidValue(f"walk: the leg {leg} leads through, or too near to, a wall or furniture")
 
 
-def past(plan: FloorPlan, rng: np.random.Generator, robot: Pose2, radius: float) -> list[tuple[float, float]]:
+def past(
+    plan: BuildingPlan, rng: np.random.Generator, robot: Pose2, radius: float
+) -> list[tuple[float, float]]:
     """A straight path across a robot's view, 1 to 2.5 m ahead; beside or behind it if there is no room.
 
     Args:
@@ -176,7 +178,7 @@ def sampled(path: Points) -> Array:
 
 
 def _longest(
-    plan: FloorPlan, middle: tuple[float, float], angle: float, radius: float
+    plan: BuildingPlan, middle: tuple[float, float], angle: float, radius: float
 ) -> list[tuple[float, float]]:
     """Both ways from a point as far as a disc gets, at most 1.8 m; empty if it does not even fit there."""
     ends = []

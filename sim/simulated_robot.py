@@ -11,7 +11,7 @@ import numpy as np
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.sim.body import Body
-from mapweave.sim.faults import Faults
+from mapweave.sim.faults import SensorFaults
 from mapweave.sim.imager import Imager
 from mapweave.sim.rangers import Rangers
 from mapweave.sim.robots import RobotSetup
@@ -47,7 +47,7 @@ class SimulatedRobot:
             stage.physics, stage.floor, place, self.description, (base, 0xB0D1, number), setup.body
         )
         self.rangers = Rangers(self.description, setup.range_noise, (base, 0x5A46E, number))
-        self.faults = Faults(self.description.axle, (base, 0xFA117, number))
+        self.faults = SensorFaults(self.description.axle, (base, 0xFA117, number))
         self.pose = place
         self.image: Image | None = None
         self.render_seconds = 0.0

@@ -11,15 +11,15 @@ from numpy.typing import NDArray
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.sim.events import SimEvent
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 from mapweave.sim.snapshot import Snapshot
 
 
-class World(Protocol):
+class SimulatedWorld(Protocol):
     """Where a simulation takes place."""
 
     @property
-    def plan(self) -> FloorPlan:
+    def plan(self) -> BuildingPlan:
         """The floor plan."""
         ...
 
@@ -28,7 +28,7 @@ class Simulated(Protocol):
     """What the bridge needs of a simulation."""
 
     @property
-    def world(self) -> World:
+    def world(self) -> SimulatedWorld:
         """Where it takes place."""
         ...
 

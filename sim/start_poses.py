@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.sim.floorplan import FloorPlan, largest_part, random_pose
+from mapweave.sim.floorplan import BuildingPlan, largest_part, random_pose
 
 APART = 0.65
 """Middles of two robots are never closer, m: 45 cm and a robot's radius, and what the grid rounds away."""
@@ -22,7 +22,7 @@ TRIES = 30
 
 
 def spread(
-    plan: FloorPlan, rooms: Sequence[str], robots: int, clearance: float, look_along: bool, seed: int
+    plan: BuildingPlan, rooms: Sequence[str], robots: int, clearance: float, look_along: bool, seed: int
 ) -> tuple[Pose2, ...]:
     """Free poses, robot i in room i (counted around) as long as there is place.
 
@@ -73,7 +73,7 @@ def _apart(rng: np.random.Generator, points: Array, taken: Sequence[Pose2], spre
 
 
 def _packed(
-    plan: FloorPlan,
+    plan: BuildingPlan,
     rooms: Sequence[str],
     free: Sequence[Array],
     robots: int,
@@ -115,7 +115,7 @@ def _rows(points: Array, taken: Sequence[NDArray[np.float64]]) -> list[Array]:
     return places
 
 
-def _along(plan: FloorPlan, pose: Pose2, rng: np.random.Generator) -> Pose2:
+def _along(plan: BuildingPlan, pose: Pose2, rng: np.random.Generator) -> Pose2:
     """The same place, with a heading along the longer side of the room there, either way."""
     room = plan.room(plan.room_at(pose.x, pose.y) or "")
     heading = room.heading + (0.0 if room.length >= room.width else math.pi / 2)

@@ -10,7 +10,7 @@ import numpy as np
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 from mapweave.sim.furnishing import rearrange
 from mapweave.sim.start_poses import spread
 from mapweave.sim.texture import Texture
@@ -129,8 +129,8 @@ def block_panels(block: Block, sides: Sequence[Texture], top: Texture | None = N
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
-    """What belongs to one piece of furniture.
+class FurniturePiece:
+    """The blocks and panels of one piece of furniture.
 
     Attributes:
         blocks: which of the world's blocks, a range.
@@ -166,11 +166,11 @@ class World:
     """
 
     name: str
-    plan: FloorPlan
+    plan: BuildingPlan
     blocks: tuple[Block, ...]
     panels: tuple[Panel, ...]
     background: int = 200
-    pieces: tuple[Piece, ...] = ()
+    pieces: tuple[FurniturePiece, ...] = ()
     start_rooms: tuple[str, ...] = ()
     look_along: bool = False
 

@@ -19,7 +19,7 @@ import numpy as np
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.merge.pose_graph.component import along_tree
-from mapweave.merge.pose_graph.factors import Factors, Measurement
+from mapweave.merge.pose_graph.factors import Factors, RelativePose
 from mapweave.merge.pose_graph.fragments import Fragment, fragment_by_node
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.optimization import ANCHOR_SIGMA, add_measurements
@@ -42,7 +42,7 @@ def inliers(fragments: Sequence[Fragment], links: Sequence[Link], gate: float) -
     wrong: set[tuple[NodeId, NodeId]] = set()
     for names in nx.connected_components(pieces):
         inside = [fragment for fragment in fragments if fragment.name in names]
-        own = [Measurement(m.a, m.b, m.a_from_b) for fragment in inside for m in fragment.measurements]
+        own = [RelativePose(m.a, m.b, m.a_from_b) for fragment in inside for m in fragment.measurements]
         measurements = [link.measurement for link in links if by_node[link.a].name in names]
         anchor = min(names)
         start = by_node[anchor].graph.pose(anchor)
@@ -51,8 +51,8 @@ def inliers(fragments: Sequence[Fragment], links: Sequence[Link], gate: float) -
 
 
 def wrong_measurements(
-    anchor: NodeId, anchor_pose: Pose2, measurements: Iterable[Measurement], gate: float
-) -> list[Measurement]:
+    anchor: NodeId, anchor_pose: Pose2, measurements: Iterable[RelativePose], gate: float
+) -> list[RelativePose]:
     """Find the robust measurements of one connected component that are wrong.
 
     Args:

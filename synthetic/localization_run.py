@@ -29,8 +29,8 @@ _STEPS_TO_CONVERGE = 19
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
-    """A node and what is true of it.
+class SurveyedNode:
+    """A node with its true landmarks.
 
     Attributes:
         true: (N, 3) m, where its landmarks are, in the node's robot frame.
@@ -73,11 +73,11 @@ class Start:
     healthy: bool
     near: bool
     nees: float
-    before: Place
-    after: Place
+    before: SurveyedNode
+    after: SurveyedNode
 
 
-def draw_place(rng: np.random.Generator) -> Place:
+def draw_place(rng: np.random.Generator) -> SurveyedNode:
     """Draw a node of 4 to 30 landmarks, 1.5 to 5 m ahead, whose depths the map knows to 1 to 8 %."""
     count = int(rng.integers(_LEAST, _MOST + 1))
     depths = rng.uniform(1.5, 5.0, count)
@@ -93,10 +93,10 @@ def draw_place(rng: np.random.Generator) -> Place:
     )
     covariances = np.einsum("ni,nj,n->nij", ray, ray, sigmas**2)
     covariances[:, [1, 2], [1, 2]] += (_PIXEL * mapped_depths / CAMERA.fx)[:, None] ** 2
-    return Place(CAMERA.back_project(pixels, depths), mapped, covariances)
+    return SurveyedNode(CAMERA.back_project(pixels, depths), mapped, covariances)
 
 
-def drive(rng: np.random.Generator, place: Place, steps: int = 100) -> Start:
+def drive(rng: np.random.Generator, place: SurveyedNode, steps: int = 100) -> Start:
     """Drive `steps` ticks near a node, from a prior as wrong as the paper's."""
     while True:
         true = Pose2(*(rng.normal(size=3) * (0.5, 0.3, 0.25)))
@@ -123,7 +123,7 @@ def drive(rng: np.random.Generator, place: Place, steps: int = 100) -> Start:
         near = math.hypot(off.x, off.y) < _DISTANCE and abs(off.heading) < _TURNED
         converged &= near or k < _STEPS_TO_CONVERGE
     landmarks = filter_.landmarks_in_node()
-    after = Place(place.true[landmarks.ids], landmarks.points, landmarks.covariances)
+    after = SurveyedNode(place.true[landmarks.ids], landmarks.points, landmarks.covariances)
     nees = filter_.pose.mahalanobis2(true)
     return Start(visible, converged, filter_.healthy, near, nees, place, after)
 
@@ -133,7 +133,7 @@ def try_start(rng: np.random.Generator, steps: int = 100) -> Start:
     return drive(rng, draw_place(rng), steps)
 
 
-def try_drives(rng: np.random.Generator, drives: int, steps: int = 100) -> list[Place]:
+def try_drives(rng: np.random.Generator, drives: int, steps: int = 100) -> list[SurveyedNode]:
     """Drive again and again through one node, each time with the landmarks as the last drive left them.
 
     What a drive learned is kept if the filter was healthy at its end.

@@ -11,7 +11,7 @@ from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.merging.merger import Merger
@@ -66,10 +66,10 @@ def numbered(map_id: MapId, changes: Iterable[ChangeBody], first: int = 1, stamp
     return [Change(map_id, number, stamp_ns, body) for number, body in enumerate(changes, first)]
 
 
-def entries_of(map_id: MapId, changes: Iterable[ChangeBody], first: int = 1) -> list[Entry]:
+def entries_of(map_id: MapId, changes: Iterable[ChangeBody], first: int = 1) -> list[ReceivedChange]:
     """The changes as they come over the wire, numbered from `first`."""
     log = numbered(map_id, changes, first)
-    return [Entry.read(map_id, change.sequence, encode_change(change)) for change in log]
+    return [ReceivedChange.read(map_id, change.sequence, encode_change(change)) for change in log]
 
 
 def fill_store(store: Store, logs: Mapping[MapId, Iterable[ChangeBody]]) -> None:

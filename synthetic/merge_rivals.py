@@ -18,7 +18,7 @@ from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import fragment_by_node
 from mapweave.merge.pose_graph.links import Link
-from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.settings import ConsistencySettings
 from synthetic.fleet import SyntheticFleet
 from synthetic.gnc import inliers
@@ -42,7 +42,7 @@ def least_squares(maps: Maps, links: Sequence[Link]) -> MergedMap:
         tuple(sorted(used, key=lambda link: link.pair)),
         (),
         tuple(frozenset(graph.nodes) for graph in graphs),
-        Poses(graphs),
+        NodePoses(graphs),
         tuple(graphs),
     )
 

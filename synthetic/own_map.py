@@ -35,7 +35,7 @@ NEAR, TURNED = 1.2, 0.7
 """Nodes that the robot tries to recognise at first, m and rad."""
 
 
-class OwnMap:
+class SurveyedMap:
     """A robot's map, and where its nodes truly are.
 
     Attributes:

@@ -28,7 +28,7 @@ MARGIN = 0.6
 """m, robots keep away from walls."""
 
 
-class Fault(StrEnum):
+class OdometryFault(StrEnum):
     """What is wrong with a robot's odometry."""
 
     NONE = "none"
@@ -99,13 +99,17 @@ def draw_tour(
 
 
 def draw_map(
-    house: House, map_id: MapId, tour: Sequence[Pose2], fault: Fault, rng: np.random.Generator
+    house: House, map_id: MapId, tour: Sequence[Pose2], fault: OdometryFault, rng: np.random.Generator
 ) -> tuple[list[Node], list[Edge], dict[NodeId, Pose2]]:
     """A robot's map of a tour, and where its nodes truly are."""
     nodes: list[Node] = []
     edges: list[Edge] = []
     truth: dict[NodeId, Pose2] = {}
-    broken = round(len(tour) * rng.uniform(0.4, 0.6)) if fault in (Fault.SLIP, Fault.CARRIED) else -1
+    broken = (
+        round(len(tour) * rng.uniform(0.4, 0.6))
+        if fault in (OdometryFault.SLIP, OdometryFault.CARRIED)
+        else -1
+    )
     aside = rng.uniform(-math.pi, math.pi)
     place = PoseGaussian(Pose2(), np.zeros((3, 3)))
     for k, true in enumerate(tour):
@@ -113,12 +117,12 @@ def draw_map(
         if k:
             before = tour[k - 1]
             step = before.inverse() @ true
-            if fault is Fault.LONG:
+            if fault is OdometryFault.LONG:
                 step = Pose2(1.3 * step.x, 1.3 * step.y, step.heading)
-            elif fault is Fault.TURNS:
+            elif fault is OdometryFault.TURNS:
                 turn = math.remainder(step.heading, math.tau)
                 step = Pose2(step.x, step.y, 1.1 * turn)
-            elif k == broken and fault is Fault.SLIP:
+            elif k == broken and fault is OdometryFault.SLIP:
                 step = Pose2(2.0 * math.cos(aside), 2.0 * math.sin(aside), 0.0) @ step
             elif k == broken:
                 step = Pose2(0.5, 0.0, 0.3)
@@ -133,7 +137,7 @@ def draw_map(
 
 
 @dataclass(frozen=True, eq=False)
-class Fleet:
+class FaultyFleet:
     """Maps of one house, and the truth.
 
     Attributes:
@@ -166,8 +170,8 @@ ODD = MapId("r3", 1)
 
 
 @dataclass(frozen=True)
-class Scene:
-    """Who maps what.
+class MappingPlan:
+    """Which rooms each robot maps.
 
     Attributes:
         name: in the table.
@@ -189,17 +193,19 @@ class Scene:
 SCENES = {
     scene.name: scene
     for scene in (
-        Scene("room", False, ((0,), (0,), (0,)), (0,), (0,), rooms=1),
-        Scene("house", False, ((0, 1), (1, 0), (0, 1)), (0, 1), (0, 1)),
+        MappingPlan("room", False, ((0,), (0,), (0,)), (0,), (0,), rooms=1),
+        MappingPlan("house", False, ((0, 1), (1, 0), (0, 1)), (0, 1), (0, 1)),
         # The correct robots know the first of the two similar rooms, the fourth one the second.
-        Scene("twins", True, ((0, 1), (1, 0), (0, 1)), (0, 2), (1, 2), rooms=3),
-        Scene("twins both", True, ((0, 1, 2), (2, 1, 0), (0, 2, 1)), (0, 2), (1, 2), rooms=3),
-        Scene("twins alone", True, ((1,), (1,), (1,)), (2,), (1, 2), rooms=3),
+        MappingPlan("twins", True, ((0, 1), (1, 0), (0, 1)), (0, 2), (1, 2), rooms=3),
+        MappingPlan("twins both", True, ((0, 1, 2), (2, 1, 0), (0, 2, 1)), (0, 2), (1, 2), rooms=3),
+        MappingPlan("twins alone", True, ((1,), (1,), (1,)), (2,), (1, 2), rooms=3),
     )
 }
 
 
-def draw_fleet(seed: int, scene: Scene, fault: Fault, stops: int = 3, views: int = 5) -> Fleet:
+def draw_fleet(
+    seed: int, scene: MappingPlan, fault: OdometryFault, stops: int = 3, views: int = 5
+) -> FaultyFleet:
     """Three sound robots, and one with a fault."""
     rng = np.random.default_rng([seed, 0x0DD])
     house = draw_house(rng, twins=scene.twins, count=scene.rooms)
@@ -210,13 +216,13 @@ def draw_fleet(seed: int, scene: Scene, fault: Fault, stops: int = 3, views: int
         count = round(stops * 2 / len(visits)) if not scene.twins else stops
         tour = draw_tour(house, visits, count, views, own)
         map_id = ODD if odd else MapId(f"r{k}", 1)
-        nodes, edges, true = draw_map(house, map_id, tour, fault if odd else Fault.NONE, own)
+        nodes, edges, true = draw_map(house, map_id, tour, fault if odd else OdometryFault.NONE, own)
         maps[map_id] = nodes, edges
         truth |= true
-    return Fleet(house, maps, truth)
+    return FaultyFleet(house, maps, truth)
 
 
-def merged_fleet(fleet: Fleet, left_out: frozenset[MapId] = frozenset()) -> Merger:
+def merged_fleet(fleet: FaultyFleet, left_out: frozenset[MapId] = frozenset()) -> Merger:
     """All changes taken in, merged twice on the way."""
     merger = Merger()
     changes = fleet.changes(left_out)
@@ -228,7 +234,7 @@ def merged_fleet(fleet: Fleet, left_out: frozenset[MapId] = frozenset()) -> Merg
     return merger
 
 
-def lost_views(fleet: Fleet, scene: Scene, count: int, seed: int) -> list[tuple[View, Pose2]]:
+def lost_views(fleet: FaultyFleet, scene: MappingPlan, count: int, seed: int) -> list[tuple[View, Pose2]]:
     """Views of lost robots, near mapped places, and their true poses."""
     rng = np.random.default_rng([seed, 0x105])
     out = []
@@ -270,7 +276,7 @@ def judged(answers: Answers, view: View, at: Pose2, truth: dict[NodeId, Pose2]) 
 
 
 def outcome(
-    fleet: Fleet, views: Sequence[tuple[View, Pose2]], left_out: frozenset[MapId] = frozenset()
+    fleet: FaultyFleet, views: Sequence[tuple[View, Pose2]], left_out: frozenset[MapId] = frozenset()
 ) -> dict[str, Any]:
     """Merge a fleet and ask: answers of each sort, parts of the sound maps, and maps that are found wrong."""
     merger = merged_fleet(fleet, left_out)

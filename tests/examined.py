@@ -12,14 +12,19 @@ import pytest
 
 from mapweave.hybridmap.node import Node
 from mapweave.merge.pose_graph import verification
-from mapweave.registration.recognition import Recognition, RecognitionSettings, Refusal, examine_nodes
+from mapweave.registration.recognition import (
+    Recognition,
+    RecognitionFailure,
+    RecognitionSettings,
+    examine_nodes,
+)
 
-_found: dict[bytes, Recognition | Refusal] = {}
+_found: dict[bytes, Recognition | RecognitionFailure] = {}
 
 
 def _examined(
     a: Node, b: Node, settings: RecognitionSettings | None, rng: np.random.Generator
-) -> Recognition | Refusal:
+) -> Recognition | RecognitionFailure:
     """What comes of two nodes, which depends on their ids and on what they see alone: see `verify`."""
     key = hashlib.blake2b(repr(settings).encode(), digest_size=16)
     for node in (a, b):

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from mapweave.wire.credentials import Access, Role
+from mapweave.wire.credentials import Role, RouterAccess
 from mapweave.wire.keys import Keys
 from mapweave.wire.senders import sent_by
 
@@ -38,7 +38,7 @@ def may_ask(role: Role) -> frozenset[str]:
     return frozenset(ASKS)
 
 
-def access_control(keys: Keys, access: Access, certified: bool) -> dict[str, object]:
+def access_control(keys: Keys, access: RouterAccess, certified: bool) -> dict[str, object]:
     """Zenoh's `access_control`: default deny, one subject and one policy an identity.
 
     Args:

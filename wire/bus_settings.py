@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from mapweave.hybridmap.errors import SettingsError
-from mapweave.wire.credentials import Access, Credentials
+from mapweave.wire.credentials import Credentials, RouterAccess
 
 RETRY_FIRST = 0.1
 """Pause before the second attempt to connect, s; doubled each time."""
@@ -71,7 +71,7 @@ class BusSettings:
     attempt: float = 10.0
     lease: float = LEASE
     credentials: Credentials | None = None
-    access: Access | None = None
+    access: RouterAccess | None = None
     fleet: str = "demo"
 
     def __post_init__(self) -> None:

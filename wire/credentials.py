@@ -75,8 +75,8 @@ class Member:
 
 
 @dataclass(frozen=True, slots=True)
-class Access:
-    """Who is admitted by a router.
+class RouterAccess:
+    """The members that a router admits.
 
     Attributes:
         members: with good keys.

@@ -28,7 +28,7 @@ from mapweave.hybridmap.quantization import (
     restore_landmarks,
     round_landmarks,
 )
-from mapweave.wire.landmark_reader import Layout, Numbers, read
+from mapweave.wire.landmark_reader import LandmarkHead, Numbers, read
 from mapweave.wire.rans import Column, Frequencies, Ints, LaneWriter, pack_bits
 
 HEAD = struct.Struct("<BBHHHHH")
@@ -148,7 +148,7 @@ def _unpack(data: bytes, with_depths: bool) -> Numbers:
     low = _low_bits(count, reach_y) if ascending else reach_y.bit_length()
     return read(
         body[HEAD.size :],
-        Layout(
+        LandmarkHead(
             count,
             _lane_size(reach_x, low),
             low,

@@ -28,8 +28,8 @@ REASONS = ("", CUT_OFF, OTHER_ROWS, TOO_LONG, OFF_THE_GRID)
 """By what the compiled form returns."""
 
 
-class Layout(NamedTuple):
-    """Contents of the head.
+class LandmarkHead(NamedTuple):
+    """The head of packed landmarks, decoded.
 
     Attributes:
         landmarks: how many.
@@ -122,7 +122,7 @@ def _columns() -> tuple[Columns, Columns, Columns]:
     return tuple(Columns.of([Column(of) for of in part]) for part in (codes, shares, cells))  # type: ignore[return-value]
 
 
-def read_in_numpy(data: Row, layout: Layout, tables: Alphabets, out: Numbers) -> int:
+def read_in_numpy(data: Row, layout: LandmarkHead, tables: Alphabets, out: Numbers) -> int:
     """Read landmarks, a lane for each, side by side.
 
     Args:
@@ -231,7 +231,7 @@ def pop_depths(tables: Alphabets, out: Numbers, states: Ints, window: Ints, at: 
 
 
 @compiled_form_of(read_in_numpy)
-def read_landmarks(data: Row, layout: Layout, tables: Alphabets, out: Numbers) -> int:
+def read_landmarks(data: Row, layout: LandmarkHead, tables: Alphabets, out: Numbers) -> int:
     """Read landmarks in one pass; returns the number of the reason why they are refused, else 0."""
     at, length, count, size = 0, 8 * len(data), layout.landmarks, layout.size
     if layout.steps >= 0 and count:
@@ -274,7 +274,7 @@ def read_landmarks(data: Row, layout: Layout, tables: Alphabets, out: Numbers) -
     return 0
 
 
-def read(data: bytes, layout: Layout) -> Numbers:
+def read(data: bytes, layout: LandmarkHead) -> Numbers:
     """Read what is behind the head of packed landmarks.
 
     Raises:

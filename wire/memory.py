@@ -28,7 +28,7 @@ _D = TypeVar("_D", bound=Declared)
 
 
 @dataclass(frozen=True, slots=True)
-class Faults:
+class MessageFaults:
     """What goes wrong with published messages; questions and liveliness are not touched.
 
     Attributes:
@@ -51,12 +51,14 @@ class MemoryHub:
         """Make an empty hub without losses."""
         self._lock = threading.RLock()
         self._buses: list[MemoryBus] = []
-        self._faults: dict[MemoryBus | None, Faults] = {}
+        self._faults: dict[MemoryBus | None, MessageFaults] = {}
         self._random = np.random.default_rng(0)
         self._held: list[tuple[int, MemoryBus, Sample]] = []
         self._clock = 0
 
-    def disturb(self, faults: Faults, random: np.random.Generator, bus: MemoryBus | None = None) -> None:
+    def disturb(
+        self, faults: MessageFaults, random: np.random.Generator, bus: MemoryBus | None = None
+    ) -> None:
         """From now on disturb messages, with the given random numbers: of one bus, or of all."""
         with self._lock:
             self._faults[bus] = faults
@@ -108,7 +110,7 @@ class MemoryHub:
             if sender._cut:
                 return
             self._clock += 1
-            faults = self._faults.get(sender) or self._faults.get(None) or Faults()
+            faults = self._faults.get(sender) or self._faults.get(None) or MessageFaults()
             if self._random.random() >= faults.drop:
                 for _ in range(2 if self._random.random() < faults.double else 1):
                     if self._random.random() < faults.delay:

@@ -30,7 +30,7 @@ FARTHEST_STAMP_NS = 1_000_000_000
 """Largest age of a frame; a greater difference means that the device uses another clock."""
 
 
-class Frame(NamedTuple):
+class StampedImage(NamedTuple):
     """An image with its stamp.
 
     Attributes:
@@ -45,7 +45,7 @@ class Frame(NamedTuple):
 class FrameSource(Protocol):
     """A camera."""
 
-    def newer(self, stamp_ns: int, patience: float) -> Frame | None:
+    def newer(self, stamp_ns: int, patience: float) -> StampedImage | None:
         """Wait up to `patience` (s) for a frame newer than a stamp; returns the newest. Never raises."""
         ...
 
@@ -65,13 +65,13 @@ class Capture:
         """
         self._settings = settings
         self._changed = threading.Condition()
-        self._newest: Frame | None = None
+        self._newest: StampedImage | None = None
         self._closing = False
         self._capture = self._open()
         self._thread = threading.Thread(target=self._serve, name="camera", daemon=True)
         self._thread.start()
 
-    def newer(self, stamp_ns: int, patience: float) -> Frame | None:
+    def newer(self, stamp_ns: int, patience: float) -> StampedImage | None:
         """Wait for a frame newer than a stamp; see FrameSource."""
 
         def there() -> bool:
@@ -115,7 +115,7 @@ class Capture:
     # In the camera's thread.
 
     def _serve(self) -> None:
-        reported: Frame | None = None
+        reported: StampedImage | None = None
         said = False
         while not self._closing:
             reason = self._take_all()
@@ -161,7 +161,7 @@ class Capture:
                 return
             grey = image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
             with self._changed:
-                self._newest = Frame(stamp_ns, np.asarray(grey, dtype=np.uint8))
+                self._newest = StampedImage(stamp_ns, np.asarray(grey, dtype=np.uint8))
                 self._changed.notify_all()
             if not locked and time.monotonic() - begin >= SETTLING:
                 locked = True

@@ -17,7 +17,7 @@ from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.recording import Recording
 from mapweave.agent.recordings.splits import read_split
-from mapweave.agent.recordings.wheel_data import Wheels
+from mapweave.agent.recordings.wheel_data import WheelModel
 from mapweave.hybridmap.errors import DeviceError
 
 AXLE_PER_HEIGHT = 0.9
@@ -73,7 +73,7 @@ class Replay:
         wheels = recording.wheels
         if wheels is None:
             axle = AXLE_PER_HEIGHT * max(recording.camera.mount_height, 0.1)
-            wheels = Wheels(axle, RobotDescription.wheel_noise, RobotDescription.side_slip)
+            wheels = WheelModel(axle, RobotDescription.wheel_noise, RobotDescription.side_slip)
         return RobotDescription(
             camera=recording.camera,
             distortion=recording.distortion,

@@ -17,7 +17,7 @@ from mapweave.agent.drivers.clock import RemoteClock, now_ns
 from mapweave.agent.drivers.ros2_guard import Ros2Guard
 from mapweave.agent.drivers.ros2_odometry import WheelOdometry
 from mapweave.agent.drivers.ros2_ranges import Ranger
-from mapweave.agent.drivers.ros2_topics import Mounts, Ros2Camera, Topic
+from mapweave.agent.drivers.ros2_topics import Mounts, NewestMessage, Ros2Camera
 from mapweave.agent.drivers.settings import CameraSettings, Geometry, RobotSettings
 from mapweave.agent.drivers.wheeled import STALE, WheeledRobot
 from mapweave.agent.observation import Command, RobotDescription
@@ -34,7 +34,7 @@ from mapweave.agent.ros_messages.values import (
 )
 from mapweave.hybridmap.errors import DeviceError, InvalidValue, SettingsError
 from mapweave.wire.bus_settings import LEASE
-from mapweave.wire.ros2.keys import CommandKeys, Endpoint, Role
+from mapweave.wire.ros2.keys import CommandKeys, Endpoint, EndpointRole
 from mapweave.wire.ros2.messages import encode, make
 from mapweave.wire.ros2.node import Publisher, Ros2Node
 from mapweave.wire.ros2.settings import Ros2Link
@@ -109,26 +109,26 @@ class Ros2Base:
         self._node, self._options, self._given = node, options, given
         self._axle, self._radius = given.axle, given.radius
         self._clock = clock = RemoteClock()
-        self._odometry = Topic(node, options.odometry, ros2_odometry.KINDS, clock)
+        self._odometry = NewestMessage(node, options.odometry, ros2_odometry.KINDS, clock)
         self._sources = set[str]()
-        node.watch(Role.PUBLISHER, self._odometry.name, self._odometry_source)
+        node.watch(EndpointRole.PUBLISHER, self._odometry.name, self._odometry_source)
         self._wheels = WheelOdometry(given.axle, options.wheel_radius, options.joints)
-        self.images = Topic(node, options.image, IMAGE_TYPES, clock)
+        self.images = NewestMessage(node, options.image, IMAGE_TYPES, clock)
         beside = options.image.removesuffix("/compressed").rpartition("/")
         info = options.camera_info or f"{beside[0]}{beside[1]}camera_info"
-        self._info = None if self.camera is not None else Topic(node, info, (CAMERA_TYPE,), None)
+        self._info = None if self.camera is not None else NewestMessage(node, info, (CAMERA_TYPE,), None)
         self._rectified = beside[2].startswith("image_rect")
         self._mounts = Mounts(node)
-        self._ranges = [Topic(node, name, ros2_ranges.KINDS, clock) for name in options.ranges]
+        self._ranges = [NewestMessage(node, name, ros2_ranges.KINDS, clock) for name in options.ranges]
         self._rangers: list[Ranger] = []
-        self._kidnap = Topic(node, "kidnap_status", (KIDNAP_TYPE,), clock)
-        self._battery = Topic(node, "battery_state", (BATTERY_TYPE,), clock)
-        self._hazards = Topic(node, "hazard_detection", (HAZARDS_TYPE,), clock)
+        self._kidnap = NewestMessage(node, "kidnap_status", (KIDNAP_TYPE,), clock)
+        self._battery = NewestMessage(node, "battery_state", (BATTERY_TYPE,), clock)
+        self._hazards = NewestMessage(node, "hazard_detection", (HAZARDS_TYPE,), clock)
         topic = node.link.topic(options.command)
         self._twist, self._stamped = (node.publisher(topic, kind) for kind in (TWIST_TYPE, STAMPED_TYPE))
         self._subscribed: list[Publisher] = []
         self._command = topic
-        node.watch(Role.PUBLISHER, topic, self._command_source)
+        node.watch(EndpointRole.PUBLISHER, topic, self._command_source)
         self._claim: Claim | None = None
         self._guard: Ros2Guard | None = None
         self._unheard = False
@@ -263,7 +263,7 @@ class Ros2Base:
                 f"{self.camera.width}x{self.camera.height} px; give [robot.camera], or another topic"
             )
 
-    def _camera_by_info(self, info: Topic, frame: str, end: float) -> CameraSettings:
+    def _camera_by_info(self, info: NewestMessage, frame: str, end: float) -> CameraSettings:
         received = info.first("camera calibration ([robot.camera] can replace it)", end - time.monotonic())
         try:
             c, lens, distortion = camera_of(received.message, self._rectified)

@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.drivers.camera import Frame
+from mapweave.agent.drivers.camera import StampedImage
 from mapweave.agent.drivers.clock import RemoteClock, of_monotonic_ns
 from mapweave.agent.drivers.wheeled import STALE
 from mapweave.agent.ros_messages.images import grey_of
@@ -37,7 +37,7 @@ class Received(NamedTuple):
     stamp_ns: int
 
 
-class Topic:
+class NewestMessage:
     """The newest message of a topic."""
 
     def __init__(self, node: Ros2Node, name: str, kinds: Sequence[str], clock: RemoteClock | None) -> None:
@@ -159,13 +159,13 @@ class Mounts:
 class Ros2Camera:
     """Images of a topic."""
 
-    def __init__(self, topic: Topic) -> None:
+    def __init__(self, topic: NewestMessage) -> None:
         """Take the topic; the node stays another's."""
         self._topic = topic
         self._seen = 0
         self._complaint = ""
 
-    def newer(self, stamp_ns: int, patience: float) -> Frame | None:
+    def newer(self, stamp_ns: int, patience: float) -> StampedImage | None:
         """Wait for an image newer than a stamp; see FrameSource."""
         end = time.monotonic() + patience
         while True:
@@ -183,7 +183,7 @@ class Ros2Camera:
                     log.warning("%s: %s", self._topic.name, error)
                 continue
             if received.stamp_ns > stamp_ns:
-                return Frame(received.stamp_ns, image)
+                return StampedImage(received.stamp_ns, image)
 
     def close(self) -> None:
         """Nothing is to be released."""

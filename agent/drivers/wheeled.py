@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.drivers.author_errors import DriverMistake, driver_error, kind_of, mistake
 from mapweave.agent.drivers.base import Base, BaseReading, Wheels
-from mapweave.agent.drivers.camera import Capture, Frame, FrameSource
+from mapweave.agent.drivers.camera import Capture, FrameSource, StampedImage
 from mapweave.agent.drivers.checked_base import check_base, check_reading, check_wheels
 from mapweave.agent.drivers.clock import now_ns
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
@@ -136,7 +136,7 @@ class WheeledRobot:
             if not self._failure and time.monotonic() - self._answered > SILENT:
                 # Else its thread has said what is wrong.
                 self._fail(f"the robot's base has not answered for {SILENT:g} s")
-            if frame is not None and not isinstance(frame, Frame):
+            if frame is not None and not isinstance(frame, StampedImage):
                 raise mistake("camera: newer()", f"must return a Frame or None, not {kind_of(frame)}")
             if frame is not None:
                 stamp_ns = frame.stamp_ns

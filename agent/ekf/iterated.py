@@ -15,7 +15,7 @@ from mapweave.hybridmap.pose import Array
 
 
 @dataclass(frozen=True, eq=False)
-class Measurement:
+class LandmarkMeasurements:
     """An image's measurements of some landmarks.
 
     Attributes:
@@ -36,8 +36,8 @@ class Measurement:
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
-    """A corrected state.
+class IteratedUpdate:
+    """The result of an iterated EKF update.
 
     Attributes:
         state: after the update.
@@ -53,8 +53,8 @@ class Fit:
 
 
 def iterated_update(
-    state: LocalizationState, start: Array, measured: Measurement, mount_forward: float
-) -> Fit | None:
+    state: LocalizationState, start: Array, measured: LandmarkMeasurements, mount_forward: float
+) -> IteratedUpdate | None:
     """Correct the state by an image (iterated extended Kalman filter: Gauss-Newton on the MAP cost).
 
     Args:
@@ -90,7 +90,7 @@ def iterated_update(
             first = innovations
             accepted, whitening, _ = select_inliers(innovations, spread, measured.gate)
             if not accepted.any():
-                return Fit(state, accepted, first, float("nan"))
+                return IteratedUpdate(state, accepted, first, float("nan"))
         else:
             both = np.flatnonzero(np.repeat(accepted, 2))
             whitening = whiten(spread[np.ix_(both, both)])
@@ -107,7 +107,7 @@ def iterated_update(
     corrected = state.corrected(step, root)
     nis = float(white @ white) / len(white)
     assert first is not None
-    return Fit(corrected, accepted, first, nis)
+    return IteratedUpdate(corrected, accepted, first, nis)
 
 
 def _linear(by_pose: Array, by_ray: Array, pose_vector: Array, rays: Array) -> Array:

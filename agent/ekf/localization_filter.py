@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from mapweave.agent.arrays import among
 from mapweave.agent.ekf.gating import pixel_gate
 from mapweave.agent.ekf.inverse_depth import project_anchored, rays_of_points
-from mapweave.agent.ekf.iterated import Measurement, iterated_update
+from mapweave.agent.ekf.iterated import LandmarkMeasurements, iterated_update
 from mapweave.agent.ekf.landmark_estimates import Ids, NodeLandmarks
 from mapweave.agent.ekf.localization_state import NEAREST_SCALE, LocalizationState, turning
 from mapweave.agent.ekf.motion import WheelNoise, move_pose
@@ -140,7 +140,7 @@ class LocalizationFilter:
         slopes = (pixels[rows] - self._centre) / self._focal
         variances, linear = (self._settings.pixel_sigma / self._focal) ** 2, LINEAR_PX / self._camera.fx
         gate = pixel_gate(self._settings.gate_probability)
-        measurement = Measurement(slots, slopes, variances, gate, ITERATIONS, linear)
+        measurement = LandmarkMeasurements(slots, slopes, variances, gate, ITERATIONS, linear)
         fit = iterated_update(self._state, start, measurement, mount)
         if fit is None:
             return self._judge(UpdateReport.blind(len(ids), "the pose is too uncertain to be corrected"))

@@ -18,7 +18,13 @@ from mapweave.agent.ekf.filter_health import FilterHealth
 from mapweave.agent.ekf.gating import MEDIAN, Judgement, pixel_gate, remove_outliers, select_inliers
 from mapweave.agent.ekf.innovations import Examined, innovation_covariance, whiten
 from mapweave.agent.ekf.landmark_estimates import Ids, LandmarkEstimates
-from mapweave.agent.ekf.mapping_state import LEAST_AGREEING, PRIOR_DEPTH, PRIOR_SPREAD, MappingState, Step
+from mapweave.agent.ekf.mapping_state import (
+    LEAST_AGREEING,
+    PRIOR_DEPTH,
+    PRIOR_SPREAD,
+    MappingState,
+    WheelStep,
+)
 from mapweave.agent.ekf.measurement_model import ImageMeasurement, Pinhole, slots_of
 from mapweave.agent.ekf.motion import WheelNoise, move_pose, transform_rays
 from mapweave.agent.ekf.pitch_correction import pitch_offset
@@ -83,7 +89,7 @@ class MappingFilter:
         self._gate = pixel_gate(self.settings.gate_probability)
         self._noise = PixelNoise(self.settings.pixel_sigma, self._pinhole.focal, self.settings.adaptation)
         self._settled = MappingState.at_anchor()
-        self._step: Step | None = None
+        self._step: WheelStep | None = None
         self._watch = FilterHealth(camera.fx)
 
     def predict(self, odometry: Odometry) -> None:
@@ -93,7 +99,7 @@ class MappingFilter:
         rays, scale = transform_rays(state.rays, odometry, mount)
         stays = (scale > 1e-3) & (rays[:, 2] * NEAREST <= 1.0) & (np.abs(rays[:, 0]) <= s.widest_slope)
         root, aside = self._wheels.root(odometry), self._wheels.side_slip(odometry)
-        taken = Step(state, odometry, root, aside, mount, odometry, pose_vector, rays)
+        taken = WheelStep(state, odometry, root, aside, mount, odometry, pose_vector, rays)
         if not stays.all():
             self.ids = self.ids[stays]
             taken = taken.kept(stays)

@@ -103,7 +103,7 @@ class MappingState:
 
 
 @dataclass(eq=False, slots=True)
-class Step:
+class WheelStep:
     """One step of the wheels, linearised where it seems to have gone, until an image has judged it.
 
     Attributes:
@@ -132,9 +132,9 @@ class Step:
         """After the step: P- = A P A^T + B S B^T (docs/method.md); computed when first asked for."""
         return self._advanced()[0]
 
-    def again(self, at: Odometry | None = None, wheel_root: Array | None = None) -> Step:
+    def again(self, at: Odometry | None = None, wheel_root: Array | None = None) -> WheelStep:
         """The same step linearised elsewhere, or with more odometry noise."""
-        step = Step(
+        step = WheelStep(
             self.before, self.measured, self.wheel_root if wheel_root is None else wheel_root,
             self.side_slip, self.mount_forward, at or self.at,
             self.pose_vector, self.rays,
@@ -145,7 +145,7 @@ class Step:
 
     def glanced(
         self, slots: NDArray[np.intp], slopes: Array, variances: Array, most: float
-    ) -> tuple[Step, Examined]:
+    ) -> tuple[WheelStep, Examined]:
         """Linearise at the turn that the image suggests, and compare the image with that prediction.
 
         The turn comes from the landmarks, of which a quarter may be wrong; the way comes from the wheels.
@@ -177,7 +177,7 @@ class Step:
         forward, turn, surprise = wheel_errors(by_input, self.wheel_root, slots, whitening, residual)
         return Odometry(self.measured.forward + forward, self.measured.turn + turn), surprise
 
-    def kept(self, mask: NDArray[np.bool_]) -> Step:
+    def kept(self, mask: NDArray[np.bool_]) -> WheelStep:
         """The step of only some of the landmarks."""
         if mask.all():
             return self

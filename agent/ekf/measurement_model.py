@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.ekf.innovations import Examined, examine
 from mapweave.agent.ekf.landmark_estimates import Ids
-from mapweave.agent.ekf.mapping_state import LEAST_AGREEING, MappingState, Step
+from mapweave.agent.ekf.mapping_state import LEAST_AGREEING, MappingState, WheelStep
 from mapweave.agent.ekf.update_report import Health, UpdateReport
 from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.camera import Camera
@@ -85,8 +85,8 @@ class ImageMeasurement(NamedTuple):
         return ImageMeasurement(len(ids), places[rows], rows, pinhole.slopes(pixels[rows]), pinhole.focal)
 
     def compared(
-        self, step: Step | None, settled: MappingState, variances: Array, settings: FilterSettings
-    ) -> tuple[Step | None, Examined]:
+        self, step: WheelStep | None, settled: MappingState, variances: Array, settings: FilterSettings
+    ) -> tuple[WheelStep | None, Examined]:
         """Compare an image with its prediction.
 
         Args:

@@ -20,7 +20,7 @@ from mapweave.agent.exploration.viewpoint_selection import (
 )
 from mapweave.agent.mapping.episode import Episode, Move
 from mapweave.agent.mapping.relative_poses import relative_poses, way_lengths
-from mapweave.agent.mission import Answer, Question
+from mapweave.agent.mission import Question, ServerAnswer
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.settings import ExplorerSettings
@@ -75,7 +75,7 @@ class Explorer:
         self._questions: list[Question] = []
         self._behaviour = self._explore()
 
-    def see(self, observation: Observation, answers: tuple[Answer, ...] = ()) -> None:
+    def see(self, observation: Observation, answers: tuple[ServerAnswer, ...] = ()) -> None:
         """Begin a tick. The mapper and the floor have seen the observation already."""
         self._moves.see(observation)
         self._now += self._description.tick

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mapweave.agent.exploration.viewpoint_selection import seen_around
-from mapweave.agent.mission import Answer, WhatIsKnown
+from mapweave.agent.mission import ServerAnswer, WhatIsKnown
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.query import KnownAnswer
@@ -36,7 +36,7 @@ class FleetCoverage:
         """What to ask at a position, (2,) m in map."""
         return WhatIsKnown(NUMBER, self._map, float(position[0]), float(position[1]), self._reach)
 
-    def take(self, answer: Answer) -> None:
+    def take(self, answer: ServerAnswer) -> None:
         """Take an answer. A missing answer leaves the earlier coverage as it is."""
         if isinstance(answer.content, KnownAnswer):
             self.views = answer.content.views.astype(np.float64)

@@ -59,7 +59,7 @@ class Candidate:
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
+class RankedPlaces:
     """One source's candidates for a view.
 
     Attributes:
@@ -73,8 +73,8 @@ class Candidates:
     reason: str
 
 
-class OwnMap:
-    """The robot's own map as a source.
+class OwnMapSource:
+    """The robot's own map as a source of candidates.
 
     Attributes:
         map: which may grow.
@@ -87,13 +87,13 @@ class OwnMap:
         self.elsewhere = False
         self._rng = rng
 
-    def candidates(self, view: View, image: NDArray[np.uint8], features: Features) -> Candidates:
+    def candidates(self, view: View, image: NDArray[np.uint8], features: Features) -> RankedPlaces:
         """Nodes that a view shows, of an image with these features."""
         if self.elsewhere:
-            return Candidates((), "", "the own map is of another floor")
+            return RankedPlaces((), "", "the own map is of another floor")
         recalled = recognise_places(self.map, view, self._rng)
         if not recalled:
-            return Candidates((), "", f"none of {len(self.map.nodes)} nodes is recognised")
+            return RankedPlaces((), "", f"none of {len(self.map.nodes)} nodes is recognised")
         alike = aliased_places(recalled, RIVAL, APART)
         ambiguous = "" if alike is None else f"nodes {alike[0].id} and {alike[1].id} look the same"
         places = tuple(
@@ -103,11 +103,11 @@ class OwnMap:
             for node, recognition in recalled
         )
         best, recognition = recalled[0]
-        return Candidates(places, ambiguous, f"node {best.id}: {recognition.inliers} landmarks agree")
+        return RankedPlaces(places, ambiguous, f"node {best.id}: {recognition.inliers} landmarks agree")
 
 
-class FleetMap:
-    """The fleet's merged map as a source: a server, which knows whether another room looks the same.
+class FleetMapSource:
+    """The fleet's merged map as a source of candidates: its server knows of rooms that look the same.
 
     Attributes:
         refuted: its places that the robot's own view did not bear out.
@@ -122,27 +122,27 @@ class FleetMap:
         self._silent_until = 0.0
         self._agreement = ViewAgreement()
 
-    def candidates(self, view: View) -> Generator[Command, None, Candidates]:
+    def candidates(self, view: View) -> Generator[Command, None, RankedPlaces]:
         """Where a view was taken, by the fleet's map; a silent fleet is not asked at each view.
 
         A view that is no proof alone counts together with an earlier one, see `ViewAgreement`.
         """
         if self._motion.now < self._silent_until:
-            return Candidates((), "", NO_ANSWER)
+            return RankedPlaces((), "", NO_ANSWER)
         answer = yield from self._motion.ask(WhereAmI(self._motion.number(), view, self.near))
         if answer.content is None:
             self._silent_until = self._motion.now + (answer.retry_after or SILENCE)
         if not isinstance(answer.content, RelocalizeAnswer):
-            return Candidates((), "", answer.error or "no answer")
+            return RankedPlaces((), "", answer.error or "no answer")
         content, motion = answer.content, self._motion
         ambiguous = content.reason if content.certainty is Certainty.AMBIGUOUS else ""
         place = self._agreement.take(content, motion.odom_from_robot, motion.way, motion.turned)
         if place is None:
-            return Candidates((), ambiguous, content.reason)
+            return RankedPlaces((), ambiguous, content.reason)
         if self.refuted.holds(place.node):
-            return Candidates((), ambiguous, f"again node {place.node}, of which nothing was in view")
+            return RankedPlaces((), ambiguous, f"again node {place.node}, of which nothing was in view")
         reason = content.reason
         if content.certainty is Certainty.UNKNOWN:
             reason = f"{place.inliers} landmarks of {place.node} agree, and so does an earlier view"
         candidate = Candidate(place.node, place.node_from_robot, distance_known=place.distance_known)
-        return Candidates((candidate,), ambiguous, reason)
+        return RankedPlaces((candidate,), ambiguous, reason)

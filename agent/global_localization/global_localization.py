@@ -10,7 +10,13 @@ from __future__ import annotations
 import math
 from collections.abc import Generator
 
-from mapweave.agent.global_localization.candidates import APART, Candidate, Candidates, FleetMap, OwnMap
+from mapweave.agent.global_localization.candidates import (
+    APART,
+    Candidate,
+    FleetMapSource,
+    OwnMapSource,
+    RankedPlaces,
+)
 from mapweave.agent.global_localization.pose_consistency import PoseHypothesis, consistent
 from mapweave.agent.global_localization.search_policy import SearchPolicy
 from mapweave.agent.localization.place_recognition import exact_enough
@@ -69,9 +75,9 @@ class GlobalLocalization:
         description: RobotDescription,
         sift: Sift,
         motion: MotionPrimitives,
-        own_map: OwnMap,
+        own_map: OwnMapSource,
         policy: SearchPolicy,
-        fleet: FleetMap | None = None,
+        fleet: FleetMapSource | None = None,
     ) -> None:
         """Take the means.
 
@@ -175,7 +181,7 @@ class GlobalLocalization:
 
     # Verdicts
 
-    def _single(self, own: Candidates, fleet: Candidates | None, leniency: float) -> Candidate | None:
+    def _single(self, own: RankedPlaces, fleet: RankedPlaces | None, leniency: float) -> Candidate | None:
         """The place that one view shows, by the own map and by the fleet's, which must not contradict it."""
         sure = self._policy.sure
         self.detail = own.reason if fleet is None else fleet.reason
@@ -198,7 +204,7 @@ class GlobalLocalization:
             return None
         return fleet_best
 
-    def _second_of_two(self, own: Candidates) -> Candidate | None:
+    def _second_of_two(self, own: RankedPlaces) -> Candidate | None:
         """The place that a view shows if an earlier view of other things agrees with it."""
         if own.ambiguous or not own.places:
             self.detail = own.ambiguous or own.reason
@@ -287,7 +293,7 @@ class GlobalLocalization:
         if self._fleet is not None:
             self._fleet.near = None
 
-    def _take_hint(self, own: Candidates) -> None:
+    def _take_hint(self, own: RankedPlaces) -> None:
         """Remember the node with most inliers from here, even if its pose is uncertain."""
         best = own.places[0].recognized if own.places else None
         if best is not None and (self._hint is None or best.recognition.inliers > self._hint[0]):

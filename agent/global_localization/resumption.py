@@ -6,7 +6,7 @@ from collections import deque
 
 import numpy as np
 
-from mapweave.agent.global_localization.candidates import OwnMap, RecognizedNode
+from mapweave.agent.global_localization.candidates import OwnMapSource, RecognizedNode
 from mapweave.agent.global_localization.global_localization import GlobalLocalization
 from mapweave.agent.global_localization.search_policy import TO_MAP, SearchPolicy
 from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
@@ -53,7 +53,7 @@ class Resumption:
         self.seen: deque[tuple[Pose2, Array]] = deque(maxlen=REMEMBERED)
         self._motion = MotionPrimitives(description)
         self._localization = GlobalLocalization(
-            description, sift, self._motion, OwnMap(own_map, np.random.default_rng(seed)),
+            description, sift, self._motion, OwnMapSource(own_map, np.random.default_rng(seed)),
             policy or TO_MAP,
         )  # fmt: skip
         self._behaviour = self._find(drives)

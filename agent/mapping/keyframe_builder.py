@@ -18,7 +18,7 @@ from mapweave.agent.mapping.anchored_keyframe import HERE, AnchoredKeyframe
 from mapweave.agent.mapping.loop_closures import LoopClosures
 from mapweave.agent.mapping.tracking import EpisodeEstimate
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
-from mapweave.agent.mapping.view import RawImage, View
+from mapweave.agent.mapping.view import PendingKeyframe, RawImage
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.edge_limits import unmeasurable
@@ -119,8 +119,8 @@ class KeyframeBuilder:
 
     def place(
         self,
-        anchor: View,
-        further: list[View],
+        anchor: PendingKeyframe,
+        further: list[PendingKeyframe],
         estimate: EpisodeEstimate,
         trajectory: TrajectoryRecorder,
         moved: PoseGaussian,
@@ -162,7 +162,11 @@ class KeyframeBuilder:
         self._pending.append(make)
 
     def _place_beside(
-        self, placed: AnchoredKeyframe, view: View, estimate: EpisodeEstimate, map_from_anchor: PoseGaussian
+        self,
+        placed: AnchoredKeyframe,
+        view: PendingKeyframe,
+        estimate: EpisodeEstimate,
+        map_from_anchor: PoseGaussian,
     ) -> None:
         """Make a node of a further view of an episode whose anchor has become a node."""
         landmarks, tracks = self._landmarks(view, estimate)
@@ -290,7 +294,7 @@ class KeyframeBuilder:
 
     def _node(
         self,
-        view: View,
+        view: PendingKeyframe,
         landmarks: Landmarks,
         map_from_anchor: PoseGaussian,
         segment: TrajectorySegment | None = None,
@@ -304,7 +308,9 @@ class KeyframeBuilder:
             self._images.append((node.id, view.image))
         return node
 
-    def _landmarks(self, view: View, estimate: EpisodeEstimate) -> tuple[Landmarks, NDArray[np.int64]]:
+    def _landmarks(
+        self, view: PendingKeyframe, estimate: EpisodeEstimate
+    ) -> tuple[Landmarks, NDArray[np.int64]]:
         """The view's features with depth in the view: by the filter, else triangulated; and their tracks."""
         camera = self._camera
         depths, sigmas = np.full(len(view.tracks), np.nan), np.full(len(view.tracks), np.nan)

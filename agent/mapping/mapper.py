@@ -18,7 +18,7 @@ from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
 from mapweave.agent.mapping.node_retirement import NodeRetirement, Released, alone
 from mapweave.agent.mapping.tracking import Tracking
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
-from mapweave.agent.mapping.view import RawImage, View
+from mapweave.agent.mapping.view import PendingKeyframe, RawImage
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.track_quality import TrackQuality
@@ -69,8 +69,8 @@ class Mapper:
         self._retirement = NodeRetirement(self._keyframes.map, released)
         self._trajectory = TrajectoryRecorder(description)
         self._composed = HERE, HERE, HERE
-        self._anchor: View | None = None
-        self._further: list[View] = []
+        self._anchor: PendingKeyframe | None = None
+        self._further: list[PendingKeyframe] = []
         # A thread extracts features, which are used when the next tick begins, by waiting for them: no result
         # depends on speed. Those of the next anchor are used earlier if a behaviour asks for its features:
         # episodes that begin a tick later cost a robot a quarter of its nodes.
@@ -293,7 +293,7 @@ class Mapper:
         self._begin_at(anchor)
         self._keyframes.recognise(node, anchor.tracks, recognition)
 
-    def _begin_at(self, anchor: View) -> None:
+    def _begin_at(self, anchor: PendingKeyframe) -> None:
         self._tracking.reanchor()
         self._anchor = anchor
         self._trajectory.clear(anchor.stamp_ns)

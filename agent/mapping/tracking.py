@@ -18,7 +18,7 @@ from mapweave.agent.mapping.kidnap_detection import KidnapDetector, turned
 from mapweave.agent.mapping.odometry_consistency import OdometryConsistency
 from mapweave.agent.mapping.prediction_offset import PredictionOffset
 from mapweave.agent.mapping.track_history import TrackHistory
-from mapweave.agent.mapping.view import RawImage, View, associate, even_choice
+from mapweave.agent.mapping.view import PendingKeyframe, RawImage, associate, even_choice
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.occluded_tracks import OccludedTracks
@@ -225,13 +225,17 @@ class Tracking:
         """Note from where the tracks are seen now, if the robot has moved or it is forced."""
         self.history.record(self._filter.pose.mean, self._tracker.ids, self._tracker.pixels, force)
 
-    def take(self, observation: Observation, features: Features, anchor_from_view: PoseGaussian) -> View:
+    def take(
+        self, observation: Observation, features: Features, anchor_from_view: PoseGaussian
+    ) -> PendingKeyframe:
         """Make a view of an image that was just tracked, and match its features with tracks."""
         tracks = associate(features, self._tracker.ids, self._tracker.raw, ASSOCIATE_PX)
         image = None if observation.image is None else RawImage(observation.image, self._lens)
-        return View(observation.stamp_ns, anchor_from_view, features, tracks, observation.proximity, image)
+        return PendingKeyframe(
+            observation.stamp_ns, anchor_from_view, features, tracks, observation.proximity, image
+        )
 
-    def follow(self, view: View) -> None:
+    def follow(self, view: PendingKeyframe) -> None:
         """Make tracks of a view's features that have none; `fill` is to come before the next step."""
         new = view.tracks < 0
         ids = np.arange(self._next_track, self._next_track + int(new.sum()), dtype=np.int64)

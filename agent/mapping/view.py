@@ -26,7 +26,7 @@ class RawImage:
 
 
 @dataclass(eq=False)
-class View:
+class PendingKeyframe:
     """An image that will become a node.
 
     Attributes:

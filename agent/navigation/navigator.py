@@ -11,7 +11,7 @@ import numpy as np
 from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement
 from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
 from mapweave.agent.localization.fix import Fix
-from mapweave.agent.mission import Answer, GoTo, Question
+from mapweave.agent.mission import GoTo, Question, ServerAnswer
 from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
 from mapweave.agent.navigation.answer_trial import AnswerTrial
 from mapweave.agent.navigation.blocks import Blocks
@@ -23,7 +23,7 @@ from mapweave.agent.navigation.positioning import Positioning
 from mapweave.agent.navigation.right_of_way import Passage, RightOfWay
 from mapweave.agent.navigation.route_follower import NEAR, RouteFollower, RouteProgress
 from mapweave.agent.navigation.route_source import RouteSource
-from mapweave.agent.navigation.stage import Stage
+from mapweave.agent.navigation.stage import NavigationStage
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import AgentSettings
@@ -88,7 +88,7 @@ class Navigator:
         The robot is on the floor of the node `near`, if that is known. `beside` is the robot next to it,
         if there is one. Its questions are numbered from `first`.
         """
-        self.stage: str = Stage.LOST
+        self.stage: str = NavigationStage.LOST
         self.detail = ""
         self.fix: Fix | None = None
         self.goal = goal
@@ -136,7 +136,7 @@ class Navigator:
     @property
     def arrived(self) -> bool:
         """Whether the robot is parked at the goal."""
-        return self.stage == Stage.ARRIVED
+        return self.stage == NavigationStage.ARRIVED
 
     def taken_up(self, mission: GoTo) -> GoTo:
         """Its mission, from where it is with it now."""
@@ -146,10 +146,10 @@ class Navigator:
     @property
     def given_up(self) -> bool:
         """Whether the robot stands, since the goal cannot be reached; `detail` is the reason."""
-        return self.stage == Stage.GIVEN_UP
+        return self.stage == NavigationStage.GIVEN_UP
 
     def step(
-        self, observation: Observation, answers: tuple[Answer, ...], standing: bool = False
+        self, observation: Observation, answers: tuple[ServerAnswer, ...], standing: bool = False
     ) -> tuple[Command, list[Question]]:
         """One tick: returns what the wheels shall do and what to ask the fleet's map.
 
@@ -218,7 +218,7 @@ class Navigator:
     def _give_up(self, reason: str) -> None:
         """Stand, and say why."""
         if not self.given_up:
-            self.stage, self.detail = Stage.GIVEN_UP, reason
+            self.stage, self.detail = NavigationStage.GIVEN_UP, reason
             self._positioning.search, self._following = None, False
             self._behaviour = self._stand()
 
@@ -229,16 +229,16 @@ class Navigator:
             if late := crossing.late(self._motion.now):
                 self._give_up(late)
                 return
-            self.stage, self.detail = Stage.PORTAL, crossing.request
+            self.stage, self.detail = NavigationStage.PORTAL, crossing.request
             yield Command()
         if crossing.wait is None:
             return
-        self.stage, self.fix = Stage.LOST, None
+        self.stage, self.fix = NavigationStage.LOST, None
         self._start_from((yield from self._positioning.find_beyond(crossing)))
         crossing.looked(self.fix is not None)
 
     def _find(self) -> Behaviour:
-        self.stage, self._goal_hidden = Stage.LOST, False
+        self.stage, self._goal_hidden = NavigationStage.LOST, False
         self._patience.trouble = "it does not know where it is"
         expected, self._expected = self._expected, None
         self._start_from((yield from self._positioning.find(expected)))
@@ -252,7 +252,7 @@ class Navigator:
 
     def _get_route(self, fix: Fix, goal: NodeId) -> Generator[Command, None, RouteAnswer]:
         """Ask for a way."""
-        self.stage = Stage.ASKING
+        self.stage = NavigationStage.ASKING
         answer = yield from self._routes.route(fix, goal, self._blocks)
         self.detail, self._detour = answer.reason, answer.detour
         if not answer.legs:
@@ -266,12 +266,12 @@ class Navigator:
         self._blocks.add(a, b, self._motion.now)
         self._patience.trouble = f"no robot has driven between {a} and {b}, and this one has no rangers"
         if named:
-            self.stage, self.detail = Stage.WAITING, self._patience.trouble
+            self.stage, self.detail = NavigationStage.WAITING, self._patience.trouble
             yield from self._motion.stand(PAUSE)
 
     def _wait_for_a_way(self) -> Behaviour:
         """Without a route: obstacles may go away, or a server come back; or the robot's pose is wrong."""
-        self.stage, now, patience = Stage.WAITING, self._motion.now, self._patience
+        self.stage, now, patience = NavigationStage.WAITING, self._motion.now, self._patience
         if not (self._blocks.pairs(now) or self._blocks.obstacles(now)) and patience.refused_since is None:
             self.fix, patience.refused_since = None, now
         elif reason := patience.refused(self._routes.refusing, now):
@@ -325,7 +325,7 @@ class Navigator:
                 and not (self._via and self._portal is None)
                 and known
             ):
-                self.stage, self.detail = Stage.ARRIVED, HIDDEN
+                self.stage, self.detail = NavigationStage.ARRIVED, HIDDEN
                 self._reach()
             case RouteProgress.UNSURE:
                 # It is at the goal by what it knows, yet it sees none of the goal's landmarks.
@@ -339,7 +339,7 @@ class Navigator:
         self.tally = self.tally.passed([0.0])
         if self._portal is not None:
             self._reach_stop()
-            self.stage = Stage.PORTAL
+            self.stage = NavigationStage.PORTAL
             self.crossing.begin(self._portal)
 
     def _reach_stop(self) -> None:
@@ -359,7 +359,7 @@ class Navigator:
         self._following = False
         while passage is Passage.HELD:
             if right_of_way.holder:
-                self.stage, self.detail = Stage.YIELDING, right_of_way.reason
+                self.stage, self.detail = NavigationStage.YIELDING, right_of_way.reason
                 self._patience.trouble = f"{right_of_way.holder} is in the way"
             yield Command()
             passage = right_of_way.passage(follower.leg, follower.fix)
@@ -386,7 +386,7 @@ class Navigator:
         right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
         while follower.to_goal > THERE and (yield from self._let_pass(right_of_way, follower)):
             command = follower.step(self._motion.observation)
-            self.fix, self.stage, self.detail = follower.fix, Stage.ASIDE, follower.detail
+            self.fix, self.stage, self.detail = follower.fix, NavigationStage.ASIDE, follower.detail
             if follower.to_goal <= THERE or follower.progress not in UNDERWAY:
                 break
             yield command
@@ -408,7 +408,7 @@ class Navigator:
         self.tally = self.tally.blocked()
         where = f"between {a} and {b}" if a != b else f"on the way to {b}"
         self._patience.block(where, obstacle.robot if obstacle else "", now)
-        self.stage, self.detail = Stage.BLOCKED, f"{where}: {words}"
+        self.stage, self.detail = NavigationStage.BLOCKED, f"{where}: {words}"
         self._patience.trouble = self.detail
         yield from self._motion.stand(PAUSE)
         lost = self.fix is not None and not self.fix.in_sight and self.fix.blind > TRUSTED

@@ -12,7 +12,7 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Obstacle, RouteAnswer, RouteLeg
 from mapweave.hybridmap.reachability import closed_edges
-from mapweave.hybridmap.route import Ways
+from mapweave.hybridmap.route import RouteTable
 from mapweave.hybridmap.segments import distances
 
 
@@ -36,7 +36,7 @@ def onboard_route(
         obstacles: places that it cannot pass; those at nodes of other maps are left out.
     """
     barred = {*blocked, *_past(own_map, obstacles)}
-    route = Ways(own_map, blocked=barred, closed=closed_edges(own_map)).find(start, goal)
+    route = RouteTable(own_map, blocked=barred, closed=closed_edges(own_map)).find(start, goal)
     if not route.nodes:
         return RouteAnswer((), f"own map: {route.reason}")
     origin = PoseGaussian(Pose2(), np.zeros((3, 3)))

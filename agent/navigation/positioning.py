@@ -7,7 +7,7 @@ from collections.abc import Generator
 
 import numpy as np
 
-from mapweave.agent.global_localization.candidates import Candidate, FleetMap, OwnMap
+from mapweave.agent.global_localization.candidates import Candidate, FleetMapSource, OwnMapSource
 from mapweave.agent.global_localization.global_localization import LENIENT, STILL, GlobalLocalization
 from mapweave.agent.global_localization.search_policy import BEYOND_PORTAL, TO_NAVIGATE
 from mapweave.agent.localization.fix import Fix
@@ -59,7 +59,7 @@ class Positioning:
         self._motion = motion
         self._detector = NodeDetector(description, lens, sift, rng, settings)
         self._description, self._lens, self._settings = description, lens, settings
-        self._own, self._fleet = OwnMap(own_map, rng), FleetMap(motion)
+        self._own, self._fleet = OwnMapSource(own_map, rng), FleetMapSource(motion)
         self._fleet.near = near
         self.refuted = self._fleet.refuted
         self._localization, self._beyond = (

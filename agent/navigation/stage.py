@@ -5,8 +5,8 @@ from __future__ import annotations
 from enum import StrEnum
 
 
-class Stage(StrEnum):
-    """In words, for people."""
+class NavigationStage(StrEnum):
+    """What navigation is doing, in words for people."""
 
     LOST = "turning to localize"
     ASKING = "asking for a route"

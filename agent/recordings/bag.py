@@ -18,8 +18,15 @@ from mapweave.agent.recordings.geometry_file import LIMITS
 from mapweave.agent.recordings.incomplete import CameraGiven, Incomplete, complete
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
-from mapweave.agent.recordings.recording import BagContents, Images, Recording, StampedPoses, Topic, names_of
-from mapweave.agent.recordings.wheel_data import Wheels, wheels_of
+from mapweave.agent.recordings.recording import (
+    BagContents,
+    BagTopic,
+    Images,
+    Recording,
+    StampedPoses,
+    names_of,
+)
+from mapweave.agent.recordings.wheel_data import WheelModel, wheels_of
 from mapweave.agent.ros_messages.images import grey_of
 from mapweave.agent.ros_messages.values import (
     CAMERA_TYPE,
@@ -66,7 +73,7 @@ class Bag:
             DeviceError: nothing of it can be read.
         """
         self.path, self.damage = path, list[str]()
-        self.wheels: Wheels | None = None
+        self.wheels: WheelModel | None = None
         self._parts = [part for each in parts_of(path) for part in self._opened(each)]
         if not self._parts:
             raise DeviceError((self.damage or [f"{path}: no bag in it"])[0])
@@ -74,7 +81,7 @@ class Bag:
         for part in self._parts:
             for name, (kind, count) in part.topics.items():
                 counts[name, kind] = counts.get((name, kind), 0) + count
-        self.topics = tuple(Topic(name, kind, counts[name, kind]) for name, kind in sorted(counts))
+        self.topics = tuple(BagTopic(name, kind, counts[name, kind]) for name, kind in sorted(counts))
 
     @property
     def contents(self) -> BagContents:
@@ -262,12 +269,12 @@ def bag(path: Path, options: RecordingOptions) -> Recording:
     return replace(whole, kidnapped=kidnapped, notes=tuple(notes), damage=damage, wheels=opened.wheels)
 
 
-def _of(opened: Bag, kinds: Sequence[str]) -> list[Topic]:
+def _of(opened: Bag, kinds: Sequence[str]) -> list[BagTopic]:
     """The topics of these types that have messages."""
     return [topic for topic in opened.topics if topic.kind in kinds and topic.count]
 
 
-def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str) -> Topic:
+def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str) -> BagTopic:
     """The topic that is wanted, else the one of the right type with most messages; there must be one."""
     fitting = _of(opened, kinds)
     if wanted is None:
@@ -285,7 +292,7 @@ def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str) ->
     return next(topic for topic in fitting if topic.count == most)
 
 
-def _odometry_topic(opened: Bag, options: RecordingOptions) -> Topic | None:
+def _odometry_topic(opened: Bag, options: RecordingOptions) -> BagTopic | None:
     if options.odometry_topic is not None:
         return _chosen(opened, options.odometry_topic, POSE_TYPES, "poses")
     fitting = _of(opened, (ODOMETRY_TYPE,))

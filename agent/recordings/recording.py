@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.recordings.heading_check import contradiction
 from mapweave.agent.recordings.odometry_jumps import bridged
-from mapweave.agent.recordings.wheel_data import Wheels
+from mapweave.agent.recordings.wheel_data import WheelModel
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array, Pose2
@@ -37,8 +37,8 @@ are taken for seconds. No robot's camera is quicker, and a robot that is so slow
 
 
 @dataclass(frozen=True)
-class Topic:
-    """One of a bag's.
+class BagTopic:
+    """A topic of a bag.
 
     Attributes:
         name: of the topic.
@@ -60,7 +60,7 @@ class BagContents:
         seconds: from the first message to the last, s.
     """
 
-    topics: tuple[Topic, ...]
+    topics: tuple[BagTopic, ...]
     seconds: float
 
 
@@ -95,7 +95,7 @@ class Recording:
     damage: tuple[str, ...] = ()
     kidnapped: NDArray[np.bool_] | None = None
     bag: BagContents | None = None
-    wheels: Wheels | None = None
+    wheels: WheelModel | None = None
     timed: bool = True
 
     def __len__(self) -> int:
@@ -359,7 +359,7 @@ def _milliseconds(increments: Array, stamps_ns: Stamps) -> list[str]:
     ]
 
 
-def names_of(topics: Iterable[Topic]) -> str:
+def names_of(topics: Iterable[BagTopic]) -> str:
     """Names and types of the topics that have messages."""
     return ", ".join(f"{topic.name} ({topic.kind})" for topic in topics if topic.count) or "no messages"
 

@@ -16,7 +16,7 @@ KEYS = {"axle": "mapweave.axle_m", "wheel_noise": "mapweave.wheel_noise", "side_
 
 
 @dataclass(frozen=True, slots=True)
-class Wheels:
+class WheelModel:
     """What the filters must know of wheels; see RobotDescription.
 
     Attributes:
@@ -35,7 +35,7 @@ def wheel_data(description: RobotDescription) -> dict[str, str]:
     return {key: repr(float(getattr(description, field))) for field, key in KEYS.items()}
 
 
-def wheels_of(custom_data: object) -> Wheels | None:
+def wheels_of(custom_data: object) -> WheelModel | None:
     """The wheels that the metadata of a bag give; None if they do not.
 
     Args:
@@ -48,7 +48,7 @@ def wheels_of(custom_data: object) -> Wheels | None:
         return None
     try:
         values = {field: float(custom_data[key]) for field, key in KEYS.items()}
-        return convert(values, Wheels)  # type: ignore[no-any-return]
+        return convert(values, WheelModel)  # type: ignore[no-any-return]
     except KeyError as missing:
         raise ValueError(f"its metadata.yaml lacks {missing.args[0]}") from None
     except (TypeError, ValueError, msgspec.ValidationError):

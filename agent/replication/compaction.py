@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 
-from mapweave.agent.replication.log_entry import Entry
+from mapweave.agent.replication.log_entry import LogEntry
 from mapweave.hybridmap.change import EdgePut, NodeRetired
 from mapweave.hybridmap.ids import NodeId
 
 
-def undone(entries: Iterable[Entry], limit: int, everyone: int) -> list[int]:
+def undone(entries: Iterable[LogEntry], limit: int, everyone: int) -> list[int]:
     """Changes without which a log gives the same map: edges at retired nodes, and the retirements.
 
     The newest change stays, and that of the greatest number: from them follows which come next.

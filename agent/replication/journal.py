@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeGuard
 
 from mapweave.agent.replication.compaction import undone
-from mapweave.agent.replication.log_entry import Entry
+from mapweave.agent.replication.log_entry import LogEntry
 from mapweave.hybridmap.change import Change, ChangeBody, EdgeRetired, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId, check_name
@@ -95,12 +95,12 @@ def body_of(encoded: object, crc: int) -> ChangeBody | None:
         return None
 
 
-def entry_of(map_id: MapId, sequence: int, number: int, put: int, encoded: object, crc: int) -> Entry:
+def entry_of(map_id: MapId, sequence: int, number: int, put: int, encoded: object, crc: int) -> LogEntry:
     """A row of a map's log as an entry; its element is that of its body if that is undamaged."""
     body = body_of(encoded, crc)
     if body is None or element_of(body).map != map_id:
-        return Entry(sequence, NodeId(*map_id, number), bool(put), None)
-    return Entry(sequence, element_of(body), not isinstance(body, NodeRetired | EdgeRetired), body)
+        return LogEntry(sequence, NodeId(*map_id, number), bool(put), None)
+    return LogEntry(sequence, element_of(body), not isinstance(body, NodeRetired | EdgeRetired), body)
 
 
 def _of_key(key: Sequence[object]) -> int:
@@ -310,7 +310,7 @@ class Journal:
             for change in self.changes(map_id, begin, min(begin + READ_AT_ONCE - 1, head)):
                 yield change.body
 
-    def entries(self, map_id: MapId) -> Iterator[Entry]:
+    def entries(self, map_id: MapId) -> Iterator[LogEntry]:
         """Every change that is still there, in order; damaged ones without a body."""
         query = "SELECT sequence, element, put, body, crc FROM change WHERE epoch = ? ORDER BY sequence"
         for row in self._read(query, self._epoch(map_id)):

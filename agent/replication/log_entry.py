@@ -8,7 +8,7 @@ from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.ids import NodeId
 
 
-class Entry(NamedTuple):
+class LogEntry(NamedTuple):
     """One change of a log: the node or edge that it writes or retires; body None if damaged."""
 
     sequence: int

@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 from mapweave.agent.replication.journal import Journal
-from mapweave.agent.replication.log_entry import Entry
+from mapweave.agent.replication.log_entry import LogEntry
 from mapweave.hybridmap.change import ChangeBody, EdgeRetired, NodeRetired
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
@@ -37,7 +37,7 @@ class RetainedMap:
         return RetainedMap.of_entries(map_id, journal.entries(map_id))
 
     @staticmethod
-    def of_entries(map_id: MapId, entries: Iterable[Entry]) -> RetainedMap:
+    def of_entries(map_id: MapId, entries: Iterable[LogEntry]) -> RetainedMap:
         """Replay the changes of a map.
 
         What the disk has damaged is left out, with the edges at nodes that are missing for it. A damaged

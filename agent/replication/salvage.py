@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.agent.replication.journal import body_of, entry_of, key_holds
-from mapweave.agent.replication.log_entry import Entry
+from mapweave.agent.replication.log_entry import LogEntry
 from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId, check_name
@@ -134,7 +134,7 @@ def _agent(rows: Iterable[Row], owners: Iterable[tuple[Any]]) -> str:
     return ""
 
 
-def _entries(map_id: MapId, rows: Mapping[tuple[int, int], Row]) -> Iterator[Entry]:
+def _entries(map_id: MapId, rows: Mapping[tuple[int, int], Row]) -> Iterator[LogEntry]:
     for (epoch, sequence), (*key, encoded, crc) in sorted(rows.items()):
         if epoch != map_id.epoch:
             continue
@@ -142,4 +142,4 @@ def _entries(map_id: MapId, rows: Mapping[tuple[int, int], Row]) -> Iterator[Ent
             yield entry_of(map_id, sequence, key[2], key[3], encoded, crc)
         else:
             # What it is about is not known.
-            yield Entry(sequence, NodeId(*map_id, 0), True, None)
+            yield LogEntry(sequence, NodeId(*map_id, 0), True, None)

@@ -21,7 +21,7 @@ MOST_SKIPPED = 100.0
 """Ticks between two observations."""
 
 
-class Fault(NamedTuple):
+class SensorFault(NamedTuple):
     """A sensor that cannot be believed.
 
     Attributes:
@@ -45,7 +45,7 @@ class SensorMonitor:
 
     def __init__(self, description: RobotDescription) -> None:
         """All sensors are healthy."""
-        self.fault: Fault | None = None
+        self.fault: SensorFault | None = None
         self.rangers = RangerMonitor(description)
         self.pose_lost = False
         self._tick = description.tick
@@ -96,16 +96,16 @@ class SensorMonitor:
             return Command()
         return Command(0.0, TRIAL_RATE if since < TRIAL_SIDE else -TRIAL_RATE)
 
-    def _found(self) -> Fault | None:
+    def _found(self) -> SensorFault | None:
         causes = (
             ("clock", self._clock.fault),
             ("camera", self._camera.fault),
             ("encoders", self._encoders.fault),
             ("rangers", self.rangers.fault),
         )
-        return next((Fault(sensor, words) for sensor, words in causes if words), None)
+        return next((SensorFault(sensor, words) for sensor, words in causes if words), None)
 
-    def _wait(self, before: Fault | None) -> None:
+    def _wait(self, before: SensorFault | None) -> None:
         """Count the time of a fault, and say when its next trial is."""
         if self.fault is None or before is None or self.fault.sensor != before.sensor:
             self._faulty, self._trial_at, self._pause = 0.0, FIRST_TRIAL, FIRST_TRIAL

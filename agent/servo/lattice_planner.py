@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.servo.plan import Leg, Plan, Price, Surroundings, sample
+from mapweave.agent.servo.plan import Leg, Price, ServoPlan, Surroundings, sample
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 
 _FIRST_OCTANT = ((1, 0), (3, 1), (2, 1), (3, 2))
@@ -52,7 +52,7 @@ def lattice_plan(
     price: Price,
     cell: float = 0.1,
     room: float = 1.2,
-) -> Plan | None:
+) -> ServoPlan | None:
     """A cheap admissible plan of any number of legs.
 
     Args:
@@ -228,7 +228,7 @@ def _thin(points: Array) -> Array:
 
 def _shorten(
     surroundings: Surroundings, start: Pose2, way: Array, margin: float, price: Price
-) -> Plan | None:
+) -> ServoPlan | None:
     """The cheapest sequence of exact legs over a way's points."""
     points = np.concatenate([[[start.x, start.y]], way])
     first, last = np.triu_indices(len(points), 1)
@@ -262,7 +262,7 @@ def _shorten(
             x, y = points[last[k]].tolist()
             legs.append(Leg(branch, float(direction[k]), x, y, float(length[k])))
         if surroundings.allowed(sample(start, legs), 0.7 * margin).all():
-            return Plan(start, tuple(legs), price.of(start, legs), margin)
+            return ServoPlan(start, tuple(legs), price.of(start, legs), margin)
     return None
 
 

@@ -22,7 +22,7 @@ _LOOK_AHEAD = 0.25
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class SpeedLimits:
     """Speed limits: forward m/s, turn rad/s."""
 
     forward: float
@@ -36,7 +36,7 @@ FORWARD_GAIN = 1.5
 class LegController:
     """Drives one leg, along the line from the pose where the robot starts to drive."""
 
-    def __init__(self, leg: Leg, last: bool, limits: Limits) -> None:
+    def __init__(self, leg: Leg, last: bool, limits: SpeedLimits) -> None:
         """Take a leg.
 
         Args:

@@ -46,7 +46,7 @@ class Leg:
 
 
 @dataclass(frozen=True, slots=True)
-class Plan:
+class ServoPlan:
     """A way to the goal pose.
 
     Attributes:

@@ -8,7 +8,7 @@ import numpy as np
 
 from mapweave.agent.servo.lattice_planner import lattice_plan
 from mapweave.agent.servo.margins import margins
-from mapweave.agent.servo.plan import PRICE, Plan, Surroundings
+from mapweave.agent.servo.plan import PRICE, ServoPlan, Surroundings
 from mapweave.agent.servo.two_leg_planner import two_leg_plan
 from mapweave.hybridmap.pose import Pose2
 
@@ -19,7 +19,7 @@ _DETOUR_M = 0.6
 """if it is also this much longer, m."""
 
 
-def quick_plan(around: Surroundings, start: Pose2) -> Plan | None:
+def quick_plan(around: Surroundings, start: Pose2) -> ServoPlan | None:
     """A plan of two legs with as wide a margin as there is one for: milliseconds.
 
     Args:
@@ -37,12 +37,12 @@ def quick_plan(around: Surroundings, start: Pose2) -> Plan | None:
     return None
 
 
-def needs_thought(plan: Plan | None) -> bool:
+def needs_thought(plan: ServoPlan | None) -> bool:
     """Whether a quick plan is so long, or missing, that the thorough search is worth its time."""
     return plan is None or plan.length > _DETOUR * math.hypot(plan.start.x, plan.start.y) + _DETOUR_M
 
 
-def thorough_plan(around: Surroundings, start: Pose2) -> Plan | None:
+def thorough_plan(around: Surroundings, start: Pose2) -> ServoPlan | None:
     """The cheapest plan that two legs or the lattice know: tens to hundreds of milliseconds.
 
     Args:

@@ -6,7 +6,7 @@ import numpy as np
 
 from mapweave.agent.observation import Command
 from mapweave.agent.servo.field_of_view import FieldOfView
-from mapweave.agent.servo.leg_controller import Limits, clip
+from mapweave.agent.servo.leg_controller import SpeedLimits, clip
 from mapweave.agent.servo.margins import LEAST_MARGIN, MIN_VISIBLE, TURN_GAIN
 from mapweave.agent.servo.plan import Surroundings
 from mapweave.agent.servo.servo_step import State
@@ -23,7 +23,7 @@ _OFFSETS = np.linspace(-0.8, 0.8, 33)
 class Recovery:
     """Brings landmarks back into view. Backing off narrows all bearings: tried when no turn helps."""
 
-    def __init__(self, limits: Limits) -> None:
+    def __init__(self, limits: SpeedLimits) -> None:
         """Prepare."""
         self._limits = limits
         self._retreat_from: Pose2 | None = None

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.servo.laws import control, saturate
-from mapweave.agent.servo.leg_controller import LegController, Limits, clip
+from mapweave.agent.servo.leg_controller import LegController, SpeedLimits, clip
 from mapweave.agent.servo.margins import FIELD_MARGIN, LEAST_MARGIN, MIN_VISIBLE, TURN_GAIN
 from mapweave.agent.servo.obstacles import ObstacleMemory
-from mapweave.agent.servo.plan import PRICE, Plan, Surroundings, arc, sample
+from mapweave.agent.servo.plan import PRICE, ServoPlan, Surroundings, arc, sample
 from mapweave.agent.servo.planner import needs_thought, quick_plan, thorough_plan
 from mapweave.agent.servo.polar import Polar, continued, polar_of
 from mapweave.agent.servo.recovery import Recovery
@@ -67,7 +67,7 @@ class Servo:
         """
         self._description = description
         share = CRUISE
-        self._limits = Limits(
+        self._limits = SpeedLimits(
             max(description.max_forward, 1e-3) * share, max(description.max_turn, 1e-3) * share
         )
         self.start(Pose2(), np.zeros((0, 3)))
@@ -87,7 +87,7 @@ class Servo:
         self._memory = ObstacleMemory()
         self._law: int | None = None
         self._polar = Polar(0.0, 0.0, 0.0)  # continued from tick to tick while a law is at work
-        self._plan: Plan | None = None
+        self._plan: ServoPlan | None = None
         self._leg = 0
         self._follower: LegController | None = None
         self._broken_laws = 0
@@ -101,7 +101,7 @@ class Servo:
         return self._law is not None or self._plan is not None
 
     @property
-    def plan(self) -> Plan | None:
+    def plan(self) -> ServoPlan | None:
         """The plan at work, if legs and no law drive."""
         return self._plan
 

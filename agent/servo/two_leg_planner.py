@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from mapweave.agent.servo.plan import Leg, Plan, Price, Surroundings, sample
+from mapweave.agent.servo.plan import Leg, Price, ServoPlan, Surroundings, sample
 from mapweave.hybridmap.pose import Array, Pose2
 
 _SPACING = 0.06
@@ -36,7 +36,7 @@ def headings_around(surroundings: Surroundings, pose: Pose2, margin: float) -> A
     return poses[low : high + 1, 2]
 
 
-def two_leg_plan(surroundings: Surroundings, start: Pose2, margin: float, price: Price) -> Plan | None:
+def two_leg_plan(surroundings: Surroundings, start: Pose2, margin: float, price: Price) -> ServoPlan | None:
     """The cheapest admissible plan of at most two legs.
 
     For headings h1 and h2 the lengths follow from d1 e(h1) + d2 e(h2) = -start; a negative one is driven
@@ -72,7 +72,7 @@ def two_leg_plan(surroundings: Surroundings, start: Pose2, margin: float, price:
         for index in batch[surroundings.allowed(poses, margin).all(axis=1)]:
             legs = _legs(start, h1[index], d1[index], h2[index], d2[index])
             if surroundings.allowed(sample(start, legs), margin).all():
-                return Plan(start, legs, float(cost[index]), margin)
+                return ServoPlan(start, legs, float(cost[index]), margin)
         done, size = done + size, min(4 * size, 400)
     return None
 

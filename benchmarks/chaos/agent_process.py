@@ -67,7 +67,7 @@ class Orders:
     seed: int
 
 
-class EventLog:
+class DurableLines:
     """Lines in a file, each on the disk when `write` returns."""
 
     def __init__(self, path: Path) -> None:
@@ -86,7 +86,7 @@ class EventLog:
 class NotedJournal(Journal):
     """A journal that writes down when an acknowledgement is on the disk."""
 
-    def __init__(self, path: Path, agent: str, noted: EventLog) -> None:
+    def __init__(self, path: Path, agent: str, noted: DurableLines) -> None:
         """See Journal."""
         super().__init__(path, agent)
         self._noted = noted
@@ -108,8 +108,8 @@ def main() -> None:
     script, folder, keys = ScriptedRobot(orders.robot, orders.seed), Path(orders.folder), Keys(FLEET)
     name = script.map.agent
     stop = stop_on_signals()
-    truth = EventLog(folder / f"{name}.truth")
-    journal = NotedJournal(folder / f"{name}.sqlite", name, EventLog(folder / f"{name}.acks"))
+    truth = DurableLines(folder / f"{name}.truth")
+    journal = NotedJournal(folder / f"{name}.sqlite", name, DurableLines(folder / f"{name}.acks"))
     map_id = journal.open_map(1)
     head = journal.head(map_id)
     step = position = 0

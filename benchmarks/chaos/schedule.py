@@ -12,7 +12,7 @@ LEAST_KILLS = 20
 
 
 class Kind(StrEnum):
-    """Of a disturbance."""
+    """What a disturbance does."""
 
     KILL = "kill -9"
     """Started again when it ends."""
@@ -27,7 +27,13 @@ class Kind(StrEnum):
 
 
 KILLS = (Kind.KILL, Kind.LOSE_STORE)
-LINKS = (Kind.CUT, Kind.SLOW, Kind.FROZEN, Kind.FLAP, Kind.HALF)
+LINKS = (
+    Kind.CUT,
+    Kind.SLOW,
+    Kind.FROZEN,
+    Kind.FLAP,
+    Kind.HALF,
+)
 LASTING = {
     Kind.KILL: (0.1, 1.5), Kind.LOSE_STORE: (0.1, 1.5), Kind.STOP: (0.5, 7.0), Kind.CUT: (0.2, 3.0),
     Kind.SLOW: (1.0, 4.0), Kind.FROZEN: (0.5, 7.0), Kind.FLAP: (1.0, 4.0), Kind.HALF: (0.1, 0.5),

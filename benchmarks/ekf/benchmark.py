@@ -29,7 +29,7 @@ from scipy.special import chdtri
 from benchmarks.command_line import command_line
 from benchmarks.ekf_speed.benchmark import measure, one_thread
 from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
-from synthetic.localization_run import FEW, Place, Start, try_drives, try_start
+from synthetic.localization_run import FEW, Start, SurveyedNode, try_drives, try_start
 from synthetic.mapping_error import error, filter_error, follow, landmark_nees, left_out
 from synthetic.mapping_optimum import batch_optimum
 from synthetic.mapping_run import SHAPES, draw_run
@@ -40,7 +40,7 @@ _DRIVES = 4
 
 
 @dataclass(frozen=True)
-class Trial:
+class FilterRun:
     """One run.
 
     Attributes:
@@ -59,10 +59,10 @@ class Trial:
     outlier_ratio: float
     left_out: int
     starts: tuple[Start, ...]
-    places: tuple[Place, ...]
+    places: tuple[SurveyedNode, ...]
 
 
-def try_run(seed: int, trial: int) -> Trial:
+def try_run(seed: int, trial: int) -> FilterRun:
     """One run with everything that is measured on it."""
     rng = np.random.default_rng([seed, trial])
     run = draw_run(rng, SHAPES[trial % len(SHAPES)])
@@ -72,7 +72,7 @@ def try_run(seed: int, trial: int) -> Trial:
     best = error(run, filter_.ids, pose_vector, points[filter_.ids])
     spoiled_run, spoiled = spoil(run, 0.3, rng)
     spoiled_filter = follow(spoiled_run)
-    return Trial(
+    return FilterRun(
         filter_error(run, filter_, everything) / best,
         filter_.pose.mahalanobis2(run.poses[-1]),
         landmark_nees(run, filter_),
@@ -83,7 +83,7 @@ def try_run(seed: int, trial: int) -> Trial:
     )
 
 
-def summary(trials: list[Trial]) -> dict[str, float | list[float]]:
+def summary(trials: list[FilterRun]) -> dict[str, float | list[float]]:
     """The figures over all runs."""
     ratios = [t.ratio for t in trials]
     starts = [start for t in trials for start in t.starts]
@@ -128,7 +128,9 @@ def main() -> None:
     with console.status("timing ..."):
         times = measure(arguments.seed)
     with ProcessPoolExecutor(arguments.jobs, mp_context=get_context("spawn")) as pool:
-        results: Iterator[Trial] = pool.map(try_run, [arguments.seed] * arguments.runs, range(arguments.runs))
+        results: Iterator[FilterRun] = pool.map(
+            try_run, [arguments.seed] * arguments.runs, range(arguments.runs)
+        )
         trials = list(track(results, "filtering", total=arguments.runs, console=console))
     figures = summary(trials)
     figures |= times

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from mapweave.evaluation.map_score import crossed
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 
 SQUARE = 0.2
 """Side of a square of floor, m."""
@@ -67,7 +67,7 @@ class MappedFloor:
         return at if math.isfinite(at) else None
 
 
-def mapped_floor(plan: FloorPlan, looks: Mapping[str, Sequence[Look]]) -> MappedFloor:
+def mapped_floor(plan: BuildingPlan, looks: Mapping[str, Sequence[Look]]) -> MappedFloor:
     """Which floor the nodes show: in their field of view, within reach, with no wall or furniture between.
 
     Args:
@@ -83,14 +83,14 @@ def mapped_floor(plan: FloorPlan, looks: Mapping[str, Sequence[Look]]) -> Mapped
     return MappedFloor(seen)
 
 
-def floor_squares(plan: FloorPlan) -> Array:
+def floor_squares(plan: BuildingPlan) -> Array:
     """(N, 2) m, in world: one point in each square of floor where a robot can stand."""
     points = np.concatenate([np.zeros((0, 2)), *plan.free_regions(CLEARANCE)])
     _, first = np.unique(np.floor(points / SQUARE).astype(np.int64), axis=0, return_index=True)
     return np.asarray(points[first])
 
 
-def shows(look: Look, points: Array, plan: FloorPlan) -> NDArray[np.bool_]:
+def shows(look: Look, points: Array, plan: BuildingPlan) -> NDArray[np.bool_]:
     """Which of (N, 2) points (m, in world) a node shows."""
     pose = look.world_from_robot
     ahead = pose.inverse().apply(points)

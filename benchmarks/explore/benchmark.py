@@ -41,7 +41,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2
-from mapweave.scenarios.fleet import TICKS_PER_SECOND, Stage
+from mapweave.scenarios.fleet import TICKS_PER_SECOND, TrialStage
 from mapweave.scenarios.local_fleet import LocalFleet
 from mapweave.storage.map_file import unpack_map_file
 
@@ -75,7 +75,7 @@ class Exploration:
     ate: float | None
 
 
-def explore(stage: Stage, seconds: float, on_time: Callable[[float], None]) -> Exploration:
+def explore(stage: TrialStage, seconds: float, on_time: Callable[[float], None]) -> Exploration:
     """Let a fleet explore.
 
     Args:
@@ -94,7 +94,7 @@ def explore(stage: Stage, seconds: float, on_time: Callable[[float], None]) -> E
         fleet.end()
 
 
-def _judged(stage: Stage, fleet: LocalFleet) -> Exploration:
+def _judged(stage: TrialStage, fleet: LocalFleet) -> Exploration:
     (reply,) = fleet.bus.ask(fleet.keys.any_server_map(), b"", 60.0)
     merged = unpack_map_file(reply.payload)
     whole = HybridMap(merged.changes)
@@ -134,7 +134,7 @@ def measure(
             scenario = office(rooms, count, seed, spread)
             with tempfile.TemporaryDirectory() as folder:
                 settings = AgentSettings(exploration=STRATEGIES[name])
-                stage = Stage(scenario, seed, Path(folder), settings)
+                stage = TrialStage(scenario, seed, Path(folder), settings)
                 done[name][count] = explore(stage, minutes * 60.0, lambda s: progress.advance(bar, s))
     return done
 

@@ -10,7 +10,7 @@ from mapweave.evaluation.map_score import crossed
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.scenario import Scenario, load_scenario, scenario_path
-from mapweave.sim.floorplan import FloorPlan, random_pose
+from mapweave.sim.floorplan import BuildingPlan, random_pose
 
 CLEARANCE = 0.4
 """Of a robot's middle from walls and furniture, m."""
@@ -40,7 +40,7 @@ def office(rooms: int, robots: int, seed: int, spread: bool) -> Scenario:
     return replace(scenario, robots=tuple(setups))
 
 
-def gathered(plan: FloorPlan, robots: int, seed: int) -> list[Pose2]:
+def gathered(plan: BuildingPlan, robots: int, seed: int) -> list[Pose2]:
     """Places for robots near to each other, with no wall between.
 
     Args:
@@ -64,7 +64,7 @@ def gathered(plan: FloorPlan, robots: int, seed: int) -> list[Pose2]:
     raise InvalidValue(f"{robots} robots do not fit into one place: use --spread")
 
 
-def _beside(pose: Pose2, poses: list[Pose2], plan: FloorPlan) -> bool:
+def _beside(pose: Pose2, poses: list[Pose2], plan: BuildingPlan) -> bool:
     """Whether a place is near to the first of others, clear of all, and no wall stands between."""
     first = poses[0]
     if min(map(pose.distance, poses)) < APART or pose.distance(first) > NEAR:

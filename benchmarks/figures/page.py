@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from benchmarks.figures.questions import INTRODUCTION, QUESTIONS, Question
-from benchmarks.figures.results import Result
+from benchmarks.figures.results import StoredResult
 from benchmarks.figures.rules import RULES, Rule
 from mapweave.hybridmap.errors import InvalidValue
 
@@ -40,7 +40,7 @@ def _shown(figures: Mapping[str, Any], path: str, form: str) -> str:
     return format(value, form)
 
 
-def page(results: Mapping[str, Result]) -> str:
+def page(results: Mapping[str, StoredResult]) -> str:
     """The whole page.
 
     Raises:
@@ -51,7 +51,7 @@ def page(results: Mapping[str, Result]) -> str:
     return "\n\n".join(parts) + "\n"
 
 
-def _question(question: Question, results: Mapping[str, Result]) -> str:
+def _question(question: Question, results: Mapping[str, StoredResult]) -> str:
     lines = [f"## {question.title}", "", "| what | figure | asked | command |", "|---|---|---|---|"]
     before = ""
     for row in question.rows:
@@ -62,7 +62,7 @@ def _question(question: Question, results: Mapping[str, Result]) -> str:
     return "\n".join(lines)
 
 
-def _rules(rules: Sequence[Rule], results: Mapping[str, Result]) -> str:
+def _rules(rules: Sequence[Rule], results: Mapping[str, StoredResult]) -> str:
     lines = [
         "## What fails without each rule", "",
         "A rule that rejects links, answers or frames is switched off by itself; everything else stays.", "",
@@ -79,7 +79,7 @@ def _rules(rules: Sequence[Rule], results: Mapping[str, Result]) -> str:
     return "\n".join(lines)
 
 
-def _measured(results: Mapping[str, Result]) -> str:
+def _measured(results: Mapping[str, StoredResult]) -> str:
     lines = [
         "## When and where", "",
         "`DATA` is the folder of recordings. Minutes are those of the processor.", "",
@@ -92,11 +92,11 @@ def _measured(results: Mapping[str, Result]) -> str:
     return "\n".join(lines)
 
 
-def _command(result: Result) -> str:
+def _command(result: StoredResult) -> str:
     return f"`{result.command.removesuffix(' --json')}`"
 
 
-def _of(results: Mapping[str, Result], name: str) -> Result:
+def _of(results: Mapping[str, StoredResult], name: str) -> StoredResult:
     if name not in results:
         raise InvalidValue(f"no result {name}: python -m benchmarks.figures --run {name}")
     return results[name]

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 
 from benchmarks.figures.page import filled
 from benchmarks.figures.questions import Row
-from benchmarks.figures.results import Result
+from benchmarks.figures.results import StoredResult
 from mapweave.hybridmap.errors import InvalidValue
 
 HEAD = "| what | figure |\n|---|---|\n"
@@ -64,7 +64,7 @@ ROWS = (
 )
 
 
-def with_table(text: str, results: Mapping[str, Result]) -> str:
+def with_table(text: str, results: Mapping[str, StoredResult]) -> str:
     """README.md with the table of stored results.
 
     Raises:

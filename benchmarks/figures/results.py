@@ -21,7 +21,7 @@ FOLDER = Path(__file__).parents[2] / "docs" / "figures"
 
 
 @dataclass(frozen=True)
-class Result:
+class StoredResult:
     """What one command has measured.
 
     Attributes:
@@ -41,7 +41,7 @@ class Result:
     figures: dict[str, Any]
 
 
-def run(command: str, data: Path | None) -> Result:
+def run(command: str, data: Path | None) -> StoredResult:
     """Run a command; what it prints besides the figures goes to standard error.
 
     Raises:
@@ -66,7 +66,7 @@ def run(command: str, data: Path | None) -> Result:
     if not isinstance(figures, dict):
         raise InvalidValue(f"{command}: the last line is no JSON object")
     busy = f", load {load:.0f} from other programs" if load >= 0.5 else ""
-    return Result(
+    return StoredResult(
         command=command,
         date=datetime.now(UTC).date().isoformat(),
         version=version("mapweave"),
@@ -82,14 +82,14 @@ def _processor_s() -> float:
     return usage.ru_utime + usage.ru_stime
 
 
-def store(name: str, result: Result, folder: Path = FOLDER) -> Path:
+def store(name: str, result: StoredResult, folder: Path = FOLDER) -> Path:
     """Write a result to its file."""
     path = folder / f"{name}.json"
     path.write_text(json.dumps(asdict(result), indent=1) + "\n", encoding="utf-8")
     return path
 
 
-def load(name: str, folder: Path = FOLDER) -> Result:
+def load(name: str, folder: Path = FOLDER) -> StoredResult:
     """A stored result.
 
     Raises:
@@ -97,7 +97,7 @@ def load(name: str, folder: Path = FOLDER) -> Result:
     """
     path = folder / f"{name}.json"
     try:
-        return Result(**json.loads(path.read_text(encoding="utf-8")))
+        return StoredResult(**json.loads(path.read_text(encoding="utf-8")))
     except FileNotFoundError:
         raise InvalidFile(f"{path} is missing: python -m benchmarks.figures --run {name}") from None
     except (OSError, ValueError, TypeError) as error:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from benchmarks.figures.results import Result
+from benchmarks.figures.results import StoredResult
 from mapweave.mapserver.server import MERGE_SHARE
 
 STATUS_BYTES = 515
@@ -68,7 +68,7 @@ class Costs:
     carried: int
 
     @staticmethod
-    def of(results: Mapping[str, Result]) -> Costs:
+    def of(results: Mapping[str, StoredResult]) -> Costs:
         """Of stored results."""
         merge, answers = results["merge_scale"].figures["scale"], results["relocalize"].figures
         explored = results["explore"].figures
@@ -93,7 +93,7 @@ class Costs:
 
 
 @dataclass(frozen=True)
-class Plan:
+class ScalePlan:
     """What the fleet needs; of one site unless it says otherwise.
 
     Attributes:
@@ -127,7 +127,7 @@ class Plan:
     merge_s: float
 
     @staticmethod
-    def of(costs: Costs) -> Plan:
+    def of(costs: Costs) -> ScalePlan:
         """By the costs."""
         robots = ROBOTS / SITES
         rate, first = robots * MAPPING / NODE_EVERY, robots / NODE_EVERY
@@ -136,7 +136,7 @@ class Plan:
         steady = STATUSES * (STATUS_BYTES + FRAME_BYTES) + (QUESTION_BYTES + FRAME_BYTES) / QUESTION_EVERY
         link, compare = robots * costs.link_s, rate * costs.compare_s
         answer = robots / QUESTION_EVERY * costs.answer_s
-        return Plan(
+        return ScalePlan(
             node_rate=rate,
             first_rate=first,
             nodes=nodes,
@@ -177,10 +177,10 @@ The [metrics](monitoring.md) show where the plan is wrong: `mapweave_ack_seconds
 (disk). A robot has six series: a site's Prometheus holds under a thousand."""
 
 
-def scale_page(results: Mapping[str, Result]) -> str:
+def scale_page(results: Mapping[str, StoredResult]) -> str:
     """The whole page."""
     costs = Costs.of(results)
-    plan, head = Plan.of(costs), ("what", "formula", "figure", "basis")
+    plan, head = ScalePlan.of(costs), ("what", "formula", "figure", "basis")
     parts = [
         "# Plan for 10 000 robots", INTRODUCTION,
         "## What one of each costs", _table(("what", "cost", "from", "basis"), _costs(costs)),
@@ -234,7 +234,7 @@ def _fleet_rows() -> list[Row]:
     ]
 
 
-def _site(costs: Costs, plan: Plan) -> list[Row]:
+def _site(costs: Costs, plan: ScalePlan) -> list[Row]:
     robots = ROBOTS // SITES
     return [
         ("nodes that stay", "floor × nodes per m² × growth", f"{plan.nodes:.0f}", EXTRAPOLATED),
@@ -258,7 +258,7 @@ def _site(costs: Costs, plan: Plan) -> list[Row]:
     ]  # fmt: skip
 
 
-def _all(plan: Plan) -> list[Row]:
+def _all(plan: ScalePlan) -> list[Row]:
     cores = SITES * math.ceil(plan.cores)
     return [
         ("map servers", "one a site", f"{SITES}", CHOSEN),
@@ -277,7 +277,7 @@ def _all(plan: Plan) -> list[Row]:
     ]  # fmt: skip
 
 
-def _building(costs: Costs, plan: Plan) -> list[Row]:
+def _building(costs: Costs, plan: ScalePlan) -> list[Row]:
     rate, first = SITES * plan.node_rate, SITES * plan.first_rate
     whole = costs.base_bytes + SITES * plan.nodes * costs.kept_bytes
     fronts = math.ceil(ROBOTS / costs.carried) if costs.carried else 0

@@ -19,13 +19,13 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.relocalize.places import Place, joined, mapped, mapped_sites
+from benchmarks.relocalize.places import TruePlace, joined, mapped, mapped_sites
 from benchmarks.relocalize.queries import KINDS, Query, known, nowhere, twins
 from benchmarks.relocalize.score import RIGHT_DEG, RIGHT_M, errors
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.mapserver.relocalization.calibration import COEFFICIENTS, HypothesisSupport, probabilities
-from mapweave.mapserver.relocalization.candidates import MOST_COMPARED, Candidates
+from mapweave.mapserver.relocalization.candidates import MOST_COMPARED, RetrievedNodes
 from mapweave.mapserver.relocalization.place_hypotheses import supported
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
@@ -52,14 +52,14 @@ def gather(seed: int, nodes: int, queries: int, bar: Progress) -> Seen:
     for kind in KINDS:
         asked += known(kind, queries, sites, places, seed, step)
     asked += twins(queries, sites, places, seed, step) + nowhere(queries, seed, step)
-    truth: dict[NodeId, Place] = {place.node.id: place for place in places}
+    truth: dict[NodeId, TruePlace] = {place.node.id: place for place in places}
     index = PlaceIndex()
     index.extend(place.node for place in places)
     relocalizer = Relocalizer(index, lambda node: truth[node].node, joined(places, seed))
     found: Seen = []
     for query in asked:
         ranked = index.query(query.picture.view, MOST_COMPARED)
-        registration = relocalizer.registration.register(Candidates(query.picture.view, ranked))
+        registration = relocalizer.registration.register(RetrievedNodes(query.picture.view, ranked))
         seen = relocalizer.selection.places(registration)
         off = [errors(query, truth.get(place.best.node), place.best_from_robot) for place in seen]
         found.append((supported(seen), [m <= RIGHT_M and deg <= RIGHT_DEG for m, deg in off]))

@@ -95,7 +95,7 @@ class SlowTimedJournal(TimedJournal, SlowJournal):
     """The same, on a slow disk."""
 
 
-class Agent:
+class AgentLink:
     """One robot's link.
 
     Attributes:
@@ -163,12 +163,12 @@ class Reporter:
     def __init__(self) -> None:
         """Begin, with no agent."""
         self._changed = threading.Condition()
-        self._due: list[tuple[float, int, Agent]] = []
+        self._due: list[tuple[float, int, AgentLink]] = []
         self._count, self._closing = 0, False
         self._thread = threading.Thread(target=self._run, name="statuses", daemon=True)
         self._thread.start()
 
-    def add(self, agent: Agent) -> None:
+    def add(self, agent: AgentLink) -> None:
         """An agent is connected: its first status is due."""
         with self._changed:
             heapq.heappush(self._due, (time.monotonic(), self._count, agent))
@@ -197,7 +197,7 @@ class Reporter:
                 heapq.heappush(self._due, (time.monotonic() + agent.report_period, number, agent))
 
 
-def run_schedule(agents: Sequence[Agent], orders: Orders, begin: float, reporter: Reporter) -> None:
+def run_schedule(agents: Sequence[AgentLink], orders: Orders, begin: float, reporter: Reporter) -> None:
     """Nodes of all agents, each at its own times; then the burst, in which none reports."""
     rng = np.random.default_rng([orders.seed, orders.first, 1])
     end = begin + orders.seconds
@@ -227,9 +227,9 @@ def main() -> None:
     orders = Orders(**json.loads(sys.argv[1]))
     stops = 2 + int(orders.seconds / INTERVAL) + -(-orders.burst // 2 // orders.agents)
     jit.load()  # as a robot does before it maps
-    agents, reporter = list[Agent](), Reporter()
+    agents, reporter = list[AgentLink](), Reporter()
     for k in range(orders.count):
-        agents.append(Agent(orders, orders.first + k, stops))
+        agents.append(AgentLink(orders, orders.first + k, stops))
         reporter.add(agents[-1])
         agents[-1].map_on()
     wait_until_acknowledged(agents)
@@ -252,7 +252,7 @@ def main() -> None:
     os._exit(0)
 
 
-def wait_until_acknowledged(agents: Sequence[Agent]) -> None:
+def wait_until_acknowledged(agents: Sequence[AgentLink]) -> None:
     """Until all is acknowledged, or patience ends."""
     end = time.monotonic() + PATIENCE
     while any(agent.waits() for agent in agents) and time.monotonic() < end:

@@ -20,7 +20,7 @@ WIDTH, DEPTH = 5.0, 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class RobotTour:
     """A robot's tour.
 
     Attributes:
@@ -32,7 +32,7 @@ class Drive:
     view: View
 
 
-def drive(robot: int, stops: int, seed: int) -> Drive:
+def drive(robot: int, stops: int, seed: int) -> RobotTour:
     """The tour of one robot; the same in every process."""
     rng = np.random.default_rng([seed, robot])
     map_id, world = MapId(name_of(robot), 1), room(0.0, 0.0, WIDTH, DEPTH, 700, rng)
@@ -44,7 +44,7 @@ def drive(robot: int, stops: int, seed: int) -> Drive:
     changes: list[list[ChangeBody]] = [[NodePut(nodes[0])]]
     changes += [[NodePut(node), EdgePut(edge)] for node, edge in zip(nodes[1:], edges, strict=True)]
     beside = poses[0] @ Pose2.from_vector(rng.normal(0.0, [0.1, 0.1, 0.1]))
-    return Drive(changes, take_view(world, beside, rng, SENSING)[0])
+    return RobotTour(changes, take_view(world, beside, rng, SENSING)[0])
 
 
 def name_of(robot: int) -> str:

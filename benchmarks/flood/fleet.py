@@ -34,7 +34,7 @@ PERIOD = 1.0
 and one that is lost asks as often."""
 
 
-class Room:
+class FloodRoom:
     """A room of which a robot has a map.
 
     Attributes:
@@ -82,7 +82,7 @@ class HonestRobot:
         """Connect."""
         self.name = f"r{number}"
         self._bus = ZenohBus(BusSettings(endpoints=(endpoint,)))
-        self._room = Room(self.name, 20.0 * number - 200.0, seed + number)
+        self._room = FloodRoom(self.name, 20.0 * number - 200.0, seed + number)
         self._journal = Journal(folder / f"{self.name}.sqlite", self.name)
         self._map = self._journal.open_map(1)
         self._replicator = Replicator(self._bus, Keys(FLEET), self._journal, self._map, ["s0"])

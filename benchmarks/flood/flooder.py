@@ -9,7 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.flood.fleet import FLEET, Room
+from benchmarks.flood.fleet import FLEET, FloodRoom
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.query import KnownRequest, RouteRequest
@@ -43,7 +43,7 @@ class Flooder:
         """
         self._name, self._keys, self._rate = name, Keys(FLEET), rate
         self._bus = ZenohBus(BusSettings(endpoints=(endpoint,)))
-        self._room = Room(self._name, 50.0, seed)
+        self._room = FloodRoom(self._name, 50.0, seed)
         self._logs: dict[int, dict[int, bytes]] = {}
         self._bus.serve(self._keys.logs(self._name), self._answer)
 

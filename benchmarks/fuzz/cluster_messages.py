@@ -8,10 +8,9 @@ from itertools import pairwise
 from pathlib import Path
 
 from mapweave.hybridmap.node import Node
-from mapweave.mapserver.cluster.frames import Reply, Request
+from mapweave.mapserver.cluster.frames import GatewayReply, GatewayRequest
 from mapweave.mapserver.cluster.messages import (
     Ask,
-    Change,
     ComparedNodes,
     Comparison,
     ComparisonAnswer,
@@ -20,6 +19,7 @@ from mapweave.mapserver.cluster.messages import (
     Nearest,
     Overlaps,
     Question,
+    ShardChange,
     ShardRequest,
     State,
     answer_message,
@@ -43,7 +43,7 @@ class ClusterMessages:
         nearest, overlaps = Nearest(nodes[0].landmarks.codes), Overlaps(ComparedNodes.of(nodes[:1]))
         server = ShardServer()
         state: State = decoded(server.call(encoded(Hello())), State)
-        change = Change(state, ComparedNodes.of(nodes[:2]), Ids.of([nodes[2].id]))
+        change = ShardChange(state, ComparedNodes.of(nodes[:2]), Ids.of([nodes[2].id]))
         readers: list[tuple[Callable[[bytes], object], list[bytes]]] = [
             (server.call, [encoded(Ask(state, encoded(nearest)))]),
             (lambda data: _nodes(decoded(data, ShardRequest)), [encoded(change)]),
@@ -54,8 +54,8 @@ class ClusterMessages:
             (lambda data: decoded(data, ComparisonAnswer).verdicts_on(pairs),
              [encoded(ComparisonAnswer.of(compare(pairs)))]),
             (lambda data: decoded(data, State), [encoded(state)]),
-            (Request.read, [Request(7, 2, b"abc").packed()]),
-            (Reply.read, [Reply(7, words="it failed").packed()]),
+            (GatewayRequest.read, [GatewayRequest(7, 2, b"abc").packed()]),
+            (GatewayReply.read, [GatewayReply(7, words="it failed").packed()]),
         ]  # fmt: skip
         self._read = [read for read, _ in readers]
         self.samples = [bytes([k]) + one for k, (_, some) in enumerate(readers) for one in some]
@@ -67,7 +67,7 @@ class ClusterMessages:
 
 
 def _nodes(request: ShardRequest) -> list[Node]:
-    return request.nodes.nodes if isinstance(request, Change) else []
+    return request.nodes.nodes if isinstance(request, ShardChange) else []
 
 
 @cache

@@ -38,7 +38,7 @@ from mapweave.hybridmap.query import (
     Whereabouts,
 )
 from mapweave.identities.key_folder import KeyFolder, Profile
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.offline_merge import merge_parts
@@ -150,7 +150,9 @@ class Samples:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "s0.sqlite"
             store = SqliteStore(path)
-            entries = [Entry(change.sequence, encode_change(change), change) for change in self.changes]
+            entries = [
+                ReceivedChange(change.sequence, encode_change(change), change) for change in self.changes
+            ]
             store.apply(self.map_id, 5, entries)
             store.close()
             return _whole_database(path)

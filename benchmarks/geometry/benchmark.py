@@ -63,7 +63,7 @@ of a turn that is the same in each step, rad."""
 
 
 @dataclass(frozen=True)
-class Result:
+class ReplayResult:
     """One replay.
 
     Attributes:
@@ -83,7 +83,7 @@ class Result:
     causes: tuple[Cause, ...]
 
 
-def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: float) -> Result:
+def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: float) -> ReplayResult:
     """Map a recording as an agent does.
 
     Args:
@@ -123,7 +123,7 @@ def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: fl
     pipeline.finish()
     nodes += len(pipeline.map.nodes)
     causes = tuple(pipeline.calibration.causes)
-    return Result(_error(mapped, true), _error(by_wheels, true), used / count, nodes, maps, causes)
+    return ReplayResult(_error(mapped, true), _error(by_wheels, true), used / count, nodes, maps, causes)
 
 
 def _error(estimated: list[Pose2], true: list[Pose2]) -> float:
@@ -178,7 +178,7 @@ def run(
     table = Table("declared", "error, m", "ratio", "wheels alone, m", "used", "nodes", "maps", "named")
     base = replay(opened(), description, truth, right.forward)
 
-    def row(label: str, result: Result) -> None:
+    def row(label: str, result: ReplayResult) -> None:
         named = ", ".join(
             f"{c.parameter.name.lower()} {c.estimated:.3f} ({c.declared:.3f})" for c in result.causes
         )

@@ -49,7 +49,7 @@ FLOAT, OURS = "float sift", "ours"
 
 
 @dataclass(eq=False)
-class Tally:
+class KeptMatches:
     """What one way has kept, over pairs.
 
     Attributes:
@@ -65,10 +65,10 @@ class Tally:
     sources: list[str] = field(default_factory=list)
 
 
-def measure(pairs: Iterable[Pair], seed: int) -> tuple[dict[str, Tally], list[Packed]]:
+def measure(pairs: Iterable[Pair], seed: int) -> tuple[dict[str, KeptMatches], list[Packed]]:
     """Keep all views in all ways, and match."""
     rng = np.random.default_rng([seed, 3])
-    tallies: dict[str, Tally] = {}
+    tallies: dict[str, KeptMatches] = {}
     nodes: list[Packed] = []
     for pair in pairs:
         found = [features(image, pair.camera) for image in (pair.first, pair.second)]
@@ -77,7 +77,7 @@ def measure(pairs: Iterable[Pair], seed: int) -> tuple[dict[str, Tally], list[Pa
         packed = pack(*found[0], pair, rng)
         nodes.append(packed)
         for name, (first, second) in keep_all(pair, packed, found).items():
-            tally = tallies.setdefault(name, Tally())
+            tally = tallies.setdefault(name, KeptMatches())
             matches, right = matched(name, pair, first, second)
             tally.right.append(right)
             tally.matches.append(matches)
@@ -86,7 +86,7 @@ def measure(pairs: Iterable[Pair], seed: int) -> tuple[dict[str, Tally], list[Pa
     return tallies, nodes
 
 
-def figures(tallies: dict[str, Tally]) -> dict[str, dict[str, float]]:
+def figures(tallies: dict[str, KeptMatches]) -> dict[str, dict[str, float]]:
     """Each way beside SIFT in floats, on the pairs that that one matches."""
     best = np.array(tallies[FLOAT].right)
     good = best >= LEAST_RIGHT
@@ -153,17 +153,17 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, Any]:
     return result
 
 
-def _of(tallies: dict[str, Tally], source: str) -> dict[str, Tally]:
+def _of(tallies: dict[str, KeptMatches], source: str) -> dict[str, KeptMatches]:
     """The tallies of one kind of pairs."""
     out = {}
     for name, tally in tallies.items():
         those = [k for k, one in enumerate(tally.sources) if one == source]
         right, matches, sizes = ([c[k] for k in those] for c in (tally.right, tally.matches, tally.sizes))
-        out[name] = Tally(right, matches, sizes)
+        out[name] = KeptMatches(right, matches, sizes)
     return out
 
 
-def _matched(tallies: dict[str, Tally], source: str) -> bool:
+def _matched(tallies: dict[str, KeptMatches], source: str) -> bool:
     return max(_of(tallies, source)[FLOAT].right) >= LEAST_RIGHT
 
 

@@ -44,7 +44,7 @@ COLOURS = {"chosen": "#d35400", "strongest": "#1f77b4", "before": "#999999"}
 
 
 @dataclass(frozen=True, eq=False)
-class Site:
+class MappedSite:
     """A place as a robot has mapped it, and views that ask for it.
 
     Attributes:
@@ -77,7 +77,7 @@ def recall_curve(seed: int, places: int, console: Console) -> dict[str, dict[str
     }
 
 
-def _kept(site: Site, way: str, budget: int) -> NDArray[np.int64]:
+def _kept(site: MappedSite, way: str, budget: int) -> NDArray[np.int64]:
     settings = SelectionSettings(budget)
     if way == "before":
         return np.arange(min(len(site.every), (budget - FIXED_BYTES) // BYTES_BEFORE))
@@ -86,7 +86,7 @@ def _kept(site: Site, way: str, budget: int) -> NDArray[np.int64]:
     return chosen if way == "chosen" else np.arange(len(chosen))
 
 
-def _recognised(site: Site, kept: NDArray[np.int64]) -> int:
+def _recognised(site: MappedSite, kept: NDArray[np.int64]) -> int:
     """How many of the views are recognised, and rightly."""
     landmarks, _ = settle(site.every.take(kept), site.camera)
     here = PoseGaussian(Pose2(), np.zeros((3, 3)))
@@ -100,7 +100,7 @@ def _recognised(site: Site, kept: NDArray[np.int64]) -> int:
     return hits
 
 
-def _site(rng: np.random.Generator) -> Site:
+def _site(rng: np.random.Generator) -> MappedSite:
     """The next place that shows enough."""
     while True:
         place = SimulatedPlace.draw(rng)
@@ -121,7 +121,7 @@ def _site(rng: np.random.Generator) -> Site:
             depths[good].astype(np.float32), sigmas[good].astype(np.float32),
         )  # fmt: skip
         likely = worth(seen[good], good / len(features))
-        return Site(place.camera, every, likely, tuple(_view(place, sift, rng) for _ in range(QUERIES)))
+        return MappedSite(place.camera, every, likely, tuple(_view(place, sift, rng) for _ in range(QUERIES)))
 
 
 def _again(place: SimulatedPlace, points: Array, sift: Sift, at: Pose2) -> NDArray[np.bool_]:

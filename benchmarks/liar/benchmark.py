@@ -45,8 +45,8 @@ from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
 from mapweave.merge.pose_graph.staged_optimization import StagedOptimization
 from mapweave.merge.torn_maps import TornMapSearch
 from mapweave.scenarios.liar.lies import EVERY, WAYS, Map
-from mapweave.scenarios.liar.trial import Outcome, Trial, row, totals
-from synthetic.wrong_geometry import ODD, SCENES, Fault, Fleet, draw_fleet, lost_views
+from mapweave.scenarios.liar.trial import ContainmentOutcome, LiarTrial, row, totals
+from synthetic.wrong_geometry import ODD, SCENES, FaultyFleet, OdometryFault, draw_fleet, lost_views
 
 SCENE = "house"
 CLOCK, RADIUS, APART_S = "utc", 0.16, 10_000
@@ -89,9 +89,9 @@ RULES: dict[str, tuple[Switch, ...]] = {
 """What contains lies, each with what takes its place when it is switched off."""
 
 
-def draw(seed: int) -> tuple[Fleet, dict[MapId, Map]]:
+def draw(seed: int) -> tuple[FaultyFleet, dict[MapId, Map]]:
     """A fleet whose robots have clocks and footprints."""
-    fleet = draw_fleet(seed, SCENES[SCENE], Fault.NONE, stops=3)
+    fleet = draw_fleet(seed, SCENES[SCENE], OdometryFault.NONE, stops=3)
     maps: dict[MapId, Map] = {}
     for number, (map_id, (nodes, edges)) in enumerate(fleet.maps.items()):
         later = number * APART_S * 1_000_000_000
@@ -102,15 +102,17 @@ def draw(seed: int) -> tuple[Fleet, dict[MapId, Map]]:
     return fleet, maps
 
 
-def drawn_trial(seed: int, queries: int, folder: Path) -> Trial:
+def drawn_trial(seed: int, queries: int, folder: Path) -> LiarTrial:
     """Three robots map the house, and a fourth one is to lie."""
     fleet, maps = draw(seed)
     honest_truth = {node: pose for node, pose in fleet.truth.items() if node.map != ODD}
     views = lost_views(replace(fleet, truth=honest_truth), SCENES[SCENE], queries, seed)
-    return Trial(ODD, maps, views, honest_truth, seed, folder)
+    return LiarTrial(ODD, maps, views, honest_truth, seed, folder)
 
 
-def tried(seed: int, queries: int, ways: Sequence[str], rule: str) -> Iterator[tuple[str, Outcome]]:
+def tried(
+    seed: int, queries: int, ways: Sequence[str], rule: str
+) -> Iterator[tuple[str, ContainmentOutcome]]:
     """What becomes of an honest fourth robot and of each way to lie, without a rule; with all for `ALL`."""
     with switched_off(RULES.get(rule, ())), tempfile.TemporaryDirectory() as folder:
         trial = drawn_trial(seed, queries, Path(folder))
@@ -143,7 +145,7 @@ def main() -> None:
         if arguments.rules:
             found = _by_rule(arguments, progress)
         else:
-            outcomes: dict[str, Outcome] = {}
+            outcomes: dict[str, ContainmentOutcome] = {}
             rule = arguments.without or ALL
             each = tried(arguments.seed, arguments.queries, arguments.ways, rule)
             for name, one in progress.track(each, len(arguments.ways) + 1, description="ways"):

@@ -36,14 +36,14 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks.command_line import command_line
-from benchmarks.life.house import House
+from benchmarks.life.house import TwoRooms
 from benchmarks.process_usage import held_bytes
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty, View
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.active_nodes import ActiveNodes
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.merging.merger import Merger
@@ -70,7 +70,7 @@ LEFT_OUT = Superseded(NodeId("none", 0, 0), 0, 0.0, 0.0)
 
 
 @dataclass(frozen=True)
-class Drive:
+class MapAfterDrive:
     """What the map is after a drive.
 
     Attributes:
@@ -124,11 +124,11 @@ def main() -> None:
 
 def run(
     drives: int, seed: int, stops: int, moved: float, queries: int, keep_days: float, console: Console
-) -> tuple[dict[str, float | list[float]], list[Drive]]:
+) -> tuple[dict[str, float | list[float]], list[MapAfterDrive]]:
     """All drives, then the questions; see the module."""
     rng = np.random.default_rng([seed, 0x11FE])
-    house = House.built(rng)
-    merger, merged, curve = Merger(), MergedMap.empty(), list[Drive]()
+    house = TwoRooms.built(rng)
+    merger, merged, curve = Merger(), MergedMap.empty(), list[MapAfterDrive]()
     truth: dict[NodeId, Pose2] = {}
     folder = TemporaryDirectory()
     path, early = Path(folder.name) / "store.db", SqliteStore(Path(folder.name) / "early.db")
@@ -143,7 +143,7 @@ def run(
         truth |= {node.id: pose for node, pose in zip(nodes, tour, strict=True)}
         map_id = MapId("r0", epoch)
         changes = numbered(map_id, changes_of(nodes, edges), stamp_ns=now_ns)
-        entries = [Entry.read(map_id, one.sequence, encode_change(one)) for one in changes]
+        entries = [ReceivedChange.read(map_id, one.sequence, encode_change(one)) for one in changes]
         began = time.process_time()
         for change in changes:
             merger.on_change(change)
@@ -159,7 +159,7 @@ def run(
                 store.prune(plan.nodes, plan.edges, merger.pruning.records(plan))
                 merger.prune(plan)
         counts = len(merged.poses) - old, old, len(merged.pruned), len(merged.components)
-        curve.append(Drive(*counts, node_ms, spent, held_bytes() - at_first, path.stat().st_size))
+        curve.append(MapAfterDrive(*counts, node_ms, spent, held_bytes() - at_first, path.stat().st_size))
         if epoch <= EARLY[-1]:
             early.apply(map_id, 1, entries)
         console.print(
@@ -210,13 +210,13 @@ def driven_through(store: Store, drives: int) -> Merger:
     return merger
 
 
-def in_the_long_run(curve: Sequence[Drive]) -> dict[str, float | list[float]]:
+def in_the_long_run(curve: Sequence[MapAfterDrive]) -> dict[str, float | list[float]]:
     """What the last drives cost by those about the fiftieth."""
     if len(curve) < FIFTIETH + 2 * SOME:
         return {}
     about, last = curve[FIFTIETH - 1 - SOME // 2 :][:SOME], curve[-SOME:]
 
-    def ratio(cost: Callable[[Drive], float]) -> float:
+    def ratio(cost: Callable[[MapAfterDrive], float]) -> float:
         return round(sum(map(cost, last)) / sum(map(cost, about)), 3)
 
     return {

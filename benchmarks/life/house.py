@@ -26,8 +26,8 @@ THING = 40
 
 
 @dataclass(frozen=True, eq=False)
-class House(World):
-    """Both rooms; a robot sees only the one in which it stands.
+class TwoRooms(World):
+    """Both rooms of the house; a robot sees only the one in which it stands.
 
     Attributes:
         rooms: (N,) which room each landmark is in.
@@ -36,11 +36,11 @@ class House(World):
     rooms: NDArray[np.int64]
 
     @staticmethod
-    def built(rng: np.random.Generator) -> House:
+    def built(rng: np.random.Generator) -> TwoRooms:
         """With furniture where it is at first."""
         both = [room(*place, LANDMARKS, rng) for place in ROOMS]
         whole = both[0] + both[1]
-        return House(whole.points, whole.normals, whole.vectors, np.repeat([0, 1], LANDMARKS))
+        return TwoRooms(whole.points, whole.normals, whole.vectors, np.repeat([0, 1], LANDMARKS))
 
     def visible(
         self, world_from_robot: Pose2, camera: Camera, reach: float
@@ -50,7 +50,7 @@ class House(World):
         here = int(world_from_robot.x > ROOMS[1][0])
         return seen[self.rooms[seen] == here], in_robot
 
-    def refurnished(self, share: float, rng: np.random.Generator) -> House:
+    def refurnished(self, share: float, rng: np.random.Generator) -> TwoRooms:
         """Things are gone, and others have come elsewhere in the room: neighbouring landmarks go together.
 
         Args:

@@ -22,7 +22,7 @@ from mapweave.agent.exploration.behaviours import DRIVE, LEAST_FEATURES
 from mapweave.agent.mapping.anchored_keyframe import HERE
 from mapweave.agent.mapping.mapper import DEPTHS_PER_HEIGHT
 from mapweave.agent.mapping.tracking import Tracking
-from mapweave.agent.mapping.view import View
+from mapweave.agent.mapping.view import PendingKeyframe
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.servo.image_drive import ImageDrive
 from mapweave.agent.settings import AgentSettings
@@ -48,7 +48,7 @@ WALK_FROM, WALK_FOR = 0.3, 0.4
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class RunTick:
     """One tick of a run.
 
     Attributes:
@@ -101,7 +101,7 @@ class MappingDrive:
     ids: NDArray[np.int64]
     points: Array
     flat: NDArray[np.bool_]
-    moments: tuple[Moment, ...]
+    moments: tuple[RunTick, ...]
     images: dict[int, NDArray[np.uint8]]
     given_up: str
 
@@ -186,7 +186,7 @@ class _Run:
         self.world_from_anchor = simulation.truth(NAME)
         self.anchor = self._begin(observation, Sift(lens, settings.sift))
         self.wheels = Pose2()
-        self.moments: list[Moment] = []
+        self.moments: list[RunTick] = []
         self.images: list[NDArray[np.uint8] | None] = []
         self.given_up = ""
         self._write(Observation(observation.stamp_ns, Odometry(0.0, 0.0), observation.image), 0.0)
@@ -235,7 +235,7 @@ class _Run:
             tuple(self.moments), self._telling(), self.given_up,
         )  # fmt: skip
 
-    def _begin(self, observation: Observation, sift: Sift) -> View:
+    def _begin(self, observation: Observation, sift: Sift) -> PendingKeyframe:
         """Make the image the anchor view of an episode, as the mapper does."""
         if observation.image is None:
             raise InvalidValue("the camera gave no first image")
@@ -248,7 +248,7 @@ class _Run:
 
     def _write(self, observation: Observation, step_ms: float) -> None:
         world_from_robot = self.simulation.truth(NAME)
-        moment = Moment(
+        moment = RunTick(
             observation.odometry, self.world_from_anchor.inverse() @ world_from_robot, self.wheels,
             self.tracking.pose, self.tracking.landmarks(), self.tracking.ids.copy(),
             self.tracking.pixels.copy(), not self.tracking.acceptance.doubtful,
@@ -264,7 +264,7 @@ class _Run:
         return {k: image for k, image in enumerate(self.images) if image is not None and k in
                 (numbers[0], between, numbers[-1])}  # fmt: skip
 
-    def _worth(self, moment: Moment) -> float:
+    def _worth(self, moment: RunTick) -> float:
         alone = math.isnan(moment.person)
         return math.hypot(moment.true.x, moment.true.y) if alone else 10.0 - abs(moment.person)
 

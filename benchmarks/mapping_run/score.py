@@ -9,7 +9,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.mapping_run.scene import MappingDrive, Moment
+from benchmarks.mapping_run.scene import MappingDrive, RunTick
 from mapweave.agent.ekf.inverse_depth import rays_of_points
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.ekf.mapping_filter import CONVERGED_SHARE, CONVERGED_SIGMA
@@ -67,7 +67,7 @@ def landmark_nees(estimates: LandmarkEstimates, points_in_robot: Array, camera: 
     return out
 
 
-def track_errors(run: MappingDrive, moment: Moment) -> Array:
+def track_errors(run: MappingDrive, moment: RunTick) -> Array:
     """(N, 2) px, tracks less where their points truly are; NaN for those that are no points."""
     points, flat = run.truth(moment.ids)
     off = moment.pixels - run.robot.camera.project(moment.true.inverse().apply(points))
@@ -75,7 +75,7 @@ def track_errors(run: MappingDrive, moment: Moment) -> Array:
     return off
 
 
-def reprojection_errors(run: MappingDrive, moment: Moment) -> Array:
+def reprojection_errors(run: MappingDrive, moment: RunTick) -> Array:
     """(N, 2) px, tracks that are landmarks less where the filter then has these."""
     known = moment.landmarks
     _, tracks, held = np.intersect1d(moment.ids, known.ids, return_indices=True)

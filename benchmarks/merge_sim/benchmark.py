@@ -47,7 +47,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 from benchmarks.command_line import command_line
-from benchmarks.merge_sim.run import Run
+from benchmarks.merge_sim.run import MergeRun
 
 SCENARIOS: dict[str, tuple[str, ...]] = {
     "office": ("office",),
@@ -77,7 +77,7 @@ class Failure:
     reason: str
 
 
-class Runner:
+class RunPool:
     """Runs in processes of their own; those under way can be ended."""
 
     def __init__(self) -> None:
@@ -86,7 +86,7 @@ class Runner:
         self._under_way: set[subprocess.Popen[str]] = set()
         self._ended = False
 
-    def run(self, name: str, seed: int) -> Run | Failure:
+    def run(self, name: str, seed: int) -> MergeRun | Failure:
         """Run one and wait for it."""
         scenario, *overrides = SCENARIOS[name]
         command = [sys.executable, "-m", "benchmarks.merge_sim.run", scenario, str(seed), *overrides]
@@ -121,7 +121,7 @@ class Runner:
                 process.kill()
 
 
-def outcome(name: str, seed: int, status: int, out: str, said: str) -> Run | Failure:
+def outcome(name: str, seed: int, status: int, out: str, said: str) -> MergeRun | Failure:
     """What a process that has ended says of its run."""
     if status < 0:
         return Failure(name, seed, f"was killed by signal {-status}")
@@ -129,12 +129,12 @@ def outcome(name: str, seed: int, status: int, out: str, said: str) -> Run | Fai
     if status > 0:
         return Failure(name, seed, lines[-1] if lines else f"ended with status {status}")
     try:
-        return Run(**json.loads(out.splitlines()[-1]))
+        return MergeRun(**json.loads(out.splitlines()[-1]))
     except (IndexError, TypeError, ValueError):
         return Failure(name, seed, "said nothing that can be read")
 
 
-def figures(runs: Sequence[Run]) -> dict[str, float | None]:
+def figures(runs: Sequence[MergeRun]) -> dict[str, float | None]:
     """The figures of some runs of one scenario."""
     errors = [run.merged_ate_m for run in runs if run.merged_ate_m is not None]
     chances = [run.place_recall for run in runs if run.place_recall is not None]
@@ -154,9 +154,9 @@ def figures(runs: Sequence[Run]) -> dict[str, float | None]:
     }
 
 
-def summary(seed: int, names: Iterable[str], results: Sequence[Run | Failure]) -> dict[str, Any]:
+def summary(seed: int, names: Iterable[str], results: Sequence[MergeRun | Failure]) -> dict[str, Any]:
     """All figures, for JSON: each by scenario; then each run, and what failed."""
-    done = [one for one in results if isinstance(one, Run)]
+    done = [one for one in results if isinstance(one, MergeRun)]
     by_name = {name: figures([run for run in done if run.scenario == name]) for name in names}
     columns = {figure: {name: by_name[name][figure] for name in by_name} for figure in figures([])}
     rounded = {
@@ -174,12 +174,12 @@ def summary(seed: int, names: Iterable[str], results: Sequence[Run | Failure]) -
 
 def measure(
     names: Sequence[str], runs: int, seed: int, workers: int, console: Console
-) -> list[Run | Failure]:
+) -> list[MergeRun | Failure]:
     """Run all, some at a time; what fails is said at once."""
     # One of each in turn: a benchmark that is stopped early has seen something of all.
     wanted = [(name, SEEDS_APART * seed + k) for k in range(runs) for name in names]
-    results: dict[tuple[str, int], Run | Failure] = {}
-    runner = Runner()
+    results: dict[tuple[str, int], MergeRun | Failure] = {}
+    runner = RunPool()
     columns = (
         TextColumn("{task.description}"), BarColumn(bar_width=30), MofNCompleteColumn(), TimeElapsedColumn(),
     )  # fmt: skip

@@ -40,7 +40,7 @@ SIDE = math.radians(45.0)
 
 
 @dataclass(frozen=True)
-class Run:
+class MergeRun:
     """What one run has come to.
 
     Attributes:
@@ -84,7 +84,7 @@ class Run:
     wall_s: float
 
 
-def run_one(scenario: Scenario, seed: int, out: Path) -> Run:
+def run_one(scenario: Scenario, seed: int, out: Path) -> MergeRun:
     """Simulate and score.
 
     Raises:
@@ -99,7 +99,7 @@ def run_one(scenario: Scenario, seed: int, out: Path) -> Run:
     one_side = shared_views(scenario, seed, truth, SIDE)
     found = [verify(whole.nodes[a], whole.nodes[b]) for a, b in sorted(sorted(pair) for pair in one_side)]
     right = {frozenset((link.a, link.b)) for link in links if not is_false(link, truth)}
-    return Run(
+    return MergeRun(
         scenario=scenario.name,
         seed=seed,
         nodes=figures.nodes,

@@ -32,14 +32,14 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from benchmarks.command_line import command_line
-from benchmarks.navigate.drives import Outcome, drive
-from benchmarks.navigate.floor import Floor
+from benchmarks.navigate.drives import NavigationOutcome, drive
+from benchmarks.navigate.floor import FreeFloor
 from benchmarks.navigate.map import Figures, map_figures
 from benchmarks.navigate.office import TRUTH, Mapped, Office
 from benchmarks.navigate.pictures import draw
 from benchmarks.navigate.plots import draw_plot
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 from mapweave.sim.robots import RobotSetup
 
 WIDTH = 140
@@ -67,7 +67,7 @@ def main() -> None:
         print(json.dumps({"seed": arguments.seed, "nodes": len(mapped.truth), **figures}))
 
 
-def summary(outcomes: Sequence[Outcome]) -> Figures:
+def summary(outcomes: Sequence[NavigationOutcome]) -> Figures:
     """The figures of all drives. Errors and ratios are medians over the drives that said they had arrived."""
     there = [one for one in outcomes if one.status.finished]
     tallies = [one.status.tally for one in outcomes]
@@ -104,7 +104,9 @@ def _arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _run(arguments: argparse.Namespace, console: Console) -> tuple[list[Outcome], Mapped, FloorPlan, Figures]:
+def _run(
+    arguments: argparse.Namespace, console: Console
+) -> tuple[list[NavigationOutcome], Mapped, BuildingPlan, Figures]:
     if arguments.runs < 1:
         raise InvalidValue(f"--runs {arguments.runs}: at least one drive")
     folder = arguments.out / f"map-{arguments.seed}-{arguments.rooms}-{arguments.map_time:g}"
@@ -116,7 +118,7 @@ def _run(arguments: argparse.Namespace, console: Console) -> tuple[list[Outcome]
         # Another day: the robot is switched on with the map on its disk, and must localize.
         with Office(folder, arguments.seed, arguments.rooms) as office:
             mapped, plan, before = office.mapped(), office.control.plan(), office.merged()
-            floor = Floor.of(plan, RobotSetup("r0").describe().radius)
+            floor = FreeFloor.of(plan, RobotSetup("r0").describe().radius)
             outcomes = []
             for run in range(arguments.runs):
                 plot = draw_plot(mapped, plan, floor, np.random.default_rng([arguments.seed, run, 0xD21]))
@@ -146,7 +148,7 @@ def _shown(progress: Progress, task: object, run: int) -> Callable[[float, str],
     return show
 
 
-def _table(outcomes: Sequence[Outcome], seed: int) -> Table:
+def _table(outcomes: Sequence[NavigationOutcome], seed: int) -> Table:
     """A drive a row."""
     table = Table(title=f"seed {seed}")
     for name in ("drive", "goal", "edges", "found s", "time s", "mm", "deg", "way", "driven", "skipped",

@@ -24,7 +24,7 @@ LOOK_EVERY = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class NavigationOutcome:
     """One drive as it was driven.
 
     Attributes:
@@ -68,7 +68,7 @@ class Outcome:
         return self.driven / max(self.plot.shortest, 1e-9)
 
 
-def drive(office: Office, plot: Plot, on_time: Callable[[float, str], None]) -> Outcome:
+def drive(office: Office, plot: Plot, on_time: Callable[[float, str], None]) -> NavigationOutcome:
     """Drive once; the robot knows its map and nothing of where it is.
 
     Args:
@@ -98,7 +98,7 @@ def drive(office: Office, plot: Plot, on_time: Callable[[float, str], None]) -> 
     error_m, error_deg = math.hypot(error.x, error.y), math.degrees(abs(wrap_angle(error.heading)))
     track = office.control.trajectory(ROBOT)[1][begin : office.ticks + 1, :2]
     collisions = truth.collisions - before
-    return Outcome(
+    return NavigationOutcome(
         plot,
         status,
         _reason(status, error_m, error_deg, collisions),

@@ -11,7 +11,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import dijkstra
 
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 
 AWAY = 0.25
 """A pose counts as standing on the free floor this near to one of its cells, m."""
@@ -20,7 +20,7 @@ NEIGHBOURS = ((0, 1), (1, 0), (1, 1), (1, -1), (1, 2), (2, 1), (1, -2), (2, -1))
 
 
 @dataclass(frozen=True, eq=False)
-class Floor:
+class FreeFloor:
     """Where a round robot can stand, as a graph of cells.
 
     Attributes:
@@ -32,7 +32,7 @@ class Floor:
     steps: coo_array
 
     @staticmethod
-    def of(plan: FloorPlan, radius: float) -> Floor:
+    def of(plan: BuildingPlan, radius: float) -> FreeFloor:
         """The free floor of a building.
 
         Args:
@@ -55,19 +55,19 @@ class Floor:
         steps = coo_array(
             (np.concatenate(lengths), (np.concatenate(begins), np.concatenate(ends))), shape=(count, count)
         )
-        return Floor(grid.centres[free], steps)
+        return FreeFloor(grid.centres[free], steps)
 
-    def ways_from(self, place: Pose2) -> Ways:
+    def ways_from(self, place: Pose2) -> ShortestWays:
         """The shortest ways from a place to everywhere."""
         gaps = np.hypot(*(self.cells - [place.x, place.y]).T)
         nearest = int(gaps.argmin())
         reached = gaps[nearest] <= AWAY
         lengths = dijkstra(self.steps, directed=False, indices=nearest)
-        return Ways(self.cells, place, lengths if reached else np.full(len(self.cells), np.inf))
+        return ShortestWays(self.cells, place, lengths if reached else np.full(len(self.cells), np.inf))
 
 
 @dataclass(frozen=True, eq=False)
-class Ways:
+class ShortestWays:
     """Shortest ways from one place.
 
     Attributes:

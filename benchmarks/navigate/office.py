@@ -17,7 +17,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.hybridmap.pose import Pose2
-from mapweave.scenarios.fleet import SERVER, TICKS_PER_SECOND, Stage
+from mapweave.scenarios.fleet import SERVER, TICKS_PER_SECOND, TrialStage
 from mapweave.scenarios.local_fleet import LocalFleet
 from mapweave.scenarios.reports import Reports
 from mapweave.scenarios.scenario import load_scenario, scenario_path
@@ -57,7 +57,7 @@ class Office:
         scenario = load_scenario(scenario_path("office"), ["robots=1", f"world.rooms={rooms}"])
         scenario = replace(scenario, missions={ROBOT: "idle"})
         self._folder = folder
-        self._fleet = LocalFleet(Stage(scenario, seed, folder, AgentSettings()))
+        self._fleet = LocalFleet(TrialStage(scenario, seed, folder, AgentSettings()))
         self.control = self._fleet.control
         self.ticks = 0
 

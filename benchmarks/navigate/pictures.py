@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.navigate.drives import Outcome
+from benchmarks.navigate.drives import NavigationOutcome
 from benchmarks.navigate.office import ROBOT, Mapped
-from mapweave.drawing.map_picture import Drive, MapPicture, draw_map, outline_of
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.drawing.map_picture import DrawnDrive, MapPicture, draw_map, outline_of
+from mapweave.sim.floorplan import BuildingPlan
 
 MOST = 6
 """Drives whose views are shown: failures first, then the first ones."""
@@ -19,7 +19,9 @@ GAIN = 3.0
 """By how much the difference of two views is exaggerated."""
 
 
-def draw(outcomes: Sequence[Outcome], mapped: Mapped, plan: FloorPlan, folder: Path) -> tuple[Path, ...]:
+def draw(
+    outcomes: Sequence[NavigationOutcome], mapped: Mapped, plan: BuildingPlan, folder: Path
+) -> tuple[Path, ...]:
     """Write fig11.png and drives.png into a folder that is there; returns their names."""
     views, ways = folder / "fig11.png", folder / "drives.png"
     _draw_views(outcomes, views)
@@ -27,7 +29,7 @@ def draw(outcomes: Sequence[Outcome], mapped: Mapped, plan: FloorPlan, folder: P
     return views, ways
 
 
-def _draw_views(outcomes: Sequence[Outcome], path: Path) -> None:
+def _draw_views(outcomes: Sequence[NavigationOutcome], path: Path) -> None:
     """Figure 11: a drive a row: desired view, reached view, their difference."""
     # It takes long to import, which tests that draw nothing do not wait for.
     from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -52,15 +54,15 @@ def _draw_views(outcomes: Sequence[Outcome], path: Path) -> None:
     figure.savefig(path, format="png")
 
 
-def _difference(one: Outcome) -> NDArray[np.uint8]:
+def _difference(one: NavigationOutcome) -> NDArray[np.uint8]:
     """Grey where the views are the same."""
     off = one.reached.astype(np.float64) - one.desired.astype(np.float64)
     return np.clip(128.0 + GAIN * off, 0, 255).astype(np.uint8)
 
 
-def _draw_ways(outcomes: Sequence[Outcome], mapped: Mapped, plan: FloorPlan, path: Path) -> None:
+def _draw_ways(outcomes: Sequence[NavigationOutcome], mapped: Mapped, plan: BuildingPlan, path: Path) -> None:
     drives = tuple(
-        Drive(
+        DrawnDrive(
             one.track,
             one.plot.world_from_robot,
             one.plot.world_from_goal,

@@ -8,14 +8,14 @@ from dataclasses import dataclass
 import networkx as nx
 import numpy as np
 
-from benchmarks.navigate.floor import Floor
+from benchmarks.navigate.floor import FreeFloor
 from benchmarks.navigate.office import Mapped
 from mapweave.evaluation.map_score import crossed
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.scenarios.kidnap_planning import CLEARANCE, LEAST_LANDMARKS, NEAR
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 
 LEAST_EDGES = 4
 """Between the node next to the start and the goal."""
@@ -43,7 +43,7 @@ class Plot:
     shortest: float
 
 
-def draw_plot(mapped: Mapped, plan: FloorPlan, floor: Floor, rng: np.random.Generator) -> Plot:
+def draw_plot(mapped: Mapped, plan: BuildingPlan, floor: FreeFloor, rng: np.random.Generator) -> Plot:
     """Draw a start at an unmapped pose near some node, and a goal with a view at least four edges away.
 
     Args:

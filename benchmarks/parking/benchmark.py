@@ -29,8 +29,8 @@ from rich.table import Table
 
 from benchmarks.command_line import command_line
 from benchmarks.parking.figures import draw_figures
-from benchmarks.parking.run import Outcome, park
-from benchmarks.parking.scene import Scene
+from benchmarks.parking.run import ParkingOutcome, park
+from benchmarks.parking.scene import ParkingScene
 from mapweave.hybridmap.errors import MapweaveError
 
 DEALT = 0x57A7
@@ -39,7 +39,7 @@ DEALT = 0x57A7
 
 def parkings(
     seed: int, starts: int, goals: int, one_view: bool
-) -> Iterator[tuple[int, Scene, Outcome | None]]:
+) -> Iterator[tuple[int, ParkingScene, ParkingOutcome | None]]:
     """Park from as many starts as there is a path for, evenly over the goals.
 
     Args:
@@ -54,7 +54,7 @@ def parkings(
     for number, share in enumerate(np.diff(np.linspace(0, starts, goals + 1).astype(int)).tolist()):
         if not share:
             continue
-        scene = Scene((seed, number), one_view)
+        scene = ParkingScene((seed, number), one_view)
         rng = np.random.default_rng([seed, number, DEALT])
         done = 0
         while done < share:
@@ -67,7 +67,7 @@ def parkings(
             done += 1
 
 
-def summary(outcomes: Sequence[Outcome], left_out: int) -> dict[str, float]:
+def summary(outcomes: Sequence[ParkingOutcome], left_out: int) -> dict[str, float]:
     """The figures. Errors are over all that say they have parked, time over those that have."""
     arrived = [o for o in outcomes if o.arrived]
     good = [o for o in outcomes if o.success]
@@ -93,7 +93,7 @@ def summary(outcomes: Sequence[Outcome], left_out: int) -> dict[str, float]:
     }
 
 
-def table_of(outcomes: Sequence[tuple[int, Outcome]]) -> Table:
+def table_of(outcomes: Sequence[tuple[int, ParkingOutcome]]) -> Table:
     """One row a start."""
     table = Table(
         "goal", "from m, m, deg", "s", "off mm, deg", "believed mm", "switches", "", title="parkings"
@@ -111,7 +111,7 @@ def run(
     seed: int, starts: int, goals: int, one_view: bool, out: Path | None, console: Console
 ) -> dict[str, float]:
     """Park, print, draw; returns the figures."""
-    outcomes: list[tuple[int, Scene, Outcome]] = []
+    outcomes: list[tuple[int, ParkingScene, ParkingOutcome]] = []
     left_out = 0
     with Progress(console=console) as progress:
         task = progress.add_task("mapping a goal", total=starts)

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from benchmarks.parking.run import LEAST_VISIBLE, Outcome, Record
-from benchmarks.parking.scene import Scene
+from benchmarks.parking.run import LEAST_VISIBLE, ParkingOutcome, Record
+from benchmarks.parking.scene import ParkingScene
 from mapweave.agent.navigation.route_follower import RouteProgress
 
 if TYPE_CHECKING:
@@ -20,7 +20,7 @@ LEFT_OUT = 3
 """A landmark that was tracked for fewer ticks is not drawn."""
 
 
-def draw_figures(scene: Scene, outcome: Outcome, folder: Path) -> list[Path]:
+def draw_figures(scene: ParkingScene, outcome: ParkingOutcome, folder: Path) -> list[Path]:
     """Write fig12.png, fig13.png and fig14.png of one parking.
 
     Args:
@@ -50,7 +50,7 @@ def draw_figures(scene: Scene, outcome: Outcome, folder: Path) -> list[Path]:
     return paths
 
 
-def _pixels(scene: Scene, outcome: Outcome, axes: Any) -> None:
+def _pixels(scene: ParkingScene, outcome: ParkingOutcome, axes: Any) -> None:
     """Figure 12: the way of each landmark in the image, from where it is first tracked to the end."""
     ax: Axes = axes[0]
     camera, pixels = scene.goal.camera, np.array(outcome.record.pixels)
@@ -69,7 +69,7 @@ def _pixels(scene: Scene, outcome: Outcome, axes: Any) -> None:
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.1), ncols=3, fontsize=8, frameon=False)
 
 
-def _bearings(scene: Scene, outcome: Outcome, axes: Any) -> None:
+def _bearings(scene: ParkingScene, outcome: ParkingOutcome, axes: Any) -> None:
     """Figure 13: bearings of the tracked landmarks with the limit, and how many there are."""
     camera, record = scene.goal.camera, outcome.record
     pixels, times = np.array(record.pixels), _times(record)
@@ -90,7 +90,7 @@ def _bearings(scene: Scene, outcome: Outcome, axes: Any) -> None:
         _shade(ax, record)
 
 
-def _errors(scene: Scene, outcome: Outcome, axes: Any) -> None:
+def _errors(scene: ParkingScene, outcome: ParkingOutcome, axes: Any) -> None:
     """Figure 14: position and heading relative to the goal, true and believed; the last part enlarged."""
     record = outcome.record
     true, believed, times = np.array(record.true), np.array(record.believed), _times(record)

@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from benchmarks.parking.scene import ROBOT, Scene
-from mapweave.agent.mission import Answer
+from benchmarks.parking.scene import ROBOT, ParkingScene
+from mapweave.agent.mission import ServerAnswer
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.navigation.route_follower import RouteProgress
 from mapweave.agent.servo.proximity import guard
@@ -48,7 +48,7 @@ class Record:
 
 
 @dataclass(frozen=True, eq=False)
-class Outcome:
+class ParkingOutcome:
     """One parking.
 
     Attributes:
@@ -82,7 +82,7 @@ class Outcome:
     record: Record
 
 
-def park(scene: Scene, start: Pose2, shortest: float, seed: int) -> Outcome:
+def park(scene: ParkingScene, start: Pose2, shortest: float, seed: int) -> ParkingOutcome:
     """Put the robot down at a start, `goal_from_robot`, and let it park.
 
     Args:
@@ -93,7 +93,7 @@ def park(scene: Scene, start: Pose2, shortest: float, seed: int) -> Outcome:
     """
     description, lens = scene.description, Lens(scene.description.camera, scene.description.distortion)
     navigator = Navigator(description, lens, Sift(lens), scene.own_map, scene.goal.id, seed=seed)
-    record, answers = Record(), list[Answer]()
+    record, answers = Record(), list[ServerAnswer]()
     with scene.simulate(scene.world_from_goal @ start) as simulation:
         observation = simulation.observe(ROBOT)
         for _ in range(round(TIME_LIMIT / description.tick)):
@@ -119,7 +119,7 @@ def park(scene: Scene, start: Pose2, shortest: float, seed: int) -> Outcome:
     if collisions:
         complaints.append(f"{collisions} collisions")
     way = np.diff(np.array(record.true)[:, :2], axis=0)
-    return Outcome(
+    return ParkingOutcome(
         start=start,
         arrived=navigator.arrived,
         success=not complaints,
@@ -136,11 +136,11 @@ def park(scene: Scene, start: Pose2, shortest: float, seed: int) -> Outcome:
     )
 
 
-def _true(scene: Scene, simulation: Simulation) -> Pose2:
+def _true(scene: ParkingScene, simulation: Simulation) -> Pose2:
     return scene.world_from_goal.inverse() @ simulation.truth(ROBOT)
 
 
-def _note(record: Record, scene: Scene, true: Pose2, navigator: Navigator) -> None:
+def _note(record: Record, scene: ParkingScene, true: Pose2, navigator: Navigator) -> None:
     fix = navigator.fix
     pixels, believed = np.full((len(scene.goal.landmarks), 2), np.nan), np.full(3, np.nan)
     if fix is not None and fix.node == scene.goal.id:

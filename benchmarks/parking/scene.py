@@ -15,7 +15,7 @@ from benchmarks.servo.planner import shortest_length
 from benchmarks.servo.world import CAMERA as PLANNER_CAMERA
 from benchmarks.servo.world import Task
 from mapweave.agent.exploration.phase import Phase
-from mapweave.agent.mission import Answer, Explore, Question, WhereAmI, WhichWay
+from mapweave.agent.mission import Explore, Question, ServerAnswer, WhereAmI, WhichWay
 from mapweave.agent.pipeline import Pipeline
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.errors import MapweaveError
@@ -25,7 +25,7 @@ from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.routes import Router
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 from mapweave.sim.placement import is_clear
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
@@ -52,7 +52,7 @@ class NoGoal(MapweaveError):
     """The arena has no place to park at."""
 
 
-class Scene:
+class ParkingScene:
     """One arena, one robot, one goal that the robot has mapped.
 
     Attributes:
@@ -76,7 +76,7 @@ class Scene:
         rng = np.random.default_rng([*seed, 0x9A4C])
         number = int(rng.integers(2**31))
         self._world, self._number = make_world("arena", number), number
-        self.plan: FloorPlan = self._world.plan
+        self.plan: BuildingPlan = self._world.plan
         with self.simulate(_goal(self.plan, rng)) as simulation:
             self.description = simulation.describe(ROBOT)
             self.own_map, self.goal = self._map(simulation, one_view)
@@ -90,18 +90,18 @@ class Scene:
         """The arena with the same robot, put down somewhere: no start depends on the starts before it."""
         return Simulation(self._world, [ROBOT], self._number, [world_from_robot])
 
-    def answer(self, question: Question) -> Answer:
+    def answer(self, question: Question) -> ServerAnswer:
         """What the map server says to a robot's question."""
         match question:
             case WhereAmI():
-                return Answer(question.number, self._relocalizer.answer(question.view))
+                return ServerAnswer(question.number, self._relocalizer.answer(question.view))
             case WhichWay():
                 way = self._router.route(
                     question.start, question.goal, question.blocked,
                     start_from_robot=question.start_from_robot,
                 )  # fmt: skip
-                return Answer(question.number, way)
-        return Answer(question.number, None, "there are no other robots")
+                return ServerAnswer(question.number, way)
+        return ServerAnswer(question.number, None, "there are no other robots")
 
     def draw_start(self, rng: np.random.Generator) -> Pose2:
         """A start, `goal_from_robot`, by the issue's rule; whether there is a path is not asked."""
@@ -140,10 +140,12 @@ class Scene:
         """Explore until the view from the start is a node, or all the views from there are."""
         pipeline = Pipeline(MapId(ROBOT, 1), self.description)
         pipeline.set_mission(Explore())
-        observation, made, answers = simulation.observe(ROBOT), list[Node](), tuple[Answer, ...]()
+        observation, made, answers = simulation.observe(ROBOT), list[Node](), tuple[ServerAnswer, ...]()
         for _ in range(MAPPING_TICKS):
             step = pipeline.step(observation, answers)
-            answers = tuple(Answer(q.number, None, "there is no map server yet") for q in step.questions)
+            answers = tuple(
+                ServerAnswer(q.number, None, "there is no map server yet") for q in step.questions
+            )
             made += [change.node for change in step.changes if isinstance(change, NodePut)]
             leaves = step.status.finished or step.status.doing == Phase.TRAVELLING
             if made and (one_view or leaves):
@@ -152,7 +154,7 @@ class Scene:
         raise NoGoal(f"{self._world.name}: the robot made no node of the view: {step.status.detail}")
 
 
-def _goal(plan: FloorPlan, rng: np.random.Generator) -> Pose2:
+def _goal(plan: BuildingPlan, rng: np.random.Generator) -> Pose2:
     """A free place that looks at a wall 1.5 to 5 m away, with room behind it to start from."""
     ways = np.arange(0.0, FARTHEST_VIEW + 0.5, 0.05)
     for _ in range(1000):

@@ -17,8 +17,8 @@ from benchmarks.relocalize.pictures import Wish
 from benchmarks.relocalize.places import (
     CLEARANCE,
     LEAST_LANDMARKS,
-    Place,
     Progress,
+    TruePlace,
     donor_sites,
     photographed,
     placed,
@@ -61,11 +61,11 @@ class Distractors:
         seed: of all.
     """
 
-    donors: Sequence[Place]
+    donors: Sequence[TruePlace]
     differences: Differences
     seed: int
 
-    def place(self, number: int) -> Place:
+    def place(self, number: int) -> TruePlace:
         """A place, with whole descriptors too; its true pose is unknown."""
         rng = np.random.default_rng([self.seed, 0xD157, number])
         i, j = rng.choice(len(self.donors), 2, replace=False).tolist()
@@ -85,14 +85,14 @@ class Distractors:
             np.concatenate([a.depth_sigmas, b.depth_sigmas]) * scales,
         )  # fmt: skip
         node = Node(NodeId(AGENT, 1, number), 0, left.node.map_from_robot, left.node.camera, landmarks)
-        return Place(node, left.world_from_node, NO_SITE, np.clip(sift, 0, 255).astype(np.uint8))
+        return TruePlace(node, left.world_from_node, NO_SITE, np.clip(sift, 0, 255).astype(np.uint8))
 
     def node(self, number: int) -> Node:
         """A place's node."""
         return self.place(number).node
 
 
-def gather(count: int, places: Sequence[Place], seed: int, progress: Progress) -> Distractors:
+def gather(count: int, places: Sequence[TruePlace], seed: int, progress: Progress) -> Distractors:
     """Look at buildings that are neither mapped nor asked about.
 
     Args:
@@ -101,7 +101,7 @@ def gather(count: int, places: Sequence[Place], seed: int, progress: Progress) -
         seed: of the buildings.
         progress: called once a view.
     """
-    donors: list[Place] = []
+    donors: list[TruePlace] = []
     for number, site in enumerate(donor_sites(seed)):
         rng = np.random.default_rng([seed, 0xD0, number])
         wishes = [
@@ -112,7 +112,7 @@ def gather(count: int, places: Sequence[Place], seed: int, progress: Progress) -
     return Distractors(donors, differences(places, seed), seed)
 
 
-def differences(places: Sequence[Place], seed: int, pairs: int = 200) -> Differences:
+def differences(places: Sequence[TruePlace], seed: int, pairs: int = 200) -> Differences:
     """Of landmarks that two nodes share, by matches that the geometry confirms."""
     rng = np.random.default_rng([seed, 0xD1F])
     found, whole = list[NDArray[np.float32]](), list[NDArray[np.int16]]()
@@ -138,6 +138,6 @@ def differences(places: Sequence[Place], seed: int, pairs: int = 200) -> Differe
     return Differences(np.concatenate(found), np.concatenate(whole))
 
 
-def _alike(a: Place, b: Place) -> bool:
+def _alike(a: TruePlace, b: TruePlace) -> bool:
     between = a.world_from_node.inverse() @ b.world_from_node
     return abs(between.heading) < 0.5 and abs(between.x) < 1.0 and abs(between.y) < 1.0

@@ -9,12 +9,12 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.relocalize.places import Place
+from benchmarks.relocalize.places import TruePlace
 from benchmarks.relocalize.queries import Query
-from benchmarks.relocalize.score import Reply
+from benchmarks.relocalize.score import ScoredAnswer
 from mapweave.hybridmap.descriptor import root_sift
 from mapweave.hybridmap.query import RelocalizeAnswer
-from mapweave.mapserver.relocalization.candidates import MOST_COMPARED, Candidates
+from mapweave.mapserver.relocalization.candidates import MOST_COMPARED, RetrievedNodes
 from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, is_lonely
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.relocalization.view_registration import Registration
@@ -30,7 +30,7 @@ RIVALS = MOST_COMPARED
 NODES_AT_ONCE = 40
 """Whose landmarks are compared at once."""
 
-PlaceOf = Callable[[int], Place]
+PlaceOf = Callable[[int], TruePlace]
 """A place of the fleet by its number, those that are real first."""
 
 
@@ -75,7 +75,7 @@ class Exhaustive:
         most = np.argsort(-counts, kind="stable")[:RIVALS].tolist()
         ranked = [(self._place_of(k).node.id, float(counts[k])) for k in most]
         matches = self._relocalizer.registration.refined(view, sightings)
-        return self._relocalizer.conclude(Registration(Candidates(view, ranked), matches))
+        return self._relocalizer.conclude(Registration(RetrievedNodes(view, ranked), matches))
 
     def may_match(
         self, views: Sequence[NDArray[np.float32]], progress: Callable[[], None] = lambda: None
@@ -109,7 +109,7 @@ class Exhaustive:
         return counts
 
 
-def lost(ours: Sequence[Reply], theirs: Sequence[Reply]) -> dict[str, float]:
+def lost(ours: Sequence[ScoredAnswer], theirs: Sequence[ScoredAnswer]) -> dict[str, float]:
     """How much less is recalled than by the exhaustive search, of the same views, with 95 % of certainty.
 
     The interval is that of Bonett and Price (2012) for the difference of paired proportions.

@@ -13,9 +13,9 @@ from rich.progress import Progress
 from benchmarks.relocalize.distractors import AGENT, gather
 from benchmarks.relocalize.exhaustive import AT_MOST, Exhaustive, asked_of, lost
 from benchmarks.relocalize.peer import Vocabulary
-from benchmarks.relocalize.places import Place, joined, mapped, mapped_sites
+from benchmarks.relocalize.places import TruePlace, joined, mapped, mapped_sites
 from benchmarks.relocalize.queries import KINDS, Query, known, nowhere, twins
-from benchmarks.relocalize.score import Reply, ask, judged, share, spent
+from benchmarks.relocalize.score import ScoredAnswer, ask, judged, share, spent
 from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Node
@@ -69,7 +69,7 @@ class Bench:
         place = self.truth.get(node_id)
         return None if place is None else place.node
 
-    def place(self, number: int) -> Place:
+    def place(self, number: int) -> TruePlace:
         """A place of the fleet by its number, those that are real first."""
         real = len(self.places)
         return self.places[number] if number < real else self.distractors.place(number - real)
@@ -86,7 +86,7 @@ class Bench:
         yield from (place.node for place in self.places[:size])
         yield from (self.made(k) for k in range(size - len(self.places)))
 
-    def asked(self, name: str, relocalizer: Relocalizer) -> list[Reply]:
+    def asked(self, name: str, relocalizer: Relocalizer) -> list[ScoredAnswer]:
         """All answers."""
         with self.task(name, len(self.queries)) as step:
             return ask(relocalizer.answer, self.queries, self.truth, step, lambda: self.making)
@@ -101,7 +101,7 @@ class Bench:
         return float(1e3 * (spent() - self.making - began)[1] / most)
 
     def ceiling(
-        self, kinds: list[str], size: int, judge: Relocalizer, replies: list[Reply]
+        self, kinds: list[str], size: int, judge: Relocalizer, replies: list[ScoredAnswer]
     ) -> dict[str, Any]:
         """Recall of the exhaustive search, by kind, and what the index has lost of near views.
 

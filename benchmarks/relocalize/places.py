@@ -10,13 +10,13 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.relocalize.pictures import Photographer, Picture, Wish, taken
+from benchmarks.relocalize.pictures import Photographer, TestPicture, Wish, taken
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
 from mapweave.sim.world import World
 from mapweave.sim.worlds.catalog import make_world
@@ -95,7 +95,7 @@ def donor_sites(seed: int) -> tuple[Site, ...]:
 
 
 @dataclass(frozen=True, eq=False)
-class Place:
+class TruePlace:
     """A node and the truth about it.
 
     Attributes:
@@ -163,15 +163,15 @@ def spread_out(points: Array, count: int, rng: np.random.Generator) -> Array:
 
 def photographed(
     site: Site, wishes: Sequence[Wish], progress: Progress, camera: str = "webcam"
-) -> list[Picture]:
+) -> list[TestPicture]:
     """Pictures of a building as it was built."""
     name = f"{site} {camera}"
     return taken(name, lambda: Photographer(site.world, (site.seed, 1), camera), wishes, progress)
 
 
-def mapped(sites: Sequence[Site], count: int, seed: int, progress: Progress) -> list[Place]:
+def mapped(sites: Sequence[Site], count: int, seed: int, progress: Progress) -> list[TruePlace]:
     """Nodes of all buildings, about as robots make them; where there is nothing to see they make none."""
-    places: list[Place] = []
+    places: list[TruePlace] = []
     for number, site in enumerate(sites):
         rng = np.random.default_rng([seed, 0x3A9, number])
         wanted = round(site.share * count)
@@ -188,7 +188,7 @@ def mapped(sites: Sequence[Site], count: int, seed: int, progress: Progress) -> 
     return places
 
 
-def placed(picture: Picture, node_id: NodeId, site: int, rng: np.random.Generator) -> Place:
+def placed(picture: TestPicture, node_id: NodeId, site: int, rng: np.random.Generator) -> TruePlace:
     """A node of a picture: depths as uncertain as a robot's, and wrong by about as much as they say."""
     true = picture.depths.astype(np.float64)
     known = np.flatnonzero(np.isfinite(true) & (rng.random(len(true)) < SEEN_AGAIN))
@@ -204,10 +204,10 @@ def placed(picture: Picture, node_id: NodeId, site: int, rng: np.random.Generato
     landmarks, order = settle(landmarks, picture.camera)
     pose = PoseGaussian.from_sigmas(picture.world_from_robot, 0.01, 0.01)
     node = Node(node_id, node_id.number * 1_000_000_000, pose, picture.camera, landmarks)
-    return Place(node, picture.world_from_robot, site, picture.sift[known][order])
+    return TruePlace(node, picture.world_from_robot, site, picture.sift[known][order])
 
 
-def joined(places: Sequence[Place], seed: int) -> MergedMap:
+def joined(places: Sequence[TruePlace], seed: int) -> MergedMap:
     """The merged map of the places: a graph for each building, of ways and turns measured as robots do."""
     graphs, poses = [], dict[NodeId, Placement]()
     for number in sorted({place.site for place in places}):
@@ -221,7 +221,7 @@ def joined(places: Sequence[Place], seed: int) -> MergedMap:
     return MergedMap({}, (), (), components, poses, tuple(graphs))
 
 
-def _ways(here: Sequence[Place], rng: np.random.Generator) -> list[Measurement]:
+def _ways(here: Sequence[TruePlace], rng: np.random.Generator) -> list[RelativePose]:
     """A tree of shortest ways from place to place, and as many more between neighbours."""
     at = np.array([[p.world_from_node.x, p.world_from_node.y] for p in here])
     away = np.linalg.norm(at[:, None] - at[None], axis=2) + np.triu(np.full((len(at),) * 2, np.inf))
@@ -232,5 +232,5 @@ def _ways(here: Sequence[Place], rng: np.random.Generator) -> list[Measurement]:
             sigma = 0.004 + WAY_XY * math.hypot(true.x, true.y)
             noise = rng.normal(0, 1, 3) * [sigma, sigma, WAY_HEADING]
             pose = PoseGaussian.from_sigmas(true @ Pose2.from_vector(noise), sigma, WAY_HEADING)
-            measured.append(Measurement(here[other].node.id, here[k].node.id, pose))
+            measured.append(RelativePose(here[other].node.id, here[k].node.id, pose))
     return measured

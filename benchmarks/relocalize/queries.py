@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.relocalize.pictures import Disturbance, Photographer, Picture, Wish, taken
-from benchmarks.relocalize.places import CLEARANCE, Place, Progress, Site, photographed, unknown_sites
+from benchmarks.relocalize.pictures import Photographer, TestPicture, ViewDisturbance, Wish, taken
+from benchmarks.relocalize.places import CLEARANCE, Progress, Site, TruePlace, photographed, unknown_sites
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.world import World
 
@@ -32,32 +32,32 @@ class Query:
     """
 
     kind: str
-    picture: Picture
+    picture: TestPicture
     site: int
 
 
-def _none(rng: np.random.Generator) -> Disturbance:
-    return Disturbance()
+def _none(rng: np.random.Generator) -> ViewDisturbance:
+    return ViewDisturbance()
 
 
-def _person(rng: np.random.Generator) -> Disturbance:
-    return Disturbance(person=True)
+def _person(rng: np.random.Generator) -> ViewDisturbance:
+    return ViewDisturbance(person=True)
 
 
-def _exposure(rng: np.random.Generator) -> Disturbance:
+def _exposure(rng: np.random.Generator) -> ViewDisturbance:
     """Up to a stop darker or brighter, with another tone curve."""
-    return Disturbance(
+    return ViewDisturbance(
         gain=round(2.0 ** float(rng.uniform(-1, 1)), 3), gamma=round(float(rng.uniform(0.7, 1.4)), 3)
     )
 
 
-def _blur(rng: np.random.Generator) -> Disturbance:
+def _blur(rng: np.random.Generator) -> ViewDisturbance:
     """Turning at 0.4 to 0.8 rad/s with the shutter open for 20 ms, 2 to 4.5 px; a little out of focus."""
     turn = float(rng.uniform(0.4, 0.8)) * float(rng.choice([-1.0, 1.0]))
-    return Disturbance(turn_rate=round(turn, 3), shutter=0.02, blur=0.8)
+    return ViewDisturbance(turn_rate=round(turn, 3), shutter=0.02, blur=0.8)
 
 
-KINDS: dict[str, Callable[[np.random.Generator], Disturbance]] = {
+KINDS: dict[str, Callable[[np.random.Generator], ViewDisturbance]] = {
     "near": _none, "far": _none, "person": _person, "exposure": _exposure, "blur": _blur,
     "furniture": _none, "camera": _none,
 }  # fmt: skip
@@ -65,7 +65,7 @@ KINDS: dict[str, Callable[[np.random.Generator], Disturbance]] = {
 
 
 def known(
-    kind: str, count: int, sites: Sequence[Site], places: Sequence[Place], seed: int, progress: Progress
+    kind: str, count: int, sites: Sequence[Site], places: Sequence[TruePlace], seed: int, progress: Progress
 ) -> list[Query]:
     """Views near nodes, of buildings without twins."""
     rng = np.random.default_rng([seed, 0x0E5, *kind.encode()])
@@ -118,7 +118,7 @@ def nowhere(count: int, seed: int, progress: Progress) -> list[Query]:
 
 
 def twins(
-    count: int, sites: Sequence[Site], places: Sequence[Place], seed: int, progress: Progress
+    count: int, sites: Sequence[Site], places: Sequence[TruePlace], seed: int, progress: Progress
 ) -> list[Query]:
     """Views in rooms that have a twin: which of the two cannot be known."""
     queries: list[Query] = []

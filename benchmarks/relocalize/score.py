@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from benchmarks.relocalize.places import Place
+from benchmarks.relocalize.places import TruePlace
 from benchmarks.relocalize.queries import Query
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, PoseGaussian, wrap_angle
@@ -22,7 +22,7 @@ STRANGERS = ("nowhere", "twins")
 
 
 @dataclass(frozen=True, eq=False)
-class Reply:
+class ScoredAnswer:
     """One answer, and what the truth says to it.
 
     Attributes:
@@ -57,10 +57,10 @@ class Reply:
 def ask(
     answer: Callable[[View], RelocalizeAnswer],
     queries: Sequence[Query],
-    truth: Mapping[NodeId, Place],
+    truth: Mapping[NodeId, TruePlace],
     progress: Callable[[], None],
     aside: Callable[[], Array] = lambda: np.zeros(2),
-) -> list[Reply]:
+) -> list[ScoredAnswer]:
     """Ask all questions, one after the other.
 
     Args:
@@ -87,10 +87,10 @@ def spent() -> Array:
     return np.array([time.perf_counter(), time.process_time()])
 
 
-def judged(query: Query, answered: RelocalizeAnswer, truth: Mapping[NodeId, Place]) -> Reply:
+def judged(query: Query, answered: RelocalizeAnswer, truth: Mapping[NodeId, TruePlace]) -> ScoredAnswer:
     """Compare an answer with the truth."""
     if not answered.candidates:
-        return Reply(query, answered.certainty, math.inf, math.inf, math.nan)
+        return ScoredAnswer(query, answered.certainty, math.inf, math.inf, math.nan)
     best = answered.candidates[0]
     place = truth.get(best.node)
     error_m, error_deg = errors(query, place, best.node_from_robot)
@@ -98,10 +98,10 @@ def judged(query: Query, answered: RelocalizeAnswer, truth: Mapping[NodeId, Plac
     if place is not None and place.site == query.site:
         true = place.world_from_node.inverse() @ query.picture.world_from_robot
         nees = best.node_from_robot.mahalanobis2(true)
-    return Reply(query, answered.certainty, error_m, error_deg, nees)
+    return ScoredAnswer(query, answered.certainty, error_m, error_deg, nees)
 
 
-def errors(query: Query, place: Place | None, node_from_robot: PoseGaussian) -> tuple[float, float]:
+def errors(query: Query, place: TruePlace | None, node_from_robot: PoseGaussian) -> tuple[float, float]:
     """How far a pose at a place is off, m and degrees; infinite in another building."""
     if place is None or place.site != query.site:
         return math.inf, math.inf
@@ -110,12 +110,12 @@ def errors(query: Query, place: Place | None, node_from_robot: PoseGaussian) -> 
     return mean.distance(true), abs(math.degrees(wrap_angle(mean.heading - true.heading)))
 
 
-def share(replies: Sequence[Reply], what: Callable[[Reply], bool]) -> float:
+def share(replies: Sequence[ScoredAnswer], what: Callable[[ScoredAnswer], bool]) -> float:
     """Of replies, NaN of none."""
     return round(sum(map(what, replies)) / len(replies), 4) if replies else math.nan
 
 
-def figures(replies: Sequence[Reply]) -> dict[str, float]:
+def figures(replies: Sequence[ScoredAnswer]) -> dict[str, float]:
     """The figures of one index; recall and errors are those of undisturbed views near nodes."""
     near = [reply for reply in replies if reply.query.kind == "near"]
     strangers = [reply for reply in replies if reply.query.kind in STRANGERS]
@@ -138,13 +138,13 @@ def figures(replies: Sequence[Reply]) -> dict[str, float]:
     }
 
 
-def recall_by_kind(replies: Sequence[Reply]) -> dict[str, float]:
+def recall_by_kind(replies: Sequence[ScoredAnswer]) -> dict[str, float]:
     """Recall of each kind of view of a mapped place."""
     kinds = dict.fromkeys(r.query.kind for r in replies if r.query.kind not in STRANGERS)
     return {kind: share([r for r in replies if r.query.kind == kind], lambda r: r.recalled) for kind in kinds}
 
 
-def wrong_by_kind(replies: Sequence[Reply]) -> dict[str, float]:
+def wrong_by_kind(replies: Sequence[ScoredAnswer]) -> dict[str, float]:
     """Share of each kind of view that was answered "here" wrongly; of strangers any such answer is wrong."""
     kinds = dict.fromkeys(r.query.kind for r in replies)
     return {
@@ -156,7 +156,7 @@ def wrong_by_kind(replies: Sequence[Reply]) -> dict[str, float]:
     }
 
 
-def _found(reply: Reply) -> bool:
+def _found(reply: ScoredAnswer) -> bool:
     return reply.certainty is Certainty.FOUND
 
 

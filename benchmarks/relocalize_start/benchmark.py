@@ -29,7 +29,7 @@ from rich.table import Table
 from benchmarks.command_line import command_line
 from benchmarks.process_usage import peak_mb, used_by
 from benchmarks.relocalize.distractors import gather
-from benchmarks.relocalize.places import Place, mapped, mapped_sites
+from benchmarks.relocalize.places import TruePlace, mapped, mapped_sites
 from benchmarks.relocalize.queries import Query, known
 from benchmarks.relocalize.score import judged, share
 from benchmarks.relocalize_start.store import fill
@@ -51,7 +51,9 @@ LONGEST = 1800.0
 """Until the first answer, s."""
 
 
-def start(folder: Path, queries: Sequence[Query], places: Sequence[Place], bar: Progress) -> dict[str, float]:
+def start(
+    folder: Path, queries: Sequence[Query], places: Sequence[TruePlace], bar: Progress
+) -> dict[str, float]:
     """Start a server, ask, and end it.
 
     Returns:

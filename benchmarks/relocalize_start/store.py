@@ -19,13 +19,13 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.relocalize.distractors import Distractors
-from benchmarks.relocalize.places import Place
+from benchmarks.relocalize.places import TruePlace
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import snap
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.wire.codec import encode_change
@@ -39,7 +39,11 @@ SIGMA = (0.01, 0.01)
 
 
 def fill(
-    path: Path, places: Sequence[Place], distractors: Distractors, total: int, progress: Callable[[int], None]
+    path: Path,
+    places: Sequence[TruePlace],
+    distractors: Distractors,
+    total: int,
+    progress: Callable[[int], None],
 ) -> None:
     """Make the store, by as many processes as there are cores: a node takes about 3 ms to encode.
 
@@ -61,7 +65,7 @@ def fill(
     with ProcessPoolExecutor(os.cpu_count(), mp_context=get_context("spawn")) as pool:
         for number, messages in enumerate(pool.map(work, robots)):
             map_id = MapId(f"d{number}", 1)
-            entries = [Entry.read(map_id, k + 1, message) for k, message in enumerate(messages)]
+            entries = [ReceivedChange.read(map_id, k + 1, message) for k, message in enumerate(messages)]
             store.apply(map_id, 1, entries)
             progress(len(robots[number]))
     store.close()
@@ -69,7 +73,7 @@ def fill(
 
 def _keep(store: Store, map_id: MapId, bodies: Iterator[ChangeBody]) -> None:
     entries = [
-        Entry.read(map_id, k, encode_change(Change(map_id, k, 0, body)))
+        ReceivedChange.read(map_id, k, encode_change(Change(map_id, k, 0, body)))
         for k, body in zip(count(1), bodies, strict=False)
     ]
     store.apply(map_id, 1, entries)

@@ -35,7 +35,7 @@ _POSITION, _HEADING = 0.01, math.radians(1.0)
 
 
 @dataclass(frozen=True)
-class Outcome:
+class ServoOutcome:
     """One controller on one task; `ticks_ms` are the times of its calls, the first with its start."""
 
     arrived: bool
@@ -50,7 +50,7 @@ class Outcome:
     ticks_ms: tuple[float, ...]
 
 
-def park(name: str, task: Task, shortest: float, rng: np.random.Generator) -> Outcome:
+def park(name: str, task: Task, shortest: float, rng: np.random.Generator) -> ServoOutcome:
     """Run one controller on one task."""
     robot, filter_ = Unicycle(task), PoseFilter(task, rng)
     visible = filter_.see(robot.pose)
@@ -70,7 +70,7 @@ def park(name: str, task: Task, shortest: float, rng: np.random.Generator) -> Ou
         visible = filter_.see(robot.pose)
     error_m, error = math.hypot(robot.pose.x, robot.pose.y), abs(wrap_angle(robot.pose.heading))
     violated = robot.least_visible < LEAST_VISIBLE
-    return Outcome(
+    return ServoOutcome(
         arrived,
         arrived and not violated and error_m <= _POSITION and error <= _HEADING,
         violated,
@@ -84,7 +84,7 @@ def park(name: str, task: Task, shortest: float, rng: np.random.Generator) -> Ou
     )
 
 
-def run_trial(seed: int, trial: int) -> dict[str, Outcome] | None:
+def run_trial(seed: int, trial: int) -> dict[str, ServoOutcome] | None:
     """All controllers on one task; None if no admissible path exists."""
     task = draw_task(np.random.default_rng([seed, trial]))
     shortest = shortest_length(task)
@@ -93,7 +93,7 @@ def run_trial(seed: int, trial: int) -> dict[str, Outcome] | None:
     return {name: park(name, task, shortest, np.random.default_rng([seed, trial, 1])) for name in CONTROLLERS}
 
 
-def summary(outcomes: list[Outcome]) -> dict[str, float]:
+def summary(outcomes: list[ServoOutcome]) -> dict[str, float]:
     """The figures of one controller. Errors are over all trials; ratio, time over those that succeeded."""
     good = [o for o in outcomes if o.success]
     ticks = np.concatenate([o.ticks_ms for o in outcomes])

@@ -26,7 +26,7 @@ PATIENCE = 120.0
 
 
 @dataclass
-class Tally:
+class AnswerLog:
     """What robots were answered: when, and whether the whole map was searched.
 
     Attributes:
@@ -64,11 +64,11 @@ class Askers:
         self._fleet, self._questions = fleet, fleet.questions(200)
         self._buses = [ZenohBus(BusSettings(endpoints=(endpoint,))) for _ in range(count)]
         self._stop = threading.Event()
-        self.tally = Tally()
+        self.tally = AnswerLog()
         self._pool = ThreadPoolExecutor(count)
         self._asking = [self._pool.submit(self._ask, bus, k) for k, bus in enumerate(self._buses)]
 
-    def close(self) -> Tally:
+    def close(self) -> AnswerLog:
         """Let each get its last answer, and disconnect."""
         self._stop.set()
         for asking in self._asking:

@@ -32,7 +32,7 @@ from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.tracker import Tracker
-from mapweave.scenarios.fleet import TICKS_PER_SECOND, Fleet, Stage
+from mapweave.scenarios.fleet import TICKS_PER_SECOND, TrialFleet, TrialStage
 from mapweave.scenarios.local_fleet import LocalFleet
 from mapweave.scenarios.process_fleet import ProcessFleet
 from mapweave.scenarios.scenario import load_scenario, scenario_path
@@ -61,13 +61,13 @@ VIEWS = 60
 """Views that the renderers draw."""
 
 
-def stage_of(robots: int, seed: int, out: Path) -> Stage:
+def stage_of(robots: int, seed: int, out: Path) -> TrialStage:
     """An office with a room for each robot, at least three."""
     overrides = (f"robots={robots}", f"world.rooms={max(3, min(robots, 12))}")
-    return Stage(load_scenario(scenario_path("office"), overrides), seed, out, AgentSettings())
+    return TrialStage(load_scenario(scenario_path("office"), overrides), seed, out, AgentSettings())
 
 
-def time_fleet(fleet: Fleet, seconds: float) -> float:
+def time_fleet(fleet: TrialFleet, seconds: float) -> float:
     """Wall seconds that a fleet takes for some simulated ones; starting is not counted."""
     fleet.start()
     try:

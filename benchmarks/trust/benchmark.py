@@ -27,12 +27,12 @@ from rich.console import Console
 from rich.table import Table
 
 from benchmarks.command_line import command_line
-from benchmarks.trust.building import Building, mapped_office
+from benchmarks.trust.building import MappedBuilding, mapped_office
 from benchmarks.trust.lying_server import LIES, LyingServer
 from mapweave.agent.navigation.answer_trial import LONGEST_ROUTE, MORE_WAY, ROUTES
 from mapweave.agent.observation import Command
 from mapweave.agent.settings import AgentSettings
-from mapweave.agent.synchronization import Lockstep
+from mapweave.agent.synchronization import LockstepWaiting
 from mapweave.fleet import send_order
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
 from mapweave.hybridmap.ids import NodeId
@@ -54,7 +54,7 @@ APART = (2.0, 5.0)
 
 
 @dataclass(frozen=True)
-class Outcome:
+class TrustOutcome:
     """One drive.
 
     Attributes:
@@ -82,10 +82,10 @@ class Outcome:
     honest_s: float
 
 
-class Drive:
+class TrustDrive:
     """One robot, lost, and its server."""
 
-    def __init__(self, building: Building, start: Pose2, goal: NodeId, seed: int, folder: Path) -> None:
+    def __init__(self, building: MappedBuilding, start: Pose2, goal: NodeId, seed: int, folder: Path) -> None:
         """Put the robot down."""
         self._building, self._goal = building, goal
         hub = MemoryHub()
@@ -97,7 +97,7 @@ class Drive:
         )
         self.server.goal = goal
         options = AgentOptions(
-            ROBOT, folder, epoch=1, mission=MissionKind.STOP, seed=seed, synchronization=Lockstep(),
+            ROBOT, folder, epoch=1, mission=MissionKind.STOP, seed=seed, synchronization=LockstepWaiting(),
             patience=0.0,
         )  # fmt: skip
         self.agent = Agent(
@@ -140,12 +140,12 @@ class Drive:
         self.simulation.close()
 
 
-def drive(building: Building, name: str, seed: int, lying: float) -> Outcome:
+def drive(building: MappedBuilding, name: str, seed: int, lying: float) -> TrustOutcome:
     """One drive with one lie."""
     rng = np.random.default_rng([seed, sorted(LIES).index(name), 0xD21])
     start, goal = plot(building, rng)
     with tempfile.TemporaryDirectory() as folder:
-        one = Drive(building, start, goal, seed, Path(folder))
+        one = TrustDrive(building, start, goal, seed, Path(folder))
         try:
             one.server.lie = LIES[name]()
             one.go()
@@ -169,7 +169,7 @@ def drive(building: Building, name: str, seed: int, lying: float) -> Outcome:
                 if one.step.status.given_up:
                     break
             arrived = one.step.status.finished and one.off <= CLOSE
-            return Outcome(
+            return TrustOutcome(
                 name, one.simulation.collisions(ROBOT), round(one.clearance, 3), round(way, 1), lied_s,
                 said, status.given_up, false_arrival, arrived, ticks / 10,
             )  # fmt: skip
@@ -177,7 +177,7 @@ def drive(building: Building, name: str, seed: int, lying: float) -> Outcome:
             one.close()
 
 
-def plot(building: Building, rng: np.random.Generator) -> tuple[Pose2, NodeId]:
+def plot(building: MappedBuilding, rng: np.random.Generator) -> tuple[Pose2, NodeId]:
     """Where from and where to: a free pose, and a node that a route leads to."""
     plan = building.world.plan
     joined = sorted(building.truth)
@@ -188,7 +188,7 @@ def plot(building: Building, rng: np.random.Generator) -> tuple[Pose2, NodeId]:
             return start, goal
 
 
-def summary(outcomes: list[Outcome]) -> dict[str, object]:
+def summary(outcomes: list[TrustOutcome]) -> dict[str, object]:
     """The figures of all drives."""
     return {
         "drives": len(outcomes),
@@ -229,7 +229,7 @@ def main() -> None:
         print(json.dumps({"seed": arguments.seed, **summary(outcomes)}))
 
 
-def _table(outcomes: list[Outcome], seed: int) -> Table:
+def _table(outcomes: list[TrustOutcome], seed: int) -> Table:
     """A drive a row."""
     table = Table(title=f"seed {seed}")
     for name in ("lie", "touches", "clearance m", "way m", "lied s", "arrived by the truth", "s", "it said"):

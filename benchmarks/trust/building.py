@@ -14,7 +14,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 from mapweave.sim.world import World
 from mapweave.sim.worlds.catalog import make_world
 
@@ -29,7 +29,7 @@ STEP = 0.05
 
 
 @dataclass(frozen=True, eq=False)
-class Building:
+class MappedBuilding:
     """A building with its map.
 
     Attributes:
@@ -43,7 +43,7 @@ class Building:
     truth: dict[NodeId, Pose2]
 
 
-def mapped_office(seed: int, rooms: int) -> Building:
+def mapped_office(seed: int, rooms: int) -> MappedBuilding:
     """An office, photographed by the robot's camera; depths and ways are as wrong as a robot's."""
     world = make_world("office", seed, rooms=rooms)
     rng = np.random.default_rng([seed, 0x7A57])
@@ -70,7 +70,7 @@ def mapped_office(seed: int, rooms: int) -> Building:
         change for change in changes
         if (change.node.id if isinstance(change, NodePut) else change.edge.a) in joined
     ]  # fmt: skip
-    return Building(world, HybridMap(kept), {node: truth[node] for node in joined})
+    return MappedBuilding(world, HybridMap(kept), {node: truth[node] for node in joined})
 
 
 def _joined(hybrid_map: HybridMap, start: NodeId) -> set[NodeId]:
@@ -87,7 +87,7 @@ def _joined(hybrid_map: HybridMap, start: NodeId) -> set[NodeId]:
     return reached
 
 
-def _pairs(plan: FloorPlan, truth: dict[NodeId, Pose2]) -> list[tuple[NodeId, NodeId]]:
+def _pairs(plan: BuildingPlan, truth: dict[NodeId, Pose2]) -> list[tuple[NodeId, NodeId]]:
     """Nodes near each other, with floor between them on which a robot can drive straight."""
     nodes, pairs = list(truth), []
     for k, a in enumerate(nodes):

@@ -21,7 +21,15 @@ from rich.table import Table
 from benchmarks.command_line import command_line
 from benchmarks.rules.switches import Switch, switched_off
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
-from synthetic.wrong_geometry import ODD, SCENES, AnswerOutcome, Fault, draw_fleet, lost_views, outcome
+from synthetic.wrong_geometry import (
+    ODD,
+    SCENES,
+    AnswerOutcome,
+    OdometryFault,
+    draw_fleet,
+    lost_views,
+    outcome,
+)
 
 WITHOUT, WITH, UNSEARCHED = "without_the_map", "with_the_map", "rule_off"
 NO_SEARCH: tuple[Switch, ...] = ((WrongGeometrySearch, "wrong", lambda *_: {}),)
@@ -34,7 +42,7 @@ def measured(
     out: dict[str, Counter[str]] = {name: Counter() for name in (WITHOUT, WITH, UNSEARCHED)}
     task = progress.add_task("fleets", total=runs * len(kinds) * len(scenes))
     for name, run, kind in product(scenes, range(runs), kinds):
-        fleet = draw_fleet(seed + run, SCENES[name], Fault(kind))
+        fleet = draw_fleet(seed + run, SCENES[name], OdometryFault(kind))
         views = lost_views(fleet, SCENES[name], queries, seed + run)
         outcomes = {WITHOUT: outcome(fleet, views, frozenset({ODD})), WITH: outcome(fleet, views)}
         with switched_off(NO_SEARCH):
@@ -51,7 +59,7 @@ def measured(
 def main() -> None:
     """Run and print."""
     parser = command_line("wrong_geometry", __doc__, "of the first fleet")
-    faults = [str(one) for one in Fault if one is not Fault.NONE]
+    faults = [str(one) for one in OdometryFault if one is not OdometryFault.NONE]
     parser.add_argument("--runs", type=int, default=3, help="fleets of each kind and scene (default 3)")
     parser.add_argument("--kinds", nargs="+", default=faults, choices=faults)
     parser.add_argument("--scenes", nargs="+", default=["room", "house"], choices=list(SCENES))

@@ -21,7 +21,7 @@ from docs.floor_plan import plan_of, to_pixels
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.ids import NodeId
 from mapweave.mapserver.http.web import Web
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
 from mapweave.wire.codec import encode_change
@@ -50,7 +50,7 @@ def page_of(building: Building, folder: Path) -> Iterator[Browser]:
         log = list(building.log(robot))
         map_id = log[0][0]
         entries = [
-            Entry.read(map_id, k, encode_change(Change(map_id, k, 0, body)))
+            ReceivedChange.read(map_id, k, encode_change(Change(map_id, k, 0, body)))
             for k, (_, body) in enumerate(log, 1)
         ]
         store.apply(map_id, 7, entries, len(entries))

@@ -17,7 +17,7 @@ MOST_FRAME = MOST_BYTES + max(REQUEST.size, REPLY.size)
 MOST_WORDS = 500
 
 
-class Request(NamedTuple):
+class GatewayRequest(NamedTuple):
     """What a server asks.
 
     Attributes:
@@ -35,17 +35,17 @@ class Request(NamedTuple):
         return REQUEST.pack(self.number, self.target) + self.message
 
     @staticmethod
-    def read(data: bytes) -> Request:
+    def read(data: bytes) -> GatewayRequest:
         """Of bytes.
 
         Raises:
             InvalidMessage: they are too few.
         """
         number, target = _head(REQUEST, data)
-        return Request(number, target, data[REQUEST.size :])
+        return GatewayRequest(number, target, data[REQUEST.size :])
 
 
-class Reply(NamedTuple):
+class GatewayReply(NamedTuple):
     """What its gateway says. The first reply says how many workers there are.
 
     Attributes:
@@ -64,7 +64,7 @@ class Reply(NamedTuple):
         return REPLY.pack(self.number, bool(self.words)) + tail
 
     @staticmethod
-    def read(data: bytes) -> Reply:
+    def read(data: bytes) -> GatewayReply:
         """Of bytes.
 
         Raises:
@@ -72,7 +72,9 @@ class Reply(NamedTuple):
         """
         number, failed = _head(REPLY, data)
         tail = data[REPLY.size :]
-        return Reply(number, b"", tail.decode(errors="replace")) if failed else Reply(number, tail)
+        return (
+            GatewayReply(number, b"", tail.decode(errors="replace")) if failed else GatewayReply(number, tail)
+        )
 
 
 def _head(form: struct.Struct, data: bytes) -> tuple[int, ...]:

@@ -18,7 +18,7 @@ from socket import socketpair
 from typing import NamedTuple
 
 from mapweave.hybridmap.errors import InvalidMessage, MapweaveError
-from mapweave.mapserver.cluster.frames import MOST_FRAME, Reply, Request
+from mapweave.mapserver.cluster.frames import MOST_FRAME, GatewayReply, GatewayRequest
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +41,7 @@ class ClusterGone(MapweaveError):
 class _Child(NamedTuple):
     process: subprocess.Popen[bytes]
     connection: Connection
-    outbox: SimpleQueue[Request | None]
+    outbox: SimpleQueue[GatewayRequest | None]
 
 
 class Gateway:
@@ -94,7 +94,7 @@ class Gateway:
                 if not self._pending:
                     self._heard = time.monotonic()
                 self._pending[self._next] = answer
-                self._child.outbox.put(Request(self._next, target, request))
+                self._child.outbox.put(GatewayRequest(self._next, target, request))
                 return answer
         answer.set_exception(ClusterGone("the cluster is not there"))
         return answer
@@ -188,8 +188,8 @@ class Gateway:
             future.set_exception(ClusterGone("the cluster is lost"))
 
 
-def _received(connection: Connection) -> Reply:
-    return Reply.read(connection.recv_bytes(MOST_FRAME))
+def _received(connection: Connection) -> GatewayReply:
+    return GatewayReply.read(connection.recv_bytes(MOST_FRAME))
 
 
 def _write(child: _Child) -> None:

@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.hybridmap.errors import InvalidMessage
-from mapweave.mapserver.cluster.frames import MOST_FRAME, MOST_WORDS, Reply, Request
+from mapweave.mapserver.cluster.frames import MOST_FRAME, MOST_WORDS, GatewayReply, GatewayRequest
 from mapweave.mapserver.cluster.gateway import WORK
 
 LOOPBACK = "127.0.0.1"
@@ -35,7 +35,7 @@ def main() -> int:
     try:
         ray = _joined(address)
     except Exception as error:  # noqa: BLE001 - whatever it is, the server says it and tries again
-        connection.send_bytes(Reply(0, words=f"{type(error).__name__}: {_words(error)}").packed())
+        connection.send_bytes(GatewayReply(0, words=f"{type(error).__name__}: {_words(error)}").packed())
         return 1
     from mapweave.mapserver.cluster.shard import ShardServer
     from mapweave.mapserver.cluster.work import answer_work
@@ -43,11 +43,11 @@ def main() -> int:
     shard = ray.remote(ShardServer).options(max_restarts=-1, num_cpus=0, scheduling_strategy="SPREAD")
     actors = [shard.remote() for _ in range(shards)]
     work = ray.remote(answer_work).options(num_cpus=1, max_retries=3, scheduling_strategy="SPREAD")
-    connection.send_bytes(Reply(int(ray.cluster_resources().get("CPU", 0))).packed())
+    connection.send_bytes(GatewayReply(int(ray.cluster_resources().get("CPU", 0))).packed())
     sending = threading.Lock()
     try:
         while True:
-            request = Request.read(connection.recv_bytes(MOST_FRAME))
+            request = GatewayRequest.read(connection.recv_bytes(MOST_FRAME))
             at = work if request.target == WORK else actors[request.target].call
             sent = at.remote(request.message)
             sent.future().add_done_callback(partial(_reply, connection, sending, request.number))
@@ -106,7 +106,9 @@ def _listens(address: str) -> bool:
 def _reply(connection: Connection, sending: threading.Lock, number: int, done: Future[bytes]) -> None:
     """Send an answer, or why there is none."""
     error = done.exception()
-    reply = Reply(number, done.result()) if error is None else Reply(number, words=_words(error))
+    reply = (
+        GatewayReply(number, done.result()) if error is None else GatewayReply(number, words=_words(error))
+    )
     # The other side may have closed: then this ends, too.
     with sending, suppress(OSError):
         connection.send_bytes(reply.packed())

@@ -157,8 +157,8 @@ class Reset:
 
 
 @dataclass(frozen=True, eq=False)
-class Change:
-    """Changes a shard.
+class ShardChange:
+    """A change of the nodes that a shard holds.
 
     Attributes:
         state: that which follows.
@@ -241,7 +241,7 @@ class OverlapsAnswer:
             raise InvalidMessage("overlaps that do not belong to their nodes")
 
 
-ShardRequest = Hello | Reset | Change | Ask
+ShardRequest = Hello | Reset | ShardChange | Ask
 Question = Nearest | Overlaps
 
 

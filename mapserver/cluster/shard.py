@@ -20,12 +20,12 @@ from mapweave.hybridmap.node import Node
 from mapweave.mapserver.cluster.messages import (
     Answer,
     Ask,
-    Change,
     Nearest,
     NearestAnswer,
     OverlapsAnswer,
     Question,
     Reset,
+    ShardChange,
     ShardRequest,
     State,
     answer_message,
@@ -92,7 +92,7 @@ class ShardServer:
         match request:
             case Reset():
                 self._reset()
-            case Change():
+            case ShardChange():
                 self._change(request)
             case Ask():
                 return self._ask(request)
@@ -101,7 +101,7 @@ class ShardServer:
     def _reset(self) -> None:
         self._shard, self._state = Shard(), State(secrets.token_hex(8), 0)
 
-    def _change(self, change: Change) -> None:
+    def _change(self, change: ShardChange) -> None:
         if change.state != replace(self._state, number=self._state.number + 1):
             raise OutOfDate(f"has {self._state}, and not what comes before {change.state}")
         self._shard.change(change.nodes.nodes, change.gone.nodes)

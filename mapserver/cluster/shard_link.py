@@ -24,12 +24,12 @@ from mapweave.hybridmap.node import Node
 from mapweave.mapserver.cluster.gateway import ClusterGone
 from mapweave.mapserver.cluster.messages import (
     Ask,
-    Change,
     ComparedNodes,
     Hello,
     Ids,
     Question,
     Reset,
+    ShardChange,
     State,
     answer_to,
     decoded,
@@ -139,7 +139,7 @@ class ShardLink:
         """Send the next change; what is lost of it is noticed."""
         assert self._state is not None
         state = self._state = State(self._state.incarnation, self._state.number + 1)
-        sent = self._call(encoded(Change(state, ComparedNodes.of(nodes), Ids.of(gone))))
+        sent = self._call(encoded(ShardChange(state, ComparedNodes.of(nodes), Ids.of(gone))))
         self._unacknowledged.append(sent)
         sent.add_done_callback(lambda done: self._acknowledged(done, state))
         return sent

@@ -28,7 +28,7 @@ from mapweave.hybridmap.map_event import History, MapEvent
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.last_shown import NOTHING, LastShown
 from mapweave.mapserver.http.live_map import LiveMap, Pair
-from mapweave.mapserver.http.login import Access, Person
+from mapweave.mapserver.http.login import Person, RequestAuthorization
 from mapweave.mapserver.http.reply import refusal
 from mapweave.mapserver.http.serving import json_bytes
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities
@@ -78,10 +78,10 @@ class Shown(Protocol):
         """What the server holds and does."""
 
 
-class Live:
-    """Looks at the server as long as there are viewers."""
+class LiveUpdates:
+    """Sends changes of the shown map to the viewers' pages; idle while there are none."""
 
-    def __init__(self, server: Shown, access: Access, before: LastShown = NOTHING) -> None:
+    def __init__(self, server: Shown, access: RequestAuthorization, before: LastShown = NOTHING) -> None:
         """Begin with no viewer.
 
         Args:

@@ -23,7 +23,7 @@ from starlette.routing import Route
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.identities.logins import Login, Logins
 from mapweave.mapserver.http.body import JSON, read_body
-from mapweave.mapserver.http.reply import Reply
+from mapweave.mapserver.http.reply import JsonLine
 from mapweave.mapserver.http.same_site import is_loopback
 from mapweave.mapserver.http.sessions import LIFE, Failures, Sessions
 from mapweave.wire.access_rules import COMMANDS, may_ask
@@ -65,8 +65,8 @@ class _Posted(msgspec.Struct, forbid_unknown_fields=True):
     token: str
 
 
-class Access:
-    """Decides for each request. Used by the server's thread alone."""
+class RequestAuthorization:
+    """Decides what each HTTP request may do. Used by the server's thread alone."""
 
     def __init__(self, logins: Logins | None, patience: float) -> None:
         """Begin without sessions.
@@ -171,7 +171,7 @@ class Access:
             raise InvalidValue('send JSON: {"token": "mapweave_..."}') from None
         login = self._checked(request, token, self._failed_logins)
         log.info("%s %s logs in from %s", login.role, login.name, address_of(request))
-        reply = Reply({"name": login.name, "role": str(login.role)})
+        reply = JsonLine({"name": login.name, "role": str(login.role)})
         reply.set_cookie(
             _cookie(request), self._sessions.begin(login), max_age=int(LIFE), path="/",
             secure=_secure(request), httponly=True, samesite="strict",
@@ -187,7 +187,7 @@ class Access:
             self.person(request)
             self._sessions.end(secret)
             log.info("%s %s logs out", login.role, login.name)
-        reply = Reply({"said": "logged out"})
+        reply = JsonLine({"said": "logged out"})
         reply.delete_cookie(name, path="/", secure=_secure(request), httponly=True, samesite="strict")
         return reply
 

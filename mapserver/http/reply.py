@@ -20,7 +20,7 @@ WHOLE = "mapweave.whole"
 """Set in the scope of a request whose body is complete."""
 
 
-class Reply(Response):
+class JsonLine(Response):
     """One JSON object on a line.
 
     A refusal is sent at once, and what the peer is still sending is read to its end and thrown away: a
@@ -46,16 +46,16 @@ class Reply(Response):
         await send({"type": "http.response.body", "body": b"", "more_body": False})
 
 
-def refusal(status: int, error: str, headers: Mapping[str, str] | None = None) -> Reply:
+def refusal(status: int, error: str, headers: Mapping[str, str] | None = None) -> JsonLine:
     """Why there is no answer, on one line."""
-    return Reply({"error": " ".join(error.split())}, status, headers)
+    return JsonLine({"error": " ".join(error.split())}, status, headers)
 
 
-def busy(error: Busy) -> Reply:
+def busy(error: Busy) -> JsonLine:
     """When to ask again."""
     content = {"error": str(error), "retry_after": round(error.retry_after, 2)}
     headers = {"Retry-After": str(math.ceil(error.retry_after))}
-    return Reply(content, HTTPStatus.SERVICE_UNAVAILABLE, headers)
+    return JsonLine(content, HTTPStatus.SERVICE_UNAVAILABLE, headers)
 
 
 async def _hear_out(scope: Scope, receive: Receive) -> None:

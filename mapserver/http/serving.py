@@ -65,7 +65,7 @@ HEADERS = {
 
 
 @dataclass(frozen=True, slots=True)
-class Limits:
+class ConnectionTimeouts:
     """Times after which a connection is dropped, s.
 
     Attributes:
@@ -87,7 +87,7 @@ def json_bytes(content: Mapping[str, Any]) -> bytes:
 class Connection(H11Protocol):
     """One connection with its time limits."""
 
-    limits = Limits()
+    limits = ConnectionTimeouts()
     waiting: dict[Connection, None]
     _head: asyncio.TimerHandle
     _whole: asyncio.TimerHandle | None = None
@@ -261,7 +261,7 @@ class HttpThread:
         self,
         app: ASGIApp,
         address: tuple[str, int],
-        limits: Limits | None = None,
+        limits: ConnectionTimeouts | None = None,
         name: str = "http",
         tls: ssl.SSLContext | None = None,
     ) -> None:
@@ -279,7 +279,7 @@ class HttpThread:
         """
         self._socket = _listen(address)
         self.port = int(self._socket.getsockname()[1])
-        limits = limits or Limits()
+        limits = limits or ConnectionTimeouts()
         protocol: type[Connection] = type("Connection", (Connection,), {"limits": limits, "waiting": {}})
         viewer = type("Viewer", (WebSocketConnection,), {"stall": limits.stall})
         config = uvicorn.Config(

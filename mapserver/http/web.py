@@ -65,15 +65,15 @@ from mapweave.mapserver.http.explain_request import read_questions
 from mapweave.mapserver.http.form import read_photo
 from mapweave.mapserver.http.json_values import constraint_values, json_values
 from mapweave.mapserver.http.last_shown import NOTHING, LastShown
-from mapweave.mapserver.http.live import Live
-from mapweave.mapserver.http.login import PERSON, PUBLIC, Access, address_of
+from mapweave.mapserver.http.live import LiveUpdates
+from mapweave.mapserver.http.login import PERSON, PUBLIC, RequestAuthorization, address_of
 from mapweave.mapserver.http.nodes import node_answers
 from mapweave.mapserver.http.pages import page, static
 from mapweave.mapserver.http.plans import plan_answers
 from mapweave.mapserver.http.rates import LIMITED, Rates
-from mapweave.mapserver.http.reply import PATIENCE, Reply, busy, refusal
+from mapweave.mapserver.http.reply import PATIENCE, JsonLine, busy, refusal
 from mapweave.mapserver.http.same_site import SameSite, is_loopback
-from mapweave.mapserver.http.serving import HttpThread, Limits
+from mapweave.mapserver.http.serving import ConnectionTimeouts, HttpThread
 from mapweave.mapserver.plan_answers import answer_on_plan, component_of, goal_on_plan, status_on_plan
 from mapweave.wire.each_robot import each_robot
 
@@ -119,7 +119,7 @@ class Web(HttpThread):
     """The map server for people. Listens from the start until closed.
 
     Attributes:
-        shown: gives what the page shows; see `Live.shown`.
+        shown: gives what the page shows; see `LiveUpdates.shown`.
     """
 
     def __init__(
@@ -127,7 +127,7 @@ class Web(HttpThread):
         address: tuple[str, int],
         server: Answering,
         patience: float = PATIENCE,
-        limits: Limits | None = None,
+        limits: ConnectionTimeouts | None = None,
         logins: Logins | None = None,
         tls: ssl.SSLContext | None = None,
         before: LastShown = NOTHING,
@@ -141,7 +141,7 @@ class Web(HttpThread):
             limits: of connections.
             logins: of the fleet's members; None: this machine alone is served.
             tls: serves HTTPS.
-            before: what the page shows until the server has merged; see `Live`.
+            before: what the page shows until the server has merged; see `LiveUpdates`.
 
         Raises:
             SettingsError: other machines would be served without a login, or unencrypted.
@@ -202,11 +202,11 @@ class Questions:
             patience: time limit for a body, and for an answer, s.
             logins: of the fleet's members; None on a fleet without keys.
             rates: of people's questions; the usual ones by default.
-            before: see `Live`.
+            before: see `LiveUpdates`.
         """
         self._server = server
-        self._access = access = Access(logins, patience)
-        self.live = Live(server, access, before)
+        self._access = access = RequestAuthorization(logins, patience)
+        self.live = LiveUpdates(server, access, before)
         self._patience = patience
         self._open, self._rates = 0, rates or Rates()
         # The question is the router's word for it, by which roles decide.
@@ -256,7 +256,7 @@ class Questions:
                     if question in LIMITED:
                         self._rates.ask(_asker(request))
                 content = await answer(request)
-                return content if isinstance(content, Response) else Reply(content)
+                return content if isinstance(content, Response) else JsonLine(content)
             except HTTPException as error:
                 return refusal(error.status_code, error.detail, error.headers)
             except Busy as error:

@@ -6,7 +6,7 @@ from collections import deque
 from dataclasses import dataclass, field
 
 from mapweave.hybridmap.ids import MapId
-from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.entry import Applied, ReceivedChange
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.wire.log_messages import MAX_REFUSALS, MAX_ROWS, LogRequest, Refusal
 
@@ -59,7 +59,7 @@ class AgentLog:
     settings: PullSettings
     watermark: int = 0
     newest: int = 0
-    ahead: dict[int, Entry] = field(default_factory=dict)
+    ahead: dict[int, ReceivedChange] = field(default_factory=dict)
     refusals: tuple[Refusal, ...] = ()
     damaged: list[Gap] = field(default_factory=list)
     unverified: Gap | None = None
@@ -90,7 +90,7 @@ class AgentLog:
         """
         return max(now - self._announced[0][1], 0.0) if self._announced else 0.0
 
-    def offer(self, entry: Entry, received: float | None = None) -> None:
+    def offer(self, entry: ReceivedChange, received: float | None = None) -> None:
         """Keep a change until its turn comes, if there is room.
 
         Args:
@@ -111,9 +111,9 @@ class AgentLog:
         self._received.clear()
         self._ahead_bytes = 0
 
-    def next_run(self, after: int) -> list[Entry]:
+    def next_run(self, after: int) -> list[ReceivedChange]:
         """The changes that follow this sequence number without a gap."""
-        run: list[Entry] = []
+        run: list[ReceivedChange] = []
         while (entry := self.ahead.get(after + 1 + len(run))) is not None:
             run.append(entry)
         return run

@@ -14,8 +14,8 @@ from mapweave.wire.log_messages import Refusal
 
 
 @dataclass(frozen=True, slots=True)
-class Entry:
-    """A change as it came.
+class ReceivedChange:
+    """A change of a robot's log, encoded as it came and decoded.
 
     Attributes:
         sequence: its place in the log.
@@ -28,19 +28,19 @@ class Entry:
     change: Change | str
 
     @staticmethod
-    def read(map_id: MapId, sequence: int, message: bytes) -> Entry:
+    def read(map_id: MapId, sequence: int, message: bytes) -> ReceivedChange:
         """Decode a message that claims this place in this map's log."""
         try:
             own_sequence, stamp_ns, encoded = unwrap_body(message)
             body = decode_body(encoded)
         except InvalidMessage as error:
-            return Entry(sequence, message, str(error))
+            return ReceivedChange(sequence, message, str(error))
         if (element_of(body).map, own_sequence) != (map_id, sequence):
             claim = f"{element_of(body).map} {own_sequence}"
-            return Entry(sequence, message, f"change: {claim} came as {map_id} {sequence}")
+            return ReceivedChange(sequence, message, f"change: {claim} came as {map_id} {sequence}")
         if isinstance(body, EdgePut) and (reason := unmeasurable(body.edge)):
-            return Entry(sequence, message, reason)
-        return Entry(sequence, message, Change(map_id, sequence, stamp_ns, body))
+            return ReceivedChange(sequence, message, reason)
+        return ReceivedChange(sequence, message, Change(map_id, sequence, stamp_ns, body))
 
 
 def words_of(refusal: Refusal) -> str:

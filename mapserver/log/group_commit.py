@@ -13,9 +13,9 @@ from dataclasses import dataclass, replace
 
 from mapweave.hybridmap.errors import InvalidFile, MapweaveError
 from mapweave.mapserver.log.agent_log import AgentLog
-from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.entry import Applied, ReceivedChange
 from mapweave.mapserver.log.intake import Full, Intakes
-from mapweave.mapserver.log.store import Run, Store
+from mapweave.mapserver.log.store import LogChanges, Store
 
 log = logging.getLogger(__name__)
 
@@ -36,7 +36,7 @@ class NextRun:
     """
 
     log: AgentLog
-    entries: Sequence[Entry]
+    entries: Sequence[ReceivedChange]
     covered: int | None = None
     full: Full | None = None
 
@@ -78,14 +78,14 @@ class GroupCommit:
         Returns:
             For each what is new, or why nothing of it is on the disk.
         """
-        stored = [Run(run.log.map, run.log.log_id, run.entries, run.covered) for run in runs]
+        stored = [LogChanges(run.log.map, run.log.log_id, run.entries, run.covered) for run in runs]
         results = self._apply(stored)
         if len(runs) > 1 and all(isinstance(result, InvalidFile) for result in results):
             # One that the disk does not take must not hold up the others.
             results = [result for run in stored for result in self._apply([run])]
         return results
 
-    def _apply(self, runs: Sequence[Run]) -> list[Applied | MapweaveError]:
+    def _apply(self, runs: Sequence[LogChanges]) -> list[Applied | MapweaveError]:
         self._since = time.monotonic()
         try:
             return self._store.apply_all(runs)

@@ -26,7 +26,7 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, MapweaveError
 from mapweave.hybridmap.ids import MapId, check_name
 from mapweave.mapserver.log.acknowledgements import Acknowledgements
 from mapweave.mapserver.log.agent_log import AgentLog
-from mapweave.mapserver.log.entry import Entry, words_of
+from mapweave.mapserver.log.entry import ReceivedChange, words_of
 from mapweave.mapserver.log.following import Follower, settled, unseen
 from mapweave.mapserver.log.group_commit import GroupCommit, NextRun
 from mapweave.mapserver.log.inbox import Inbox
@@ -34,7 +34,7 @@ from mapweave.mapserver.log.ingest_counters import IngestCounters
 from mapweave.mapserver.log.ingest_settings import IngestSettings
 from mapweave.mapserver.log.intake import Full, Intakes
 from mapweave.mapserver.log.known_logs import KnownLogs, Lag
-from mapweave.mapserver.log.pulled import Piece, Pieces, Pulled
+from mapweave.mapserver.log.pulled import Pieces, Pulled, PulledChanges
 from mapweave.mapserver.log.puller import Puller
 from mapweave.mapserver.log.recovery import recover
 from mapweave.mapserver.log.store import News, Store
@@ -127,7 +127,7 @@ class Ingest:
         self._puller = Puller(bus, keys, self._intakes, unmerged, s.ask_timeout, self._put_pulled)
         self._pulls = self._puller.schedule
         self._unaware: dict[MapId, AgentLog] = {}
-        self._work: Inbox[Sample | Pulled | Piece | News | Reminder] = Inbox()
+        self._work: Inbox[Sample | Pulled | PulledChanges | News | Reminder] = Inbox()
         self._follower = Follower(
             store, self._logs, self._intakes, self._pulls, s.pull, self._pass_on, note_refusal
         )
@@ -200,7 +200,7 @@ class Ingest:
         """A message has come; in the bus's thread."""
         robot = robot_of(sample.key)
 
-        def replaces(last: Sample | Pulled | Piece | News | Reminder) -> bool:
+        def replaces(last: Sample | Pulled | PulledChanges | News | Reminder) -> bool:
             """A newer beacon of the same log says all that the one before it did."""
             return isinstance(last, Sample) and not last.attachment and last.key == sample.key
 
@@ -226,12 +226,12 @@ class Ingest:
             self._counters.add(pulls=self._puller.start())
             self.busy = False
 
-    def _take(self, robot: str, item: Sample | Pulled | Piece | News | Reminder) -> AgentLog | None:
+    def _take(self, robot: str, item: Sample | Pulled | PulledChanges | News | Reminder) -> AgentLog | None:
         """Process one item of the inbox. Returns the log that may go on now."""
         try:
             if isinstance(item, Pulled):
                 return self._take_pulled(item)
-            if isinstance(item, Piece):
+            if isinstance(item, PulledChanges):
                 return self._take_piece(item)
             if isinstance(item, News):
                 self._follower.take(item)
@@ -269,7 +269,7 @@ class Ingest:
         if not intake.change(len(sample.payload), self._unmerged(map_id.agent)):
             return agent_log
         fits = len(sample.payload) <= MAX_CHANGE_BYTES
-        entry = Entry.read(map_id, mark.sequence, sample.payload if fits else b"")
+        entry = ReceivedChange.read(map_id, mark.sequence, sample.payload if fits else b"")
         if isinstance(entry.change, str):
             self._counters.add(damaged=1)
             log.info("%s %d came damaged (%s), pulling it", map_id, mark.sequence, entry.change)
@@ -311,7 +311,7 @@ class Ingest:
             self._take_piece(piece)
         return agent_log
 
-    def _take_piece(self, piece: Piece) -> AgentLog | None:
+    def _take_piece(self, piece: PulledChanges) -> AgentLog | None:
         """Have some of the changes that were pulled committed in this turn."""
         if self._logs.get(piece.log.map) is not piece.log:
             return None
@@ -324,7 +324,7 @@ class Ingest:
         if piece is None:
             run = NextRun(agent_log, agent_log.next_run(agent_log.watermark))
         else:
-            pulled = [Entry.read(agent_log.map, *row) for row in piece.rows]
+            pulled = [ReceivedChange.read(agent_log.map, *row) for row in piece.rows]
             run = NextRun(agent_log, [*pulled, *agent_log.next_run(piece.covered)], piece.covered)
         if not run.entries and run.covered is None:
             return None
@@ -380,7 +380,7 @@ class Ingest:
             if self._unaware.pop(agent_log.map, None) is not None:
                 self._acks.acknowledge(agent_log)
 
-    def _recover(self, agent_log: AgentLog, first: int, piece: Piece) -> None:
+    def _recover(self, agent_log: AgentLog, first: int, piece: PulledChanges) -> None:
         """Put damaged changes in their places again, or verify others, and pass on what that changes."""
         try:
             changes, restored = recover(self._store, agent_log, first, piece)
@@ -446,6 +446,6 @@ class Ingest:
                 # logs.
                 log.exception("passing on %s %d failed", change.map, change.sequence)
 
-    def _put_pulled(self, pulled: Pulled | Piece) -> None:
+    def _put_pulled(self, pulled: Pulled | PulledChanges) -> None:
         """Something that was pulled waits for its robot's turn; from any thread."""
         self._work.put(pulled.log.map.agent, pulled, bounded=False)

@@ -9,7 +9,7 @@ from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.agent_log import AgentLog
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.kept_bytes import KeptBytes
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.quotas import CHANGE_BYTES, DRIVEN, EDGES, MOST_ROBOTS, Quotas, TokenBucket
@@ -102,7 +102,7 @@ class Intake:
         self._stale = True
         self._bytes_kept.grown(map_id)
 
-    def fitting(self, map_id: MapId, entries: Sequence[Entry]) -> tuple[int, Full | None]:
+    def fitting(self, map_id: MapId, entries: Sequence[ReceivedChange]) -> tuple[int, Full | None]:
         """How many changes of a map, in order, the robot's quotas have room for, and why not more.
 
         Those that fit count as kept from now on.
@@ -120,7 +120,7 @@ class Intake:
             count, full = self._fitting(map_id, entries)
         return count, full
 
-    def _fitting(self, map_id: MapId, entries: Sequence[Entry]) -> tuple[int, Full | None]:
+    def _fitting(self, map_id: MapId, entries: Sequence[ReceivedChange]) -> tuple[int, Full | None]:
         settings = self._quotas.settings
         added: dict[NodeId, int] = {}
         edges_here: set[NodeId] = set()

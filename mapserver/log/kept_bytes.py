@@ -12,7 +12,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 
 from mapweave.hybridmap.ids import MapId
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.store import PRUNING_MARK, ROW_BYTES, Store
 
 LEAST_GROWN = 2**22
@@ -80,18 +80,18 @@ class KeptBytes:
             kept.counted = max(kept.counted, last)
             self._behind.discard(map_id)
 
-    def added_by(self, map_id: MapId, entry: Entry) -> int:
+    def added_by(self, map_id: MapId, entry: ReceivedChange) -> int:
         """Bytes that a change adds to what is counted; 0 if it is counted."""
         kept = self._maps.get(map_id)
         return _size(entry) if kept is None or entry.sequence > kept.counted else 0
 
-    def add(self, map_id: MapId, entry: Entry) -> None:
+    def add(self, map_id: MapId, entry: ReceivedChange) -> None:
         """Count a change that will be stored."""
         kept = self._maps.setdefault(map_id, _Kept())
         kept.bytes += self.added_by(map_id, entry)
         kept.counted = max(kept.counted, entry.sequence)
 
-    def compact(self, map_id: MapId, coming: Sequence[Entry]) -> None:
+    def compact(self, map_id: MapId, coming: Sequence[ReceivedChange]) -> None:
         """Delete some of what is superseded in a map; look for it first if the map has grown by enough.
 
         Args:
@@ -124,6 +124,6 @@ class KeptBytes:
         return sum(kept.bytes for map_id, kept in self._maps.items() if map_id not in without)
 
 
-def _size(entry: Entry) -> int:
+def _size(entry: ReceivedChange) -> int:
     """Bytes that a change takes in the store."""
     return ROW_BYTES + len(entry.message)

@@ -20,7 +20,7 @@ from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.log.postgres_follower import CHANNEL, LOG, RECORD, PostgresFollower, words_of
 from mapweave.mapserver.log.postgres_name import ServerName
 from mapweave.mapserver.log.sql_store import SqlStore
-from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, ID, News, Run, fresh_id
+from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, ID, LogChanges, News, fresh_id
 from mapweave.storage.file_format import what_to_do
 from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
 from mapweave.storage.postgres_watchdog import PostgresWatchdog
@@ -252,7 +252,7 @@ class PostgresStore(SqlStore):
         if self._touched:
             connection.execute("SELECT pg_notify(%s, %s)", (CHANNEL, words_of([*self._touched])))
 
-    def _begin(self, runs: Sequence[Run]) -> dict[MapId, Position]:
+    def _begin(self, runs: Sequence[LogChanges]) -> dict[MapId, Position]:
         ids = {run.map_id: str(run.log_id) for run in runs}
         # In one order everywhere: two servers that wait for each other's rows would wait for ever.
         rows = [(map_id.agent, map_id.epoch, ids[map_id]) for map_id in sorted(ids)]

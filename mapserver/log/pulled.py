@@ -20,7 +20,7 @@ AT_ONE_TURN = 16
 
 
 @dataclass(frozen=True, slots=True)
-class Piece:
+class PulledChanges:
     """Changes of a log that wait for their turn.
 
     Attributes:
@@ -34,16 +34,16 @@ class Piece:
     covered: int
 
     @property
-    def now(self) -> Piece:
+    def now(self) -> PulledChanges:
         """What is committed at the next turn."""
         rows, later = self.rows[:AT_ONE_TURN], self.rows[AT_ONE_TURN:]
-        return Piece(self.log, rows, later[0][0] - 1 if later else self.covered)
+        return PulledChanges(self.log, rows, later[0][0] - 1 if later else self.covered)
 
     @property
-    def later(self) -> Piece | None:
+    def later(self) -> PulledChanges | None:
         """What waits for a later turn; None if nothing does."""
         later = self.rows[AT_ONE_TURN:]
-        return Piece(self.log, later, self.covered) if later else None
+        return PulledChanges(self.log, later, self.covered) if later else None
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,7 +54,7 @@ class Pulled:
     asked: LogRequest
     replies: list[Reply]
 
-    def piece(self) -> tuple[Piece, int]:
+    def piece(self) -> tuple[PulledChanges, int]:
         """The changes that came, and how many replies did not decode."""
         asked, agent_log, damaged = self.asked, self.log, 0
         for reply in self.replies:
@@ -71,13 +71,13 @@ class Pulled:
                 log.warning("%s from %d: %s", agent_log.map, asked.first, error)
                 if asked.first == asked.last:
                     # It was asked for alone and does not fit into a message.
-                    return Piece(agent_log, ((asked.first, b""),), asked.first), damaged
+                    return PulledChanges(agent_log, ((asked.first, b""),), asked.first), damaged
                 agent_log.chunk = max(1, (asked.last - asked.first + 1) // 4)
                 continue
             if answer.log_id == agent_log.log_id and answer.first == asked.first:
                 rows = tuple(row for row in answer.changes if row[0] <= asked.last)
-                return Piece(agent_log, rows, min(answer.covered, asked.last)), damaged
-        return Piece(agent_log, (), 0), damaged
+                return PulledChanges(agent_log, rows, min(answer.covered, asked.last)), damaged
+        return PulledChanges(agent_log, (), 0), damaged
 
 
 class Pieces:
@@ -85,20 +85,20 @@ class Pieces:
 
     def __init__(self) -> None:
         """Start with none."""
-        self._pieces: dict[MapId, Piece] = {}
+        self._pieces: dict[MapId, PulledChanges] = {}
 
-    def put(self, piece: Piece) -> None:
+    def put(self, piece: PulledChanges) -> None:
         """A piece whose turn has come."""
         self._pieces[piece.log.map] = piece
 
-    def now(self, agent_log: AgentLog) -> Piece | None:
+    def now(self, agent_log: AgentLog) -> PulledChanges | None:
         """What is committed of a log at this turn; None if nothing of it was pulled that is new."""
         piece = self._pieces.get(agent_log.map)
         if piece is None or piece.log is not agent_log or piece.now.covered <= agent_log.watermark:
             return None
         return piece.now
 
-    def end(self, agent_log: AgentLog, now: float) -> Piece | None:
+    def end(self, agent_log: AgentLog, now: float) -> PulledChanges | None:
         """The turn of a log is over; returns what waits for its next, if anything."""
         piece = self._pieces.pop(agent_log.map, None)
         if piece is None or piece.log is not agent_log:

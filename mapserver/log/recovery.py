@@ -12,14 +12,16 @@ from collections.abc import Iterable
 
 from mapweave.hybridmap.change import Change
 from mapweave.mapserver.log.agent_log import AgentLog
-from mapweave.mapserver.log.entry import Entry
-from mapweave.mapserver.log.pulled import Piece
+from mapweave.mapserver.log.entry import ReceivedChange
+from mapweave.mapserver.log.pulled import PulledChanges
 from mapweave.mapserver.log.store import Store
 
 log = logging.getLogger(__name__)
 
 
-def recover(store: Store, agent_log: AgentLog, first: int, piece: Piece) -> tuple[Iterable[Change], int]:
+def recover(
+    store: Store, agent_log: AgentLog, first: int, piece: PulledChanges
+) -> tuple[Iterable[Change], int]:
     """Restore damaged changes, or verify others.
 
     Args:
@@ -37,7 +39,9 @@ def recover(store: Store, agent_log: AgentLog, first: int, piece: Piece) -> tupl
     changes: Iterable[Change]
     map_id, covered, restored = agent_log.map, piece.covered, 0
     if agent_log.was_damaged(first):
-        changes = store.restore(map_id, first, covered, [Entry.read(map_id, *row) for row in piece.rows])
+        changes = store.restore(
+            map_id, first, covered, [ReceivedChange.read(map_id, *row) for row in piece.rows]
+        )
         restored = len(piece.rows)
         log.warning("changes %d to %d of %s are whole again", first, covered, map_id)
     else:

@@ -10,7 +10,7 @@ from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, Nod
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.limits import MAX_NUMBER
-from mapweave.mapserver.log.entry import Applied, Entry, Position
+from mapweave.mapserver.log.entry import Applied, Position, ReceivedChange
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.mapserver.log.sql_sizes import SqlSizes
 from mapweave.mapserver.log.store import (
@@ -19,7 +19,7 @@ from mapweave.mapserver.log.store import (
     MAX_CONSTRAINTS,
     MOST_REFUSALS,
     MOST_REFUSED_KEPT,
-    Run,
+    LogChanges,
     Store,
     name_taken,
 )
@@ -71,7 +71,7 @@ class SqlStore(SqlSizes, Store):
         rows = self._read("SELECT log_id FROM log WHERE agent = ? AND epoch = ?", map_id)
         return int(rows[0][0]) if rows else None
 
-    def apply_all(self, runs: Sequence[Run]) -> list[Applied | MapweaveError]:
+    def apply_all(self, runs: Sequence[LogChanges]) -> list[Applied | MapweaveError]:
         """Take the next changes of many logs in one transaction; see `Store`."""
         try:
             with self._transaction():
@@ -109,7 +109,7 @@ class SqlStore(SqlSizes, Store):
             if any(self.result(name) != value for name, value in (unchanged or {}).items()):
                 return False
             # No other server may put one of the nodes between the queries.
-            self._begin([Run(map_id, at.log_id, ()) for map_id, at in self.positions(maps).items()])
+            self._begin([LogChanges(map_id, at.log_id, ()) for map_id, at in self.positions(maps).items()])
             for kinds, numbers in (
                 ((NodePut, NodeRetired), node_numbers),
                 ((EdgePut, EdgeRetired), edge_numbers),
@@ -144,7 +144,9 @@ class SqlStore(SqlSizes, Store):
         rows = self._read(query, (agent, agent, epoch))
         return [Gap(MapId(agent, epoch), first, last) for agent, epoch, first, last in rows]
 
-    def restore(self, map_id: MapId, first: int, covered: int, entries: Sequence[Entry]) -> Iterator[Change]:
+    def restore(
+        self, map_id: MapId, first: int, covered: int, entries: Sequence[ReceivedChange]
+    ) -> Iterator[Change]:
         """Put changes that were damaged in their places again; see `Store`."""
         changes: list[Change] = []
         refusals: list[Refusal] = []
@@ -242,7 +244,7 @@ class SqlStore(SqlSizes, Store):
         rows = self._read("SELECT value FROM result WHERE name = ?", (name,))
         return bytes(rows[0][0]) if rows else None
 
-    def _apply(self, run: Run, logs: dict[MapId, Position]) -> Applied | MapweaveError:
+    def _apply(self, run: LogChanges, logs: dict[MapId, Position]) -> Applied | MapweaveError:
         stored_id, watermark = logs.get(run.map_id, (run.log_id, 0))
         if stored_id != run.log_id and watermark > 0:
             return name_taken(run.map_id)
@@ -282,7 +284,7 @@ class SqlStore(SqlSizes, Store):
     def _take(
         self,
         map_id: MapId,
-        entry: Entry,
+        entry: ReceivedChange,
         changes: list[Change],
         refusals: list[Refusal],
         restored: bool = False,
@@ -300,7 +302,7 @@ class SqlStore(SqlSizes, Store):
             changes.append(entry.change)
             self._insert(entry, entry.change, restored)
 
-    def _insert(self, entry: Entry, change: Change, restored: bool) -> None:
+    def _insert(self, entry: ReceivedChange, change: Change, restored: bool) -> None:
         _, stamp_ns, body = unwrap_body(entry.message)
         kind, number = type(change.body).__name__, element_of(change.body).number
         values = (*change.map, entry.sequence, stamp_ns, kind, number, len(entry.message), body)

@@ -9,7 +9,7 @@ from typing import Any
 
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.entry import Position
-from mapweave.mapserver.log.store import Run
+from mapweave.mapserver.log.store import LogChanges
 
 
 class SqlTables(ABC):
@@ -44,7 +44,7 @@ class SqlTables(ABC):
         """Inside a transaction."""
 
     @abstractmethod
-    def _begin(self, runs: Sequence[Run]) -> dict[MapId, Position]:
+    def _begin(self, runs: Sequence[LogChanges]) -> dict[MapId, Position]:
         """The logs of these runs that are stored; only this transaction changes them until the commit."""
 
     @abstractmethod

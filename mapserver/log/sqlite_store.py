@@ -14,7 +14,7 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.log.integrity import SCHEMA, Gap, insert, repair
 from mapweave.mapserver.log.sql_store import SqlStore
-from mapweave.mapserver.log.store import ID, News, Run, fresh_id
+from mapweave.mapserver.log.store import ID, LogChanges, News, fresh_id
 from mapweave.storage.database import Database
 
 log = logging.getLogger(__name__)
@@ -96,7 +96,7 @@ class SqliteStore(SqlStore):
                 self._landmarks.clear()
                 raise
 
-    def _begin(self, runs: Sequence[Run]) -> dict[MapId, Position]:
+    def _begin(self, runs: Sequence[LogChanges]) -> dict[MapId, Position]:
         query = "SELECT log_id, watermark FROM log WHERE agent = ? AND epoch = ?"
         found = ((map_id, self._read(query, map_id)) for map_id in {run.map_id for run in runs})
         return {map_id: Position(int(rows[0][0]), rows[0][1]) for map_id, rows in found if rows}

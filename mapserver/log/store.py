@@ -14,7 +14,7 @@ from typing import Protocol
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
-from mapweave.mapserver.log.entry import Applied, Entry, Position, Traffic
+from mapweave.mapserver.log.entry import Applied, Position, ReceivedChange, Traffic
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.wire.log_messages import Refusal
 
@@ -37,7 +37,7 @@ MAX_CONSTRAINTS = 10_000
 
 
 @dataclass(frozen=True, slots=True)
-class Run:
+class LogChanges:
     """The next changes of one log.
 
     Attributes:
@@ -49,7 +49,7 @@ class Run:
 
     map_id: MapId
     log_id: int
-    entries: Sequence[Entry]
+    entries: Sequence[ReceivedChange]
     covered: int | None = None
 
 
@@ -116,9 +116,9 @@ class Store(Protocol):
         """Id of the log of this name, None without one."""
 
     def apply(
-        self, map_id: MapId, log_id: int, entries: Sequence[Entry], covered: int | None = None
+        self, map_id: MapId, log_id: int, entries: Sequence[ReceivedChange], covered: int | None = None
     ) -> Applied:
-        """Take the next changes of one log; see `apply_all`, and `Run` for the arguments.
+        """Take the next changes of one log; see `apply_all`, and `LogChanges` for the arguments.
 
         Returns:
             What is new.
@@ -127,12 +127,12 @@ class Store(Protocol):
             InvalidValue: another log goes by this name.
             InvalidFile: the disk does not take it; nothing is applied.
         """
-        (result,) = self.apply_all([Run(map_id, log_id, entries, covered)])
+        (result,) = self.apply_all([LogChanges(map_id, log_id, entries, covered)])
         if isinstance(result, MapweaveError):
             raise result
         return result
 
-    def apply_all(self, runs: Sequence[Run]) -> list[Applied | MapweaveError]:
+    def apply_all(self, runs: Sequence[LogChanges]) -> list[Applied | MapweaveError]:
         """Take the next changes of many logs, all in one transaction with their watermarks.
 
         Duplicates are left out. A refused change is kept aside with its reason and the log goes on
@@ -178,7 +178,9 @@ class Store(Protocol):
     def damaged(self, map_id: MapId | None = None) -> list[Gap]:
         """Changes that were found damaged and are not restored yet, of one map or of all."""
 
-    def restore(self, map_id: MapId, first: int, covered: int, entries: Sequence[Entry]) -> Iterator[Change]:
+    def restore(
+        self, map_id: MapId, first: int, covered: int, entries: Sequence[ReceivedChange]
+    ) -> Iterator[Change]:
         """Put changes that were damaged in their places again, as the robot's log has them.
 
         Where the robot has dropped some of them, what comes before is unverified: a retirement may be lost.

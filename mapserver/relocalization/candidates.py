@@ -25,8 +25,8 @@ class Retrieval(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Candidates:
-    """Candidate nodes for a view.
+class RetrievedNodes:
+    """The nodes that retrieval found for a view.
 
     Attributes:
         view: the image's features.
@@ -43,10 +43,10 @@ class Candidates:
 
 def retrieve(
     view: View, index: Retrieval, least_features: int, elsewhere: Collection[MapId] = ()
-) -> Candidates:
+) -> RetrievedNodes:
     """Find candidates; none for a view with fewer features than registration needs."""
     if len(view) < least_features:
-        return Candidates(view)
+        return RetrievedNodes(view)
     ranked = index.query(view, MOST_COMPARED * (ALIKE_FLOORS if elsewhere else 1))
     left = [(node, score) for node, score in ranked if node.map not in elsewhere]
-    return Candidates(view, left[:MOST_COMPARED], elsewhere, ranked.missing)
+    return RetrievedNodes(view, left[:MOST_COMPARED], elsewhere, ranked.missing)

@@ -13,12 +13,17 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.relocalization.aliased_landmarks import EXPLAINED_PX, between, unexplained
-from mapweave.mapserver.relocalization.candidates import Candidates
+from mapweave.mapserver.relocalization.candidates import RetrievedNodes
 from mapweave.mapserver.relocalization.place_hypotheses import ALONE, SLIGHT, NodeMatch, is_lonely
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.matching import match
 from mapweave.registration.pose_refinement import refine_pose
-from mapweave.registration.recognition import Recognition, RecognitionSettings, Refusal, examine_matches
+from mapweave.registration.recognition import (
+    Recognition,
+    RecognitionFailure,
+    RecognitionSettings,
+    examine_matches,
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +36,9 @@ class Registration:
         refusals: why others were not.
     """
 
-    candidates: Candidates
+    candidates: RetrievedNodes
     matches: Sequence[NodeMatch] = ()
-    refusals: Sequence[tuple[NodeId, Refusal]] = ()
+    refusals: Sequence[tuple[NodeId, RecognitionFailure]] = ()
 
 
 class ViewRegistration:
@@ -57,11 +62,11 @@ class ViewRegistration:
         self._node_of, self._merged = node_of, merged
         self._settings, self._faint = recognition, faint
 
-    def register(self, candidates: Candidates) -> Registration:
+    def register(self, candidates: RetrievedNodes) -> Registration:
         """Register a view with its candidates, as long as the answer can change."""
         view = candidates.view
         matches: list[NodeMatch] = []
-        refusals: list[tuple[NodeId, Refusal]] = []
+        refusals: list[tuple[NodeId, RecognitionFailure]] = []
         best_score = 0.0
         for node_id, score in candidates.ranked:
             sure = any(recognised.recognition.inliers >= ALONE for recognised in matches)

@@ -9,7 +9,7 @@ import numpy as np
 from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.landmark_tables import DIMENSIONS
 from mapweave.mapserver.retrieval.coarse_quantizer import Codes, Ids, Vectors
-from mapweave.mapserver.retrieval.inverted_file import Block
+from mapweave.mapserver.retrieval.inverted_file import CellContents
 from mapweave.mapserver.retrieval.similar_landmarks import comparable, similar
 
 
@@ -73,8 +73,8 @@ class FlatLandmarks:
         nearest = np.arange(len(rows)) - begins[rows] < most
         return rows[nearest], squared[nearest], ids[nearest]
 
-    def blocks(self, size: int) -> Iterator[Block]:
+    def blocks(self, size: int) -> Iterator[CellContents]:
         """All landmarks at once in the order of their ids: they are few."""
         del size
         order = np.argsort(self.ids, kind="stable")
-        yield Block(self.codes[order], self.ids[order])
+        yield CellContents(self.codes[order], self.ids[order])

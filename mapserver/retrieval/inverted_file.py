@@ -18,7 +18,7 @@ STEP2 = np.float32(landmark_tables().step ** 2)
 """What a squared distance of codes is worth."""
 
 
-class Block(NamedTuple):
+class CellContents(NamedTuple):
     """Landmarks as they lie in the cells.
 
     Attributes:
@@ -106,7 +106,7 @@ class InvertedFile:
         squared, ids = self._index.search(codes.astype(np.float32), k, params=self._searching(probes))
         return squared * STEP2, ids
 
-    def blocks(self, size: int) -> Iterator[Block]:
+    def blocks(self, size: int) -> Iterator[CellContents]:
         """All landmarks, cell by cell, about `size` at once: a copy of all would take the memory twice."""
         import faiss
 
@@ -122,7 +122,7 @@ class InvertedFile:
                     ids.append(faiss.rev_swig_ptr(lists.get_ids(cell), n))
                 cell, some = cell + 1, some + n
             # What is concatenated is copied.
-            yield Block(np.concatenate(codes), np.concatenate(ids))
+            yield CellContents(np.concatenate(codes), np.concatenate(ids))
 
     def _put(self, vectors: Vectors, ids: Ids, cells: Ids) -> None:
         import faiss

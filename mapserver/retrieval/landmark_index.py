@@ -16,7 +16,7 @@ import numpy as np
 
 from mapweave.mapserver.retrieval.coarse_quantizer import SAMPLE, CoarseQuantizer, Codes, Ids, Vectors
 from mapweave.mapserver.retrieval.flat_landmarks import FlatLandmarks
-from mapweave.mapserver.retrieval.inverted_file import Block, InvertedFile
+from mapweave.mapserver.retrieval.inverted_file import CellContents, InvertedFile
 from mapweave.mapserver.retrieval.shared_lock import SharedLock
 
 log = logging.getLogger(__name__)
@@ -156,12 +156,12 @@ class LandmarkIndex:
         if learner is not None:
             learner.join()
 
-    def blocks(self) -> Iterator[Block]:
+    def blocks(self) -> Iterator[CellContents]:
         """Landmarks by cells, as they are when their turn comes; without cells, all."""
         with self.lock.reading():
             return self._in_turn(self._landmarks.blocks(AT_ONCE))
 
-    def _in_turn(self, blocks: Iterator[Block]) -> Iterator[Block]:
+    def _in_turn(self, blocks: Iterator[CellContents]) -> Iterator[CellContents]:
         while True:
             with self.lock.reading():
                 block = next(blocks, None)

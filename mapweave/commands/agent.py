@@ -285,7 +285,7 @@ def open_robot(
     from mapweave.agent.drivers.registry import find_driver
     from mapweave.agent.drivers.remote import RemoteRobot
     from mapweave.agent.drivers.settings import REMOTE
-    from mapweave.agent.synchronization import FreeRunning, Lockstep
+    from mapweave.agent.synchronization import FreeRunning, LockstepWaiting
     from mapweave.commands.usage import UsageError
     from mapweave.hybridmap.errors import SettingsError
 
@@ -298,7 +298,7 @@ def open_robot(
         from mapweave.sim.lockstep_robot import LockstepRobot
 
         robot = LockstepRobot(bus, fleet, name)
-        return CheckedRobot(robot), Lockstep(robot.rendezvous)
+        return CheckedRobot(robot), LockstepWaiting(robot.rendezvous)
     if lockstep or arguments.body:
         raise UsageError(f"--lockstep and --body are for simulated robots, not for the driver {driver}")
     try:

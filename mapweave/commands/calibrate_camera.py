@@ -142,7 +142,7 @@ def _live(
         page = None
         if port is not None:
             from mapweave.extras import need
-            from mapweave.scenarios.live import Live as Page
+            from mapweave.scenarios.live import LiveFilm as Page
 
             need("server")
             page = stack.enter_context(Page(port, "Camera calibration"))

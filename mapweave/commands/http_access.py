@@ -52,7 +52,7 @@ class HttpAccess:
 
         Args:
             server: answers.
-            before: what the page shows until the server has merged; see `mapserver.http.live.Live`.
+            before: what the page shows until the server has merged; see `mapserver.http.live.LiveUpdates`.
         """
         from mapweave.mapserver.http.last_shown import NOTHING
         from mapweave.mapserver.http.web import Web

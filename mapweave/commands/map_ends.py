@@ -67,13 +67,13 @@ def names_of(arguments: argparse.Namespace, router: Router | None = None) -> tup
                 decode(ask(arguments, Keys.any_resolve, encode(request))[0].payload, ResolveAnswer),
             ),
         )
-    from mapweave.mapserver.places import Places
+    from mapweave.mapserver.places import PlaceResolver
 
     known = cache(lambda: router or router_of(arguments))
 
     def answered(request: ResolveRequest) -> ResolveAnswer:
         with refusals():
-            return Places(known(), known().annotations).answer(request)
+            return PlaceResolver(known(), known().annotations).answer(request)
 
     return (
         lambda: known().annotations,

@@ -87,7 +87,7 @@ def draw_route(
     import numpy as np
 
     from mapweave.commands.map_ends import ask
-    from mapweave.drawing.map_picture import Drive, MapPicture, draw_map
+    from mapweave.drawing.map_picture import DrawnDrive, MapPicture, draw_map
     from mapweave.hybridmap.hybrid_map import HybridMap
     from mapweave.mapserver.map_files import map_file_of
     from mapweave.storage.map_file import unpack_map_file
@@ -103,7 +103,7 @@ def draw_route(
     # Beyond a portal it leads through another part.
     way = [poses[node] for node in stops if node in poses]
     places = np.array([[pose.x, pose.y] for pose in way])
-    drive = Drive(places, way[0], way[-1], "the way", begun="start")
+    drive = DrawnDrive(places, way[0], way[-1], "the way", begun="start")
     title = f"{explanation.start} to {explanation.goal}\n{explanation.reason}"
     edges = list(HybridMap(content.changes).edges.values())
     draw_map(MapPicture(title, poses, edges, drives=[drive]), arguments.draw)

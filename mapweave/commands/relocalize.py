@@ -131,12 +131,12 @@ def _by_server(
 
 def _by_map(arguments: argparse.Namespace, view: View) -> tuple[RelocalizeAnswer, Node | None]:
     """The answer of a map, and the best candidate's node."""
-    from mapweave.mapserver.places import Places
+    from mapweave.mapserver.places import PlaceResolver
     from mapweave.offline_relocalization import relocalizer_in
 
     router = router_of(arguments)
     merged = router.merged
-    answer = Places(router, router.annotations).named(relocalizer_in(merged).answer(view))
+    answer = PlaceResolver(router, router.annotations).named(relocalizer_in(merged).answer(view))
     if not answer.candidates:
         return answer, None
     best = answer.candidates[0].node

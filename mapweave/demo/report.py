@@ -7,7 +7,7 @@ from typing import Any
 
 from rich.table import Table
 
-from mapweave.scenarios.run import Trial
+from mapweave.scenarios.run import TrialResult
 
 
 @dataclass
@@ -75,7 +75,7 @@ class Report:
     real_time_factor: float = 0.0
 
     @staticmethod
-    def of(trial: Trial) -> Report:
+    def of(trial: TrialResult) -> Report:
         """Of a trial of the scenario `demo`."""
         recording, figures = trial.recording, trial.figures
         report = Report(

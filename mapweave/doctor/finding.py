@@ -8,8 +8,8 @@ from enum import StrEnum
 from typing import Any
 
 
-class Verdict(StrEnum):
-    """On one subject."""
+class FindingLevel(StrEnum):
+    """How good or bad a finding is."""
 
     GOOD = "good"
     WARNING = "warning"
@@ -31,34 +31,34 @@ class Finding:
     """
 
     subject: str
-    verdict: Verdict
+    verdict: FindingLevel
     detail: str
     advice: str = ""
 
 
 def good(subject: str, detail: str) -> Finding:
     """All is well."""
-    return Finding(subject, Verdict.GOOD, detail)
+    return Finding(subject, FindingLevel.GOOD, detail)
 
 
 def warning(subject: str, detail: str, advice: str) -> Finding:
     """It works, with a disadvantage."""
-    return Finding(subject, Verdict.WARNING, detail, advice)
+    return Finding(subject, FindingLevel.WARNING, detail, advice)
 
 
 def wrong(subject: str, detail: str, advice: str) -> Finding:
     """It does not work."""
-    return Finding(subject, Verdict.WRONG, detail, advice)
+    return Finding(subject, FindingLevel.WRONG, detail, advice)
 
 
 def skipped(subject: str, detail: str, advice: str = "") -> Finding:
     """It was not examined."""
-    return Finding(subject, Verdict.SKIPPED, detail, advice)
+    return Finding(subject, FindingLevel.SKIPPED, detail, advice)
 
 
 def first_wrong(findings: Sequence[Finding]) -> Finding | None:
     """The first thing that does not work; what comes after it may follow from it."""
-    return next((finding for finding in findings if finding.verdict is Verdict.WRONG), None)
+    return next((finding for finding in findings if finding.verdict is FindingLevel.WRONG), None)
 
 
 def report(findings: Sequence[Finding]) -> dict[str, Any]:

@@ -13,7 +13,7 @@ PATTERNS = ("ttyUSB*", "ttyACM*", "ttyAMA*", "ttyTHS*", "rfcomm*", "cu.usb*")
 
 
 @dataclass(frozen=True)
-class SerialPort:
+class FoundPort:
     """One port.
 
     Attributes:
@@ -37,7 +37,7 @@ class SerialPort:
         return "  ".join(part for part in parts if part)
 
 
-def serial_ports(devices: Path = DEVICES) -> list[SerialPort]:
+def serial_ports(devices: Path = DEVICES) -> list[FoundPort]:
     """All serial ports, by their paths.
 
     Args:
@@ -48,7 +48,7 @@ def serial_ports(devices: Path = DEVICES) -> list[SerialPort]:
     paths = {path for pattern in PATTERNS for path in devices.glob(pattern) if path.exists()}
     paths |= {path for path in map(Path, known) if path.parent == devices}
     return [
-        SerialPort(
+        FoundPort(
             str(path), known.get(str(path), ""), by_id.get(_target(path), ""),
             os.access(path, os.R_OK | os.W_OK),
         )
@@ -56,7 +56,7 @@ def serial_ports(devices: Path = DEVICES) -> list[SerialPort]:
     ]  # fmt: skip
 
 
-def gone(before: Sequence[SerialPort], after: Sequence[SerialPort]) -> list[SerialPort]:
+def gone(before: Sequence[FoundPort], after: Sequence[FoundPort]) -> list[FoundPort]:
     """Ports that were there and are no longer."""
     left = {port.path for port in after}
     return [port for port in before if port.path not in left]

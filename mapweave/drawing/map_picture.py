@@ -18,7 +18,7 @@ from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 from mapweave.storage.atomic_file import write_whole
 
 WIDTH = 12.0
@@ -63,7 +63,7 @@ class Outline:
 
 
 @dataclass(frozen=True, eq=False)
-class Drive:
+class DrawnDrive:
     """A drive of a robot, to draw over a map.
 
     Attributes:
@@ -128,7 +128,7 @@ class MapPicture:
     poses: Mapping[NodeId, Pose2]
     edges: Sequence[Edge]
     outline: Outline = field(default_factory=Outline)
-    drives: Sequence[Drive] = ()
+    drives: Sequence[DrawnDrive] = ()
     landmarks: Array = field(default_factory=lambda: np.zeros((0, 2)))
     starts: Mapping[str, Pose2] = field(default_factory=dict)
     false: frozenset[EdgeId] = frozenset()
@@ -136,7 +136,7 @@ class MapPicture:
     backdrop: Backdrop | None = None
 
 
-def outline_of(plan: FloorPlan) -> Outline:
+def outline_of(plan: BuildingPlan) -> Outline:
     """The outline of a simulated building."""
     rooms = tuple((r.name if not r.name.startswith("door") else "", r.corners) for r in plan.rooms)
     return Outline(rooms, tuple(box.corners for box in (*plan.walls, *plan.furniture)))
@@ -377,7 +377,7 @@ def _draw_starts(axes: Any, starts: Mapping[str, Pose2], colours: Mapping[str, s
         )  # fmt: skip
 
 
-def _draw_drives(axes: Any, drives: Sequence[Drive]) -> None:
+def _draw_drives(axes: Any, drives: Sequence[DrawnDrive]) -> None:
     labelled = set()
     for drive in drives:
         axes.plot(*drive.positions.T, "--", color="black", linewidth=1.8, zorder=5, label=drive.label)

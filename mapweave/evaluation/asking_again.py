@@ -38,7 +38,7 @@ class Asked:
 
 
 @dataclass(frozen=True)
-class Trial:
+class LostDrive:
     """What a robot that was put down somewhere came to.
 
     Attributes:
@@ -52,7 +52,7 @@ class Trial:
     right: bool | None = None
 
 
-def trials_of(asked: Sequence[Asked], is_right: Callable[[int, Whereabouts], bool | None]) -> list[Trial]:
+def trials_of(asked: Sequence[Asked], is_right: Callable[[int, Whereabouts], bool | None]) -> list[LostDrive]:
     """One trial from each question on.
 
     Args:
@@ -62,7 +62,9 @@ def trials_of(asked: Sequence[Asked], is_right: Callable[[int, Whereabouts], boo
     return [_trial(asked, first, is_right) for first in range(len(asked))]
 
 
-def _trial(asked: Sequence[Asked], first: int, is_right: Callable[[int, Whereabouts], bool | None]) -> Trial:
+def _trial(
+    asked: Sequence[Asked], first: int, is_right: Callable[[int, Whereabouts], bool | None]
+) -> LostDrive:
     agreement, begin = ViewAgreement(), asked[first]
     for k in range(first, len(asked)):
         now = asked[k]
@@ -70,11 +72,11 @@ def _trial(asked: Sequence[Asked], first: int, is_right: Callable[[int, Whereabo
             break
         place = agreement.take(now.answer, now.odom_from_robot, now.way, now.turned)
         if place is not None:
-            return Trial(begin.expected, True, is_right(k, place))
-    return Trial(begin.expected, False)
+            return LostDrive(begin.expected, True, is_right(k, place))
+    return LostDrive(begin.expected, False)
 
 
-def trial_figures(trials: Sequence[Trial]) -> dict[str, Any]:
+def trial_figures(trials: Sequence[LostDrive]) -> dict[str, Any]:
     """Figures by name; None without truth in the recording.
 
     Returns:

@@ -11,9 +11,9 @@ from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.settings import AgentSettings
-from mapweave.evaluation.asking_again import Asked, Trial, trials_of
+from mapweave.evaluation.asking_again import Asked, LostDrive, trials_of
 from mapweave.evaluation.truth import Truth
-from mapweave.evaluation.verdict import LEVELS, SURE, Verdict
+from mapweave.evaluation.verdict import LEVELS, SURE, JudgedAnswer
 from mapweave.hybridmap.change import Change, ChangeBody
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Node
@@ -52,7 +52,7 @@ class DriveMap:
             truth: for scoring alone.
         """
         self.nodes, self.covered = len(nodes), covered
-        self.trials: list[Trial] = []
+        self.trials: list[LostDrive] = []
         self._nodes = nodes
         self._relocalizer, self._truth = relocalizer, truth
 
@@ -96,7 +96,7 @@ class DriveMap:
         covered = [pose for pose in true_poses if pose is not None]
         return DriveMap(nodes, relocalizer_in(merged), covered, truth)
 
-    def questions(self, robot: Replay) -> Iterator[Verdict]:
+    def questions(self, robot: Replay) -> Iterator[JudgedAnswer]:
         """Ask where each image of another pass was taken; at the end `trials` has what robots make of it."""
         declared = robot.describe()
         geometry, wheels = geometry_of(declared), OdometryCorrection()
@@ -124,7 +124,7 @@ class DriveMap:
             if answer.certainty in SURE:
                 place = str(answer.candidates[0].node)
                 error_m, error_deg = self._error(answer.candidates[0], true)
-            yield Verdict(
+            yield JudgedAnswer(
                 query=f"{observation.stamp_ns / 1e9:.3f} s",
                 expected=expected,
                 certainty=answer.certainty,

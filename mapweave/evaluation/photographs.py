@@ -20,8 +20,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.recordings.image_folder import images_of
-from mapweave.evaluation.asking_again import Trial
-from mapweave.evaluation.verdict import Verdict
+from mapweave.evaluation.asking_again import LostDrive
+from mapweave.evaluation.verdict import JudgedAnswer
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.ids import NodeId
@@ -154,14 +154,14 @@ class AppearanceMap:
         self._nodes[number] = Node(NodeId("photo", 1, number), 0, nowhere, self._camera, landmarks)
         self._index.add(self._nodes[number])
 
-    def ask(self, number: int, image: Path, reference: Reference | None) -> Verdict:
+    def ask(self, number: int, image: Path, reference: Reference | None) -> JudgedAnswer:
         """Where an image was taken."""
         began = time.perf_counter()
         view = self._view(image)
         extracted = time.perf_counter()
         ranked = [node_id.number for node_id, _ in self._index.query(view, CANDIDATES)]
         certainty, place = self._judge(ranked, view)
-        return Verdict(
+        return JudgedAnswer(
             query=str(number),
             expected=reference is not None,
             certainty=certainty,
@@ -185,7 +185,7 @@ class AppearanceMap:
         return self._sift.extract(read_grey(path, self._camera)).view(self._camera)
 
 
-def photograph_trials(verdicts: Sequence[Verdict]) -> list[Trial]:
+def photograph_trials(verdicts: Sequence[JudgedAnswer]) -> list[LostDrive]:
     """A robot that asks at a photograph and, where that is no answer, at the next one.
 
     Photographs have no odometry. They are 1 to 3 m apart, so the next one is what lies within 2 m.
@@ -195,7 +195,7 @@ def photograph_trials(verdicts: Sequence[Verdict]) -> list[Trial]:
         asked = [first] if second is None or int(second.query) != int(first.query) + 1 else [first, second]
         answered = next((verdict for verdict in asked if verdict.certainty is Certainty.FOUND), None)
         right = None if answered is None else answered.right
-        trials.append(Trial(first.expected, answered is not None, right))
+        trials.append(LostDrive(first.expected, answered is not None, right))
     return trials
 
 

@@ -15,12 +15,12 @@ from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.image_folder import images_of
 from mapweave.agent.recordings.splits import robots_of
 from mapweave.agent.settings import AgentSettings
-from mapweave.evaluation.asking_again import Trial, trial_figures
+from mapweave.evaluation.asking_again import LostDrive, trial_figures
 from mapweave.evaluation.drive import DriveMap
 from mapweave.evaluation.photographs import AppearanceMap, Photographs, photograph_trials
 from mapweave.evaluation.pieces import check_folder
 from mapweave.evaluation.truth import Truth
-from mapweave.evaluation.verdict import Verdict, figures
+from mapweave.evaluation.verdict import JudgedAnswer, figures
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -43,8 +43,8 @@ class RelocalizationEvaluation:
     """
 
     about: dict[str, Any]
-    verdicts: dict[str, list[Verdict]]
-    trials: list[Trial]
+    verdicts: dict[str, list[JudgedAnswer]]
+    trials: list[LostDrive]
 
     def report(self) -> dict[str, Any]:
         """For `json.dumps`: figures of the first way at the top, those of the others under their names."""

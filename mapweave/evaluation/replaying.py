@@ -35,7 +35,7 @@ SAME_STAMP_NS = 20_000_000
 
 
 @dataclass(frozen=True)
-class Frame:
+class ReplayedFrame:
     """One observation.
 
     Attributes:
@@ -66,7 +66,7 @@ class ReplayEvaluation:
     """
 
     name: str
-    frames: Sequence[Frame]
+    frames: Sequence[ReplayedFrame]
     maps: Sequence[HybridMap]
     truth: Array
     notes: Sequence[str] = field(default_factory=tuple)
@@ -159,7 +159,7 @@ def evaluate_replay(
     replay: Replay,
     settings: AgentSettings,
     truth: Path | None,
-    on_frame: Callable[[Frame], None] = lambda frame: None,
+    on_frame: Callable[[ReplayedFrame], None] = lambda frame: None,
 ) -> ReplayEvaluation:
     """Map a recording as `mapweave replay` does, and score it.
 
@@ -176,7 +176,7 @@ def evaluate_replay(
     true_poses(truth, np.zeros(0, np.int64))
     description = replay.describe()
     pipelines = [_pipeline(0, description, settings)]
-    frames, wheels = list[Frame](), Pose2()
+    frames, wheels = list[ReplayedFrame](), Pose2()
     while (observation := replay.sense()) is not None:
         if pipelines[-1].lost:
             calibration = pipelines[-1].calibration
@@ -185,7 +185,7 @@ def evaluate_replay(
         wheels = wheels @ observation.odometry.motion()
         pose = status.map_from_robot if status.located else None
         reason = "" if status.located else status.detail.partition(":")[0] or status.doing
-        frames.append(Frame(observation.stamp_ns, len(pipelines) - 1, pose, wheels, reason))
+        frames.append(ReplayedFrame(observation.stamp_ns, len(pipelines) - 1, pose, wheels, reason))
         on_frame(frames[-1])
     pipelines[-1].finish()
     stamps = np.array([frame.stamp_ns for frame in frames], np.int64)

@@ -18,8 +18,8 @@ LEVELS = ((0.25, 2.0), (0.5, 5.0), (5.0, 10.0))
 
 
 @dataclass(frozen=True)
-class Verdict:
-    """One question.
+class JudgedAnswer:
+    """An answer to one question, compared with the recording.
 
     Attributes:
         query: its image.
@@ -52,7 +52,7 @@ class Verdict:
         return self.error_m <= metres and self.error_deg <= degrees
 
 
-def figures(verdicts: Sequence[Verdict]) -> dict[str, Any]:
+def figures(verdicts: Sequence[JudgedAnswer]) -> dict[str, Any]:
     """Figures by name; None without truth in the recording.
 
     Returns:

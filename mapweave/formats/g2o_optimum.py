@@ -10,7 +10,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, Measurement
+from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, RelativePose
 
 OTHERS = "g2o"
 """Takes the agent's place in the ids of foreign vertices."""
@@ -32,7 +32,7 @@ def optimum_of(graph: G2oGraph) -> dict[int, Pose2]:
     ids = {k: NodeId(OTHERS, 0, k) for k in graph.poses}
     # The back end adds its least error to every measurement; here the file's own numbers shall count.
     measurements = [
-        Measurement(ids[edge.i], ids[edge.j], PoseGaussian(edge.i_from_j, _less(edge.covariance)))
+        RelativePose(ids[edge.i], ids[edge.j], PoseGaussian(edge.i_from_j, _less(edge.covariance)))
         for edge in graph.edges
     ]
     solved = solve_graph(ids[held], graph.poses[held], measurements)

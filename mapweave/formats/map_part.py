@@ -12,7 +12,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.merge.manual_constraints import apply_constraints
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.refusals import check_component
 
@@ -69,11 +69,11 @@ class MapPart:
         return link_probabilities(self.merged)
 
     @property
-    def measurements(self) -> list[Measurement]:
+    def measurements(self) -> list[RelativePose]:
         """Those whose optimum the poses are."""
         left = apply_constraints(self.merged.maps, (), self.merged.constraints).maps
         own = [m for fragment in fragments_of(left) for m in fragment.measurements]
-        links = [Measurement(*link.pair, link.a_from_b, robust=True) for link in self.merged.links]
+        links = [RelativePose(*link.pair, link.a_from_b, robust=True) for link in self.merged.links]
         return [m for m in (*own, *links) if m.a in self.numbers]
 
     def node(self, node: NodeId) -> Node:

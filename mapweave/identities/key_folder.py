@@ -38,7 +38,7 @@ from mapweave.storage.atomic_file import read_whole, write_whole
 from mapweave.storage.os_errors import reason_of
 from mapweave.wire.bus_settings import DEFAULT_ENDPOINT, ENDPOINT, BusSettings
 from mapweave.wire.conversion import json_value
-from mapweave.wire.credentials import Access, Credentials, Member, Role
+from mapweave.wire.credentials import Credentials, Member, Role, RouterAccess
 
 CATALOGUE = "fleet.json"
 AUTHORITY, AUTHORITY_KEY, PASSWORDS = "authority.pem", "authority.key", "passwords"
@@ -386,7 +386,7 @@ class KeyFolder:
             mode="router", listen=tuple(listen) or catalogue.listen, routers=tuple(routers),
             fleet=catalogue.fleet,
             credentials=own or read_key_file(self.key_file(server)).credentials,
-            access=Access(tuple(good), passwords, tuple(bad)),
+            access=RouterAccess(tuple(good), passwords, tuple(bad)),
         )  # fmt: skip
 
     def changed(self) -> bool:

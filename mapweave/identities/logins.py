@@ -9,7 +9,7 @@ from pathlib import Path
 
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.identities.key_folder import CATALOGUE, Identity, KeyFolder
-from mapweave.identities.tokens import TOKENS, Token, hash_of, read_tokens
+from mapweave.identities.tokens import TOKENS, StoredToken, hash_of, read_tokens
 from mapweave.wire.credentials import Role
 
 log = logging.getLogger(__name__)
@@ -47,7 +47,7 @@ class Logins:
         catalogue = KeyFolder(folder).catalogue
         self.hosts = catalogue.hosts
         self._seen: tuple[tuple[int, int, int], ...] = ()
-        self._tokens: Mapping[str, tuple[Token, Identity]] = {}
+        self._tokens: Mapping[str, tuple[StoredToken, Identity]] = {}
         self._read()
 
     def login(self, token: str) -> Login | None:

@@ -26,7 +26,7 @@ PREFIX = "mapweave_"
 
 
 @dataclass(frozen=True)
-class Token:
+class StoredToken:
     """What is kept of a token.
 
     Attributes:
@@ -71,14 +71,14 @@ def hash_of(token: str) -> str:
     return hashlib.sha256(token.encode("utf-8", errors="replace")).hexdigest()
 
 
-def read_tokens(folder: Path) -> tuple[Token, ...]:
+def read_tokens(folder: Path) -> tuple[StoredToken, ...]:
     """All tokens of a folder of keys, oldest first.
 
     Raises:
         SettingsError: their file is damaged.
     """
     try:
-        return json_value(read_whole(folder / TOKENS), tuple[Token, ...])
+        return json_value(read_whole(folder / TOKENS), tuple[StoredToken, ...])
     except FileNotFoundError:
         return ()
     except OSError as error:
@@ -91,7 +91,7 @@ def add_token(folder: Path, name: str, days: float) -> str:
     """Make a token; it is returned, and nowhere else."""
     token, now = PREFIX + secrets.token_urlsafe(32), datetime.now(UTC)
     expires = (now + timedelta(days=days)).isoformat(timespec="seconds")
-    made = Token(name, hash_of(token), now.isoformat(timespec="seconds"), expires)
+    made = StoredToken(name, hash_of(token), now.isoformat(timespec="seconds"), expires)
     _write(folder, (*(one for one in read_tokens(folder) if not one.expired), made))
     return token
 
@@ -105,5 +105,5 @@ def end_tokens(folder: Path, name: str) -> int:
     return len(before) - len(left)
 
 
-def _write(folder: Path, tokens: tuple[Token, ...]) -> None:
+def _write(folder: Path, tokens: tuple[StoredToken, ...]) -> None:
     write_private(folder / TOKENS, msgspec.json.format(msgspec.json.encode(tokens), indent=1).decode() + "\n")

@@ -15,7 +15,7 @@ from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Observation, RobotDescription
-from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.ranger_monitor import announcement
 from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.agent.recordings.trajectory_file import TrajectoryFile
@@ -119,7 +119,7 @@ class Agent:
         keys: Keys,
         settings: AgentSettings,
         options: AgentOptions,
-        on_step: Callable[[Observation, Step], None] = lambda observation, step: None,
+        on_step: Callable[[Observation, TickResult], None] = lambda observation, step: None,
         print_line: Callable[[str], None] = lambda line: None,
     ) -> None:
         """Open the journal and join the fleet.
@@ -262,7 +262,7 @@ class Agent:
     def _say(self, line: str) -> None:
         self._print(f"{self._options.name}: {line}")
 
-    def _stepped(self, observation: Observation, step: Step) -> None:
+    def _stepped(self, observation: Observation, step: TickResult) -> None:
         self._stamp_ns = observation.stamp_ns
         if self._views is not None:
             self._views.keep(step.images, step.changes)
@@ -305,7 +305,7 @@ class Agent:
         self.pipeline.set_mission(mission)
         self._say(f"{cause}; it begins map {self.map_id}, and the old one stays")
 
-    def tick(self, observation: Observation) -> Step:
+    def tick(self, observation: Observation) -> TickResult:
         """One tick; see Runner.tick. Begins a fresh map where that is needed."""
         step = self.runner.tick(observation)
         if self.pipeline.lost:

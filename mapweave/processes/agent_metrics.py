@@ -23,7 +23,7 @@ from prometheus_client.registry import Collector
 
 from mapweave.agent.fleet_client import FAILED
 from mapweave.agent.mission import MayIDrive, Question, WhatIsKnown, WhereAmI, WhichWay, WhoIsNear
-from mapweave.agent.pipeline import Step
+from mapweave.agent.pipeline import TickResult
 from mapweave.agent.replication.replicator import ReplicationStatus
 from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import NotConnected, SettingsError
@@ -91,7 +91,7 @@ class AgentMetrics(Collector):
         """Read these with every scrape."""
         self._sources = sources
 
-    def step(self, step: Step, busy: float) -> None:
+    def step(self, step: TickResult, busy: float) -> None:
         """Take in a tick.
 
         Args:

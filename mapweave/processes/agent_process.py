@@ -13,7 +13,7 @@ import cv2
 
 from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.observation import Observation, RobotDescription
-from mapweave.agent.pipeline import Step
+from mapweave.agent.pipeline import TickResult
 from mapweave.agent.settings import AgentSettings
 from mapweave.extras import need
 from mapweave.hybridmap.counted import counted
@@ -61,7 +61,7 @@ def run_agent(
     rerun = None if options.rerun is None else rerun_log(options.rerun, options.name)
     metrics = None if options.metrics is None else _metrics(options.name)
 
-    def stepped(observation: Observation, step: Step) -> None:
+    def stepped(observation: Observation, step: TickResult) -> None:
         manager.alive()
         show(observation, step)
         if publisher is not None:

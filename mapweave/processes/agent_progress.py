@@ -9,7 +9,7 @@ from types import TracebackType
 from rich.console import Console
 
 from mapweave.agent.observation import Observation
-from mapweave.agent.pipeline import Step
+from mapweave.agent.pipeline import TickResult
 from mapweave.hybridmap.counted import counted
 from mapweave.terminal import Bar, EventLog
 
@@ -51,7 +51,7 @@ class AgentProgress:
         if self._bar is not None:
             self._bar.__exit__(kind, error, trace)
 
-    def __call__(self, observation: Observation, step: Step) -> None:
+    def __call__(self, observation: Observation, step: TickResult) -> None:
         """Show a tick."""
         status = step.status
         if self._bar is not None:

@@ -15,7 +15,7 @@ from rich.text import Text
 from mapweave.agent.drivers.camera import FrameSource
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.vision.calibration.collection import Guidance, ViewCollection
-from mapweave.vision.calibration.coverage import NAMES, Coverage
+from mapweave.vision.calibration.coverage import NAMES, ViewCoverage
 
 PATIENCE = 5.0
 """s without a frame after which the camera has ended."""
@@ -51,7 +51,7 @@ def panel(guidance: Guidance) -> Group:
     return Group(bars(guidance.coverage), Text(guidance.hint, style="bold"))
 
 
-def bars(coverage: Coverage) -> Table:
+def bars(coverage: ViewCoverage) -> Table:
     """Coverage in x, y, size and skew."""
     table = Table.grid(padding=(0, 1))
     for name, share in zip(NAMES, coverage.bars.tolist(), strict=True):

@@ -32,7 +32,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.observation import Command, Observation
 from mapweave.agent.occupancy_grid import GridCells
-from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import NotConnected, SettingsError
@@ -70,7 +70,7 @@ FREE, UNKNOWN, OCCUPIED = 0, 255, 100
 
 
 @dataclass(frozen=True, eq=False)
-class Moment:
+class LoggedTick:
     """What is written of one tick; nothing in it changes later.
 
     Attributes:
@@ -136,14 +136,14 @@ class RerunLog:
         self._stamp_ns = 0
         self._ticks = 0
         self._changed = True
-        self._waiting: queue.Queue[Moment | None] = queue.Queue(QUEUED)
+        self._waiting: queue.Queue[LoggedTick | None] = queue.Queue(QUEUED)
         self._words = ""
         self._path: list[Array] = []
         self._camera: Camera | None = None
         self._thread = threading.Thread(target=self._serve, name="rerun", daemon=True)
         self._thread.start()
 
-    def step(self, observation: Observation, step: Step, pipeline: Pipeline) -> None:
+    def step(self, observation: Observation, step: TickResult, pipeline: Pipeline) -> None:
         """Take in a tick; never waits.
 
         Args:
@@ -159,7 +159,7 @@ class RerunLog:
         tracks, bearings, landmarks, covariances = _tracked(pipeline)
         # Only this thread puts, so there is room.
         self._waiting.put_nowait(
-            Moment(
+            LoggedTick(
                 observation.stamp_ns,
                 pipeline.image,
                 pipeline.lens.camera,
@@ -207,7 +207,7 @@ class RerunLog:
     def _log(self, path: str, value: rr.AsComponents, static: bool = False) -> None:
         self._recording.log(f"{self._robot}/{path}", value, static=static)
 
-    def _write_camera(self, moment: Moment) -> None:
+    def _write_camera(self, moment: LoggedTick) -> None:
         camera, path = moment.camera, "map/robot/camera"
         if camera != self._camera:
             self._camera = camera
@@ -236,7 +236,7 @@ class RerunLog:
                 self._log(f"bearings/outermost_{side}", rr.Scalars(math.degrees(outermost)))
                 self._log(f"bearings/limit_{side}", limit)
 
-    def _write_pose(self, moment: Moment) -> None:
+    def _write_pose(self, moment: LoggedTick) -> None:
         self._log("map/robot/landmarks", rr.Points3D(moment.landmarks, radii=0.01, colors=[240, 160, 40]))
         self._log("map/robot/ellipsoids", _ellipsoids(moment.landmarks, moment.covariances))
         for name, value in (("forward", moment.command.forward), ("turn", moment.command.turn)):
@@ -253,7 +253,7 @@ class RerunLog:
         if not self._path or np.linalg.norm(here - self._path[-1]) > STEP:
             self._path.append(here)
 
-    def _write_map(self, moment: Moment) -> None:
+    def _write_map(self, moment: LoggedTick) -> None:
         if moment.map is not None:
             self._write_nodes(*moment.map)
         if moment.floor is not None:
@@ -268,7 +268,7 @@ class RerunLog:
         self._log("map/edges", _edges(places, edges))
         self._log("map/path", rr.LineStrips3D([self._path], colors=[90, 130, 255]))
 
-    def _write_words(self, moment: Moment) -> None:
+    def _write_words(self, moment: LoggedTick) -> None:
         status = moment.status
         now = f"{status.doing}: {status.detail}" if status.detail else status.doing
         self._log("now", rr.TextDocument(f"mission: {status.mission}\n\n{now}"))

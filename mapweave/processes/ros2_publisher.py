@@ -57,7 +57,7 @@ SPHERES, LINES, ADD, DELETE = 7, 5, 0, 2
 
 
 @dataclass(frozen=True)
-class Moment:
+class PublishedTick:
     """What is published of one tick.
 
     Attributes:
@@ -147,7 +147,7 @@ class Ros2Publisher:
         self._nodes: tuple[Node, ...] = ()
         self._edges: tuple[Edge, ...] = ()
         self._changed = threading.Condition()
-        self._newest: tuple[Moment, MergedPoses] | None = None
+        self._newest: tuple[PublishedTick, MergedPoses] | None = None
         self._closing = False
         self._thread = threading.Thread(target=self._serve, name="ros2-publisher", daemon=True)
         self._thread.start()
@@ -169,7 +169,7 @@ class Ros2Publisher:
         if changed:
             self._revision += 1
             self._nodes, self._edges = tuple(pipeline.map.nodes.values()), tuple(pipeline.map.edges.values())
-        moment = Moment(
+        moment = PublishedTick(
             observation.stamp_ns, pipeline.map_from_robot, self._odom_from_robot, self._nodes, self._edges,
             self._maps, self._revision,
         )  # fmt: skip
@@ -215,7 +215,7 @@ class Ros2Publisher:
                 self._publish_path(path, merged_from_map)
                 self._map.publish(_markers(moment, places, merged_from_map))
 
-    def _publish_pose(self, moment: Moment, merged_from_map: Pose2) -> None:
+    def _publish_pose(self, moment: PublishedTick, merged_from_map: Pose2) -> None:
         assert moment.map_from_robot is not None
         at = PoseGaussian(merged_from_map @ moment.map_from_robot.mean, moment.map_from_robot.covariance)
         stamp_ns = self._clock.remote(moment.stamp_ns)
@@ -250,7 +250,7 @@ def _apart(a: Pose2, b: Pose2) -> bool:
     return a.distance(b) > STEP or abs(wrap_angle(b.heading - a.heading)) > TURN
 
 
-def _merged_from_map(moment: Moment, merged: MergedPoses) -> Pose2:
+def _merged_from_map(moment: PublishedTick, merged: MergedPoses) -> Pose2:
     """Where the robot's own map lies in the merged map, by the nearest of its nodes that is placed there."""
     robot = Pose2() if moment.map_from_robot is None else moment.map_from_robot.mean
     placed = [(node, at) for node in moment.nodes if (at := merged.of(node.id)) is not None]
@@ -260,7 +260,9 @@ def _merged_from_map(moment: Moment, merged: MergedPoses) -> Pose2:
     return at.merged_from_node @ node.map_from_robot.mean.inverse()
 
 
-def _markers(moment: Moment, places: Mapping[NodeId, MergedPose | None], merged_from_map: Pose2) -> Any:
+def _markers(
+    moment: PublishedTick, places: Mapping[NodeId, MergedPose | None], merged_from_map: Pose2
+) -> Any:
     """Nodes where the merged map has them, else where the robot's own map has them; and edges in between."""
     points = {}
     for node in moment.nodes:

@@ -12,12 +12,12 @@ from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.http.last_shown import LastShown
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import HISTORY
 from mapweave.mapserver.merging.verification_cache_keeper import SUFFIX
 from mapweave.recorded_fleet.recording import VERDICTS, recorded_maps
-from mapweave.recorded_fleet.robot import RecordedRobot
+from mapweave.recorded_fleet.robot import ReplayedRobot
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import KeptHistory, encode
@@ -47,7 +47,7 @@ def prepare(folder: Path, store: Path, shown: LastShown) -> None:
                 journal.open_map(map_id.epoch)
                 written = journal.append(map_id, split(map_id, changes)[0], time.time_ns())
                 rows = journal.rows(map_id, 1, journal.head(map_id))
-                entries = [Entry(*row, change) for row, change in zip(rows, written, strict=True)]
+                entries = [ReceivedChange(*row, change) for row, change in zip(rows, written, strict=True)]
                 filled.apply(map_id, journal.log_id(map_id), entries)
         if VERDICTS.exists():
             shutil.copyfile(VERDICTS, store.with_name(store.name + SUFFIX))
@@ -69,7 +69,7 @@ class RecordedFleet:
         """
         self._stop = threading.Event()
         self._robots = [
-            RecordedRobot(bus, keys, server, map_id, *split(map_id, changes), _journal(folder, map_id))
+            ReplayedRobot(bus, keys, server, map_id, *split(map_id, changes), _journal(folder, map_id))
             for map_id, changes in recorded_maps().items()
         ]
         self._thread = threading.Thread(target=self._move, name="recorded fleet", daemon=True)

@@ -46,7 +46,7 @@ class _Motion:
     length: float = 0.0
 
 
-class RecordedRobot:
+class ReplayedRobot:
     """Announced on a bus until closed. Call `step` again and again."""
 
     def __init__(

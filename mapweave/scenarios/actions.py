@@ -74,7 +74,7 @@ class Send:
 
 
 @dataclass(frozen=True)
-class Photograph:
+class MapByPhotographs:
     """A free way, chosen from the seed, is mapped by photographs; a robot is put down where it begins.
 
     Attributes:
@@ -112,8 +112,8 @@ class TakeThrough:
 
 
 @dataclass(frozen=True)
-class Lie:
-    """It is tried what would become of the others if a robot had lied about its map.
+class TryLies:
+    """What would become of the others is tried if a robot had lied about its map.
 
     Attributes:
         robot: name.
@@ -199,10 +199,10 @@ Action = (
     | SetMission
     | Abduct
     | Send
-    | Photograph
+    | MapByPhotographs
     | Floors
     | TakeThrough
-    | Lie
+    | TryLies
     | KillAgent
     | StartAgent
     | KillServer
@@ -218,10 +218,10 @@ KINDS: dict[str, type[Any]] = {
     "mission": SetMission,
     "abduct": Abduct,
     "goto": Send,
-    "photograph": Photograph,
+    "photograph": MapByPhotographs,
     "floors": Floors,
     "take_through": TakeThrough,
-    "lie": Lie,
+    "lie": TryLies,
     "kill_agent": KillAgent,
     "start_agent": StartAgent,
     "kill_server": KillServer,

@@ -11,7 +11,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from mapweave.scenarios.expectations import Verdict
+from mapweave.scenarios.expectations import ExpectationResult
 from mapweave.scenarios.figures import MORE_IS_BETTER, Figures, as_text, kinds
 
 COUNTS_WITHOUT_WORST = frozenset({"components", "maps", "nodes", "edges", "loops", "links", "sim_s"})
@@ -31,7 +31,7 @@ class Attempt:
 
     seed: int
     figures: Figures | None = None
-    verdicts: Sequence[Verdict] = ()
+    verdicts: Sequence[ExpectationResult] = ()
     failure: str = ""
 
     @property

@@ -10,8 +10,8 @@ from mapweave.evaluation.map_score import crossed, is_false
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.scenarios.recording import Trajectory
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.scenarios.recording import TrialTrajectory
+from mapweave.sim.floorplan import BuildingPlan
 
 REACH = 1.5
 """A place is explored if a node was made this near to it, with no wall between, m."""
@@ -23,7 +23,7 @@ NEAREST = 4
 """So many of the nearest nodes are tried before a place counts as unexplored."""
 
 
-def explored_share(plan: FloorPlan, places: Array) -> float | None:
+def explored_share(plan: BuildingPlan, places: Array) -> float | None:
     """Share of the floor that is near a node; of closed parts of a building only those that hold nodes.
 
     Args:
@@ -61,7 +61,7 @@ def _holds(region: Array, places: Array) -> bool:
 def longest_loop(
     loops: Iterable[Edge],
     truth: Mapping[NodeId, Pose2],
-    trajectories: Mapping[str, Trajectory],
+    trajectories: Mapping[str, TrialTrajectory],
     stamps: Mapping[NodeId, int],
 ) -> float | None:
     """The longest way that a robot drove before one of its maps recognised where it had been, m.

@@ -9,7 +9,7 @@ import numpy as np
 
 from mapweave.drawing.map_picture import colours_of
 from mapweave.hybridmap.ids import MapId
-from mapweave.scenarios.recording import Lost, Moment
+from mapweave.scenarios.recording import Lost, TrialEvent
 from mapweave.scenarios.trajectories import TrajectoryScore
 
 NEAR = 0.02
@@ -21,7 +21,7 @@ DASHES = ("-", "--", ":", "-.")
 
 
 def draw_errors(
-    scores: Mapping[MapId, TrajectoryScore], moments: Sequence[Moment], lost: Sequence[Lost], path: Path
+    scores: Mapping[MapId, TrajectoryScore], moments: Sequence[TrialEvent], lost: Sequence[Lost], path: Path
 ) -> None:
     """Write a PNG: position error after the alignment of each map, with the events.
 
@@ -73,7 +73,7 @@ def draw_errors(
     figure.savefig(path, format="png")
 
 
-def _labels(moments: Sequence[Moment]) -> list[tuple[float, str]]:
+def _labels(moments: Sequence[TrialEvent]) -> list[tuple[float, str]]:
     """Time in s and label of the moments: `3`, or `3-5` for some that would be written over one another."""
     near = NEAR * max((moment.stamp_ns for moment in moments), default=0)
     labels: list[tuple[int, int, int]] = []

@@ -49,7 +49,7 @@ class Expectation:
 
 
 @dataclass(frozen=True)
-class Verdict:
+class ExpectationResult:
     """What came of one expectation.
 
     Attributes:
@@ -95,12 +95,14 @@ def parse_expectations(table: Mapping[str, Any], where: str = "expect") -> tuple
     return tuple(expectations)
 
 
-def check(figures: Figures, expectations: Sequence[Expectation]) -> list[Verdict]:
+def check(figures: Figures, expectations: Sequence[Expectation]) -> list[ExpectationResult]:
     """Judge. What was not measured is not good."""
     verdicts = []
     for wanted in expectations:
         value: Value | None = getattr(figures, wanted.name)
-        verdicts.append(Verdict(wanted.name, str(wanted), value, value is not None and wanted.accepts(value)))
+        verdicts.append(
+            ExpectationResult(wanted.name, str(wanted), value, value is not None and wanted.accepts(value))
+        )
     return verdicts
 
 

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mapweave.drawing.map_picture import colours_of
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 from mapweave.sim.snapshot import Snapshot
 
 Frame = NDArray[np.uint8]
@@ -49,8 +49,8 @@ SHIFT = 4
 
 
 @dataclass(frozen=True)
-class Layout:
-    """Where what is drawn.
+class FrameLayout:
+    """Where each part of a film's frame is drawn.
 
     Attributes:
         scale: of the plan, px per m.
@@ -69,7 +69,7 @@ class Layout:
     corners: tuple[tuple[int, int], ...]
 
 
-def lay_out(size: tuple[int, int], extent: tuple[float, float], robots: int) -> Layout:
+def lay_out(size: tuple[int, int], extent: tuple[float, float], robots: int) -> FrameLayout:
     """Share a frame between the plan, on the left, and a grid of camera images, on the right.
 
     Of all numbers of columns, the one with the largest product of the plan's area and the images' area.
@@ -81,7 +81,7 @@ def lay_out(size: tuple[int, int], extent: tuple[float, float], robots: int) -> 
     """
     width, height = size
 
-    def arrange(columns: int) -> tuple[float, Layout]:
+    def arrange(columns: int) -> tuple[float, FrameLayout]:
         rows = math.ceil(robots / columns)
         cell_height = min((height - GAP) // rows - LABEL - GAP, int(0.6 * width / columns * 3 / 4), LARGEST)
         cell = max(cell_height * 4 // 3, 4), max(cell_height, 3)
@@ -97,7 +97,7 @@ def lay_out(size: tuple[int, int], extent: tuple[float, float], robots: int) -> 
             for k in range(robots)
         )  # fmt: skip
         product = (scale * scale * extent[0] * extent[1]) * (cell[0] * cell[1] * robots)
-        return product, Layout(scale, left, top, columns, cell, corners)
+        return product, FrameLayout(scale, left, top, columns, cell, corners)
 
     return max((arrange(columns) for columns in range(1, robots + 1)), key=lambda found: found[0])[1]
 
@@ -111,7 +111,7 @@ class FilmFrame:
     """
 
     def __init__(
-        self, plan: FloorPlan, robots: Sequence[str], title: str = "", size: tuple[int, int] = (1280, 720)
+        self, plan: BuildingPlan, robots: Sequence[str], title: str = "", size: tuple[int, int] = (1280, 720)
     ) -> None:
         """Draw what does not move.
 

@@ -12,8 +12,8 @@ import numpy as np
 from mapweave.hybridmap.pose import Array
 from mapweave.scenarios.film import Film
 from mapweave.scenarios.film_frame import FilmFrame
-from mapweave.scenarios.fleet import Fleet, Stage
-from mapweave.scenarios.live import Live
+from mapweave.scenarios.fleet import TrialFleet, TrialStage
+from mapweave.scenarios.live import LiveFilm
 from mapweave.scenarios.scenario_runner import ScenarioRunner
 
 FILM = "film.webm"
@@ -39,7 +39,7 @@ class FilmingOptions:
 
 @contextmanager
 def filming(
-    stage: Stage, options: FilmingOptions, fleet: Fleet, out: Path
+    stage: TrialStage, options: FilmingOptions, fleet: TrialFleet, out: Path
 ) -> Iterator[Callable[[ScenarioRunner], None]]:
     """The function to call whenever simulated time stops.
 
@@ -52,7 +52,7 @@ def filming(
     with ExitStack() as stack:
         title = f"{stage.scenario.name}, seed {stage.seed}"
         film = stack.enter_context(Film(out / FILM, FRAMES_PER_SECOND)) if options.film else None
-        live = None if options.port is None else stack.enter_context(Live(options.port, title))
+        live = None if options.port is None else stack.enter_context(LiveFilm(options.port, title))
         if live is not None:
             options.say(f"watch at {live.url}")
         scene = FilmFrame(fleet.control.plan(), stage.robots, title)

@@ -19,7 +19,7 @@ TICKS_PER_SECOND = 10
 
 
 @dataclass(frozen=True)
-class Stage:
+class TrialStage:
     """Where a trial takes place.
 
     Attributes:
@@ -64,7 +64,7 @@ class Stage:
         return self.seed * 16 + self.robots.index(robot)
 
 
-class Fleet(Protocol):
+class TrialFleet(Protocol):
     """Server, simulator and agents, in lock-step. Time passes only in `advance`."""
 
     @property

@@ -10,9 +10,9 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.pose import Pose2
-from mapweave.scenarios.fleet import SERVER, Fleet, Stage
+from mapweave.scenarios.fleet import SERVER, TrialFleet, TrialStage
 from mapweave.scenarios.kidnap_planning import Kidnapping, NothingToShow, choose_goal, plan_kidnapping
-from mapweave.scenarios.recording import Fix, Lost
+from mapweave.scenarios.recording import Lost, RecordedLocalization
 from mapweave.storage.map_file import MapFile, unpack_map_file
 
 Note = Callable[[str, bool], None]
@@ -28,7 +28,11 @@ class KidnapEvents:
     """
 
     def __init__(
-        self, stage: Stage, fleet: Fleet, command: Callable[[str, MissionKind, NodeId], None], note: Note
+        self,
+        stage: TrialStage,
+        fleet: TrialFleet,
+        command: Callable[[str, MissionKind, NodeId], None],
+        note: Note,
     ) -> None:
         """Start with no robot lost.
 
@@ -54,7 +58,7 @@ class KidnapEvents:
                 continue
             status = report.status
             if lost.fix is None and status.fix_node is not None and status.mission == "goto":
-                lost.fix = Fix(report.stamp_ns, status.fix_node, status.node_from_robot)
+                lost.fix = RecordedLocalization(report.stamp_ns, status.fix_node, status.node_from_robot)
             if lost.arrived_ns is None and status.mission == "goto":
                 lost.legs = max(lost.legs, status.legs)
                 if status.finished and lost is self.sent.get(lost.robot):

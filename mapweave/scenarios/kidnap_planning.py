@@ -13,7 +13,7 @@ from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 
 CLEARANCE = 0.32
 """m from walls and furniture where the robot is put down: it must be able to turn."""
@@ -60,7 +60,7 @@ def plan_kidnapping(
     merged: HybridMap,
     components: Mapping[NodeId, int],
     truth: Mapping[NodeId, Pose2],
-    plan: FloorPlan,
+    plan: BuildingPlan,
     robots: tuple[str, ...],
     standing: Mapping[str, Pose2],
     seed: int,
@@ -115,10 +115,10 @@ def plan_kidnapping(
     raise NothingToShow("no free place near the nodes of such a room, from which the others leave a way")
 
 
-def _way(plan: FloorPlan, other_poses: Sequence[Pose2], start: Pose2) -> Callable[[Pose2], bool]:
+def _way(plan: BuildingPlan, other_poses: Sequence[Pose2], start: Pose2) -> Callable[[Pose2], bool]:
     """Tests whether a robot can get from one place to another around standing robots."""
     footprints = tuple(Rectangle(o.x, o.y, 2 * HALF_WIDTH, 2 * HALF_WIDTH, o.heading) for o in other_poses)
-    regions = FloorPlan(plan.rooms, plan.walls, (*plan.furniture, *footprints)).free_regions(ROOM)
+    regions = BuildingPlan(plan.rooms, plan.walls, (*plan.furniture, *footprints)).free_regions(ROOM)
 
     def region(pose: Pose2) -> int | None:
         gaps = [float(np.hypot(*(points - [pose.x, pose.y]).T).min()) for points in regions]
@@ -209,7 +209,7 @@ def _goals(
 
 
 def _place(
-    rng: np.random.Generator, plan: FloorPlan, nodes: list[Pose2], occupied: list[Pose2]
+    rng: np.random.Generator, plan: BuildingPlan, nodes: list[Pose2], occupied: list[Pose2]
 ) -> Pose2 | None:
     for _ in range(500):
         node = nodes[int(rng.integers(len(nodes)))]

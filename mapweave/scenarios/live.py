@@ -28,7 +28,7 @@ BOUNDARY = b"frame"
 STATIC = Path(__file__).with_name("static")
 
 
-class Live:
+class LiveFilm:
     """Shows the latest frame to any number of viewers; the trial never waits for them.
 
     Attributes:
@@ -47,7 +47,7 @@ class Live:
         """
         try:
             from mapweave.mapserver.http.same_site import SameSite
-            from mapweave.mapserver.http.serving import HttpThread, Limits
+            from mapweave.mapserver.http.serving import ConnectionTimeouts, HttpThread
         except ModuleNotFoundError as error:
             raise SettingsError(
                 f"the live view needs {error.name}: install the extra, pip install 'mapweave[server]'"
@@ -58,12 +58,12 @@ class Live:
         self._closed = False
         try:
             app = SameSite(_application(self, title), HOST)
-            self._http = HttpThread(app, (HOST, port), Limits(whole=None, stall=STUCK), "live")
+            self._http = HttpThread(app, (HOST, port), ConnectionTimeouts(whole=None, stall=STUCK), "live")
         except NotConnected as error:
             raise SettingsError(f"the live view cannot use port {port} ({error}); choose another") from None
         self.url = f"http://{HOST}:{self._http.port}/"
 
-    def __enter__(self) -> Live:
+    def __enter__(self) -> LiveFilm:
         """Nothing more to do."""
         return self
 
@@ -114,7 +114,7 @@ class Live:
         return None
 
 
-def _application(live: Live, title: str) -> ASGIApp:
+def _application(live: LiveFilm, title: str) -> ASGIApp:
     from starlette.applications import Starlette
     from starlette.requests import Request
     from starlette.responses import FileResponse, JSONResponse, PlainTextResponse, Response, StreamingResponse

@@ -10,22 +10,22 @@ import cv2
 import numpy as np
 
 from mapweave.agent.observation import Command, Observation
-from mapweave.agent.pipeline import Step
-from mapweave.agent.synchronization import Lockstep
+from mapweave.agent.pipeline import TickResult
+from mapweave.agent.synchronization import LockstepWaiting
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer, ServerSettings
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.processes.agent_process import rerun_log
 from mapweave.scenarios.actions import MISSION_KINDS
-from mapweave.scenarios.fleet import FIRST_EPOCH, FLEET, SERVER, Stage
+from mapweave.scenarios.fleet import FIRST_EPOCH, FLEET, SERVER, TrialStage
 from mapweave.settings import load_settings
 from mapweave.sim.ground_truth_client import SimControl
 from mapweave.sim.ground_truth_service import GroundTruthService
 from mapweave.sim.keys import SimKeys
 from mapweave.sim.simulation import Simulation
 from mapweave.wire.bus import Request
-from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
+from mapweave.wire.memory import MemoryBus, MemoryHub, MessageFaults
 
 if TYPE_CHECKING:
     from mapweave.processes.rerun_log import RerunLog
@@ -37,7 +37,7 @@ OVERTAKEN = 0.5
 class LocalFleet:
     """Calls every agent itself, tick by tick. Its answers are those of a fleet of processes."""
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: TrialStage) -> None:
         """Prepare; nothing runs yet."""
         self._stage = stage
         self.keys = SimKeys(FLEET)
@@ -118,13 +118,13 @@ class LocalFleet:
             epoch=FIRST_EPOCH,
             mission=MISSION_KINDS[stage.scenario.missions[robot]],
             seed=stage.agent_seed(robot),
-            synchronization=Lockstep(),
+            synchronization=LockstepWaiting(),
             server=SERVER,
         )
         if path := stage.rerun_log(robot):
             self._logs[robot] = rerun_log(path, robot)
 
-        def stepped(observation: Observation, step: Step) -> None:
+        def stepped(observation: Observation, step: TickResult) -> None:
             if robot in self._logs:
                 self._logs[robot].step(observation, step, self._agents[robot].pipeline)
 
@@ -155,7 +155,7 @@ class LocalFleet:
 
     def worsen(self, robot: str, loss: float, delay: float) -> None:
         """Lose some of what the robot publishes, and let later messages overtake some."""
-        faults = Faults(drop=loss, delay=OVERTAKEN if delay > 0.0 else 0.0)
+        faults = MessageFaults(drop=loss, delay=OVERTAKEN if delay > 0.0 else 0.0)
         random = np.random.default_rng([self._stage.seed, 0x105E, self._stage.robots.index(robot)])
         self._hub.disturb(faults, random, self._buses[robot])
 

@@ -18,13 +18,13 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.own_maps import maps_of
-from mapweave.scenarios.actions import Lie
+from mapweave.scenarios.actions import TryLies
 from mapweave.scenarios.figures import measured
-from mapweave.scenarios.fleet import Fleet, Stage
+from mapweave.scenarios.fleet import TrialFleet, TrialStage
 from mapweave.scenarios.liar.lies import EVERY, UNDECIDABLE, Map
-from mapweave.scenarios.liar.trial import Outcome, Trial, row, totals
+from mapweave.scenarios.liar.trial import ContainmentOutcome, LiarTrial, row, totals
 from mapweave.sim.camera import CameraSetup
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 from mapweave.sim.imager import Imager
 from mapweave.sim.scene import Scene
 from mapweave.sim.world import PanelSet, World
@@ -49,7 +49,7 @@ class Lies:
     """
 
     robot: str
-    outcomes: Mapping[str, Outcome]
+    outcomes: Mapping[str, ContainmentOutcome]
 
     def figures(self) -> dict[str, Any]:
         """The figures of the trial, see mapweave.scenarios.figures."""
@@ -63,7 +63,9 @@ class Lies:
         }
 
 
-def lie(stage: Stage, fleet: Fleet, action: Lie, merged: MapFile, note: Callable[[str, bool], None]) -> Lies:
+def lie(
+    stage: TrialStage, fleet: TrialFleet, action: TryLies, merged: MapFile, note: Callable[[str, bool], None]
+) -> Lies:
     """Give the others' maps to a server, then the robot's with one lie in it; for each way again.
 
     The fleet itself goes on untouched.
@@ -92,7 +94,7 @@ def lie(stage: Stage, fleet: Fleet, action: Lie, merged: MapFile, note: Callable
     lost = lost_views(stage.scenario.world(stage.seed), camera, others, action.queries, stage.seed)
     outcomes = {}
     with tempfile.TemporaryDirectory() as folder, _silent():
-        trial = Trial(liar, maps, lost, others, stage.seed, Path(folder))
+        trial = LiarTrial(liar, maps, lost, others, stage.seed, Path(folder))
         note(row("an honest fourth robot", trial.beside), not trial.beside.contained)
         for name in action.ways or EVERY:
             outcomes[name] = one = trial.outcome(EVERY[name])
@@ -138,7 +140,7 @@ def lost_views(
     return out
 
 
-def _poses(plan: FloorPlan, near: list[Pose2], count: int, rng: np.random.Generator) -> list[Pose2]:
+def _poses(plan: BuildingPlan, near: list[Pose2], count: int, rng: np.random.Generator) -> list[Pose2]:
     out: list[Pose2] = []
     for _ in range(TRIES):
         at = near[int(rng.integers(len(near)))] @ Pose2.from_vector(rng.normal(0.0, NEAR))

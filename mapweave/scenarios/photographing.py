@@ -9,8 +9,8 @@ from mapweave.hybridmap.errors import InvalidFile, NotConnected
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.photographs import map_of_photographs, send_map
-from mapweave.scenarios.actions import Photograph
-from mapweave.scenarios.fleet import FIRST_EPOCH, SERVER, Fleet, Stage
+from mapweave.scenarios.actions import MapByPhotographs
+from mapweave.scenarios.fleet import FIRST_EPOCH, SERVER, TrialFleet, TrialStage
 from mapweave.sim.photographer import walk
 from mapweave.sim.robots import camera_from_table
 
@@ -20,7 +20,7 @@ OFF = (0.15, 0.08, 0.15)
 """Standard deviations of a robot's start pose around the first photograph, m, m and rad."""
 
 
-def photograph(stage: Stage, fleet: Fleet, action: Photograph) -> dict[NodeId, Pose2]:
+def photograph(stage: TrialStage, fleet: TrialFleet, action: MapByPhotographs) -> dict[NodeId, Pose2]:
     """Take photographs, make a map of them, and give it to the server.
 
     Returns:

@@ -10,7 +10,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2
-from mapweave.scenarios.fleet import FLEET, Fleet, Stage
+from mapweave.scenarios.fleet import FLEET, TrialFleet, TrialStage
 from mapweave.storage.map_file import MapFile
 
 CLEAR = 0.8
@@ -24,7 +24,7 @@ class PortalEvents:
         goal: a node beyond the lift, clear of robots.
     """
 
-    def __init__(self, stage: Stage, fleet: Fleet, note: Callable[[str, bool], None]) -> None:
+    def __init__(self, stage: TrialStage, fleet: TrialFleet, note: Callable[[str, bool], None]) -> None:
         """Start without floors."""
         self._stage, self._fleet, self._note = stage, fleet, note
         self._person = Person(fleet=FLEET, by="scenario", bus=fleet.bus)

@@ -8,7 +8,7 @@ from collections.abc import Callable
 
 from mapweave.hybridmap.errors import MapweaveError, NotConnected
 from mapweave.scenarios.children import Children, free_port
-from mapweave.scenarios.fleet import FIRST_EPOCH, FLEET, SERVER, Stage
+from mapweave.scenarios.fleet import FIRST_EPOCH, FLEET, SERVER, TrialStage
 from mapweave.scenarios.network_emulator import NetworkEmulator
 from mapweave.sim.ground_truth_client import SimControl
 from mapweave.wire.bus_settings import BusSettings
@@ -36,7 +36,7 @@ class ProcessFleet:
     a cable.
     """
 
-    def __init__(self, stage: Stage) -> None:
+    def __init__(self, stage: TrialStage) -> None:
         """Prepare; nothing runs yet."""
         self._stage = stage
         self.keys = Keys(FLEET)

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.scenarios.lying import Lies
-from mapweave.sim.floorplan import FloorPlan
+from mapweave.sim.floorplan import BuildingPlan
 from mapweave.storage.map_file import MapFile
 
 
 @dataclass(frozen=True, eq=False)
-class Trajectory:
+class TrialTrajectory:
     """Poses over time.
 
     Attributes:
@@ -29,7 +29,7 @@ class Trajectory:
 
 
 @dataclass(frozen=True)
-class Fix:
+class RecordedLocalization:
     """How a lost robot was localized.
 
     Attributes:
@@ -64,7 +64,7 @@ class Lost:
     stamp_ns: int
     world_from_robot: Pose2
     goal: NodeId | None = None
-    fix: Fix | None = None
+    fix: RecordedLocalization | None = None
     arrived_ns: int | None = None
     gave_up_ns: int | None = None
     legs: int = 0
@@ -85,8 +85,8 @@ class RobotRecord:
         map_hash: SHA-256 over the robot's own maps as they would be sent.
     """
 
-    truth: Trajectory
-    estimates: Mapping[MapId, Trajectory]
+    truth: TrialTrajectory
+    estimates: Mapping[MapId, TrialTrajectory]
     collisions: int
     map_bytes: int
     wire_bytes: int
@@ -95,8 +95,8 @@ class RobotRecord:
 
 
 @dataclass(frozen=True)
-class Moment:
-    """Something that happened.
+class TrialEvent:
+    """An event of a trial.
 
     Attributes:
         stamp_ns: when, simulated.
@@ -110,7 +110,7 @@ class Moment:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class TrialRecording:
     """A whole trial.
 
     Attributes:
@@ -132,10 +132,10 @@ class Recording:
     scenario: str
     seed: int
     robots: Mapping[str, RobotRecord]
-    plan: FloorPlan
+    plan: BuildingPlan
     merged: MapFile
     lost: tuple[Lost, ...] = ()
-    moments: tuple[Moment, ...] = ()
+    moments: tuple[TrialEvent, ...] = ()
     recoveries_s: tuple[float, ...] = ()
     sim_s: float = 0.0
     wall_s: float = 0.0

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapweave.drawing.map_picture import Drive, MapPicture, draw_map, outline_of
+from mapweave.drawing.map_picture import DrawnDrive, MapPicture, draw_map, outline_of
 from mapweave.evaluation.map_score import MapScore, is_false, score_map, write_tum
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -19,9 +19,9 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.error_plot import draw_errors
-from mapweave.scenarios.expectations import Verdict
+from mapweave.scenarios.expectations import ExpectationResult
 from mapweave.scenarios.figures import Figures
-from mapweave.scenarios.recording import Lost, Recording, Trajectory
+from mapweave.scenarios.recording import Lost, TrialRecording, TrialTrajectory
 from mapweave.scenarios.report_page import report_page
 from mapweave.scenarios.score import node_truth
 from mapweave.scenarios.trajectories import score_trajectory
@@ -34,7 +34,11 @@ OWN = ("*.tum", "merged.mapweave", "map.png", "errors.png", "report.md", "scenar
 
 
 def write_folder(
-    out: Path, recording: Recording, figures: Figures, verdicts: Sequence[Verdict], scenario_text: str
+    out: Path,
+    recording: TrialRecording,
+    figures: Figures,
+    verdicts: Sequence[ExpectationResult],
+    scenario_text: str,
 ) -> None:
     """Write everything that a trial measured; a crash leaves whole files only, and no `figures.json`.
 
@@ -70,7 +74,11 @@ def write_folder(
 
 
 def _write_all(
-    out: Path, recording: Recording, figures: Figures, verdicts: Sequence[Verdict], scenario_text: str
+    out: Path,
+    recording: TrialRecording,
+    figures: Figures,
+    verdicts: Sequence[ExpectationResult],
+    scenario_text: str,
 ) -> None:
     whole, truth = HybridMap(recording.merged.changes), node_truth(recording)
     poses = {n: (c, p.mean) for n, (c, p) in recording.merged.poses.items()}
@@ -105,7 +113,7 @@ def _write_all(
 
 
 def _map_picture(
-    recording: Recording,
+    recording: TrialRecording,
     figures: Figures,
     whole: HybridMap,
     places: dict[NodeId, Pose2],
@@ -136,28 +144,30 @@ def _map_picture(
     )
 
 
-def _drive(lost: Lost, truth: Trajectory, nodes: dict[NodeId, Pose2]) -> Drive:
+def _drive(lost: Lost, truth: TrialTrajectory, nodes: dict[NodeId, Pose2]) -> DrawnDrive:
     """Where a robot went from where it was put down, until it arrived or was given up."""
     ends = [t for t in (lost.arrived_ns, lost.gave_up_ns) if t is not None]
     last = min(ends) if ends else int(truth.stamps_ns[-1])
     # At the stamp itself it may still have been where it came from.
     during = (truth.stamps_ns > lost.stamp_ns) & (truth.stamps_ns <= last)
     goal = nodes.get(lost.goal) if lost.goal is not None else None
-    return Drive(truth.poses[during, :2], lost.world_from_robot, goal, f"drive of {lost.robot}", lost.robot)
+    return DrawnDrive(
+        truth.poses[during, :2], lost.world_from_robot, goal, f"drive of {lost.robot}", lost.robot
+    )
 
 
-def _node_trajectory(whole: HybridMap, places: dict[NodeId, Pose2], robot: str) -> Trajectory:
+def _node_trajectory(whole: HybridMap, places: dict[NodeId, Pose2], robot: str) -> TrialTrajectory:
     """A robot's places in the order in which it saw them."""
     own = sorted((node for node in places if node.agent == robot), key=lambda n: (whole.nodes[n].stamp_ns, n))
     stamps = np.array([whole.nodes[node].stamp_ns for node in own], np.int64)
-    return Trajectory(stamps, np.array([places[node].vector for node in own]).reshape(-1, 3))
+    return TrialTrajectory(stamps, np.array([places[node].vector for node in own]).reshape(-1, 3))
 
 
 def _estimate_name(map_id: MapId) -> str:
     return f"{map_id.agent}.map-{map_id.epoch}.tum"
 
 
-def _write_tum(path: Path, trajectory: Trajectory) -> None:
+def _write_tum(path: Path, trajectory: TrialTrajectory) -> None:
     """No file for an empty one: others' tools do not take it."""
     if len(trajectory.stamps_ns):
         with _beside(path) as part:

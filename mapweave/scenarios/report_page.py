@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 from mapweave.hybridmap.ids import MapId
-from mapweave.scenarios.expectations import Verdict
+from mapweave.scenarios.expectations import ExpectationResult
 from mapweave.scenarios.figures import Figures, as_text
-from mapweave.scenarios.recording import Recording
+from mapweave.scenarios.recording import TrialRecording
 
 GROUPS = {
     "Merged map": (
@@ -33,9 +33,9 @@ GROUPS = {
 
 
 def report_page(
-    recording: Recording,
+    recording: TrialRecording,
     figures: Figures,
-    verdicts: Sequence[Verdict],
+    verdicts: Sequence[ExpectationResult],
     files: Mapping[MapId, tuple[str, str]],
     film: bool,
 ) -> str:
@@ -105,7 +105,7 @@ def _robots(figures: Figures) -> list[str]:
     return _table(("robot", *names, "map_hash"), rows)
 
 
-def _measured(verdict: Verdict) -> str:
+def _measured(verdict: ExpectationResult) -> str:
     return "not measured" if verdict.measured is None else as_text(verdict.measured)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.errors import InvalidMessage, NotConnected
 from mapweave.hybridmap.ids import MapId
-from mapweave.scenarios.recording import Trajectory
+from mapweave.scenarios.recording import TrialTrajectory
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
@@ -94,14 +94,16 @@ class Reports:
                 return ServerReport.decode(reply.payload)
         raise NotConnected(f"map server {name}: {replies[0].error if replies else 'no answer'}")
 
-    def estimates(self, robot: str) -> dict[MapId, Trajectory]:
+    def estimates(self, robot: str) -> dict[MapId, TrialTrajectory]:
         """`map_from_robot` over time, of each map that the robot made."""
         with self._lock:
             by_map = {
                 map_id: dict(sorted(p.items())) for map_id, p in self._poses.items() if map_id.agent == robot
             }
         return {
-            map_id: Trajectory(np.array(list(p), dtype=np.int64), np.array(list(p.values())).reshape(-1, 3))
+            map_id: TrialTrajectory(
+                np.array(list(p), dtype=np.int64), np.array(list(p.values())).reshape(-1, 3)
+            )
             for map_id, p in by_map.items()
         }
 

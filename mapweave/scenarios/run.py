@@ -12,11 +12,11 @@ from typing import Any
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.scenarios.disks import read_disks
-from mapweave.scenarios.expectations import Verdict, check
+from mapweave.scenarios.expectations import ExpectationResult, check
 from mapweave.scenarios.figures import Figures
 from mapweave.scenarios.filming import FilmingOptions, filming
-from mapweave.scenarios.fleet import Fleet, Stage
-from mapweave.scenarios.recording import Recording, RobotRecord, Trajectory
+from mapweave.scenarios.fleet import TrialFleet, TrialStage
+from mapweave.scenarios.recording import RobotRecord, TrialRecording, TrialTrajectory
 from mapweave.scenarios.scenario import Scenario
 from mapweave.scenarios.scenario_runner import ScenarioRunner
 from mapweave.scenarios.score import score
@@ -59,12 +59,12 @@ class TrialOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class Trial:
-    """What came of it."""
+class TrialResult:
+    """What came of a trial."""
 
-    recording: Recording
+    recording: TrialRecording
     figures: Figures
-    verdicts: tuple[Verdict, ...]
+    verdicts: tuple[ExpectationResult, ...]
 
     def as_dict(self) -> dict[str, Any]:
         """For JSON."""
@@ -82,7 +82,7 @@ class Trial:
         return all(verdict.good for verdict in self.verdicts)
 
 
-def run_trial(scenario: Scenario, options: TrialOptions) -> Trial:
+def run_trial(scenario: Scenario, options: TrialOptions) -> TrialResult:
     """Run a scenario and leave its report in a folder.
 
     Raises:
@@ -93,17 +93,19 @@ def run_trial(scenario: Scenario, options: TrialOptions) -> Trial:
     # A world that cannot be built shall be one line, before anything has been started.
     starting_places(scenario.world(options.seed), scenario.robots, options.seed)
     _make_room(options.out)
-    stage = Stage(scenario, options.seed, options.out, options.settings, options.settings_file, options.rerun)
+    stage = TrialStage(
+        scenario, options.seed, options.out, options.settings, options.settings_file, options.rerun
+    )
     with TerminalProgress(scenario.name, stage.robots, len(scenario.events), options.quiet) as show:
         recording = _record(stage, options, show)
         show.stage("scoring")
         figures = score(recording)
         verdicts = tuple(check(figures, scenario.expectations))
         write_folder(options.out, recording, figures, verdicts, scenario.text)
-    return Trial(recording, figures, verdicts)
+    return TrialResult(recording, figures, verdicts)
 
 
-def _record(stage: Stage, options: TrialOptions, show: TerminalProgress) -> Recording:
+def _record(stage: TrialStage, options: TrialOptions, show: TerminalProgress) -> TrialRecording:
     began = time.monotonic()
     with ExitStack() as stack:
         fleet = _fleet(stage, options.processes)
@@ -125,7 +127,7 @@ def _record(stage: Stage, options: TrialOptions, show: TerminalProgress) -> Reco
         show.stage("asking for the merged map and the truth")
         merged = runner.merged()
         status, control = fleet.control.status(), fleet.control
-        truth = {robot: Trajectory(*control.trajectory(robot)) for robot in stage.robots}
+        truth = {robot: TrialTrajectory(*control.trajectory(robot)) for robot in stage.robots}
         runner.agents = runner.reports.agents(stage.robots)
         plan, wall = control.plan(), fleet.wall()
         reports = runner.reports
@@ -143,7 +145,7 @@ def _record(stage: Stage, options: TrialOptions, show: TerminalProgress) -> Reco
         )
         for robot in stage.robots
     }
-    return Recording(
+    return TrialRecording(
         scenario=stage.scenario.name,
         seed=stage.seed,
         robots=robots,
@@ -160,7 +162,7 @@ def _record(stage: Stage, options: TrialOptions, show: TerminalProgress) -> Reco
     )
 
 
-def _fleet(stage: Stage, processes: bool) -> Fleet:
+def _fleet(stage: TrialStage, processes: bool) -> TrialFleet:
     if processes:
         from mapweave.scenarios.process_fleet import ProcessFleet
 

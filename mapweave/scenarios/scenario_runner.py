@@ -16,12 +16,12 @@ from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios import actions
 from mapweave.scenarios.actions import MISSION_KINDS
-from mapweave.scenarios.fleet import SERVER, TICKS_PER_SECOND, Fleet, Stage
+from mapweave.scenarios.fleet import SERVER, TICKS_PER_SECOND, TrialFleet, TrialStage
 from mapweave.scenarios.kidnap_events import KidnapEvents
 from mapweave.scenarios.lying import Lies, lie
 from mapweave.scenarios.photographing import beside, photograph
 from mapweave.scenarios.portal_events import PortalEvents
-from mapweave.scenarios.recording import Lost, Moment
+from mapweave.scenarios.recording import Lost, TrialEvent
 from mapweave.scenarios.reports import Reports
 from mapweave.scenarios.scenario import CONDITIONS, LONGEST, ScenarioEvent, When
 from mapweave.sim import events
@@ -58,8 +58,8 @@ class ScenarioRunner:
 
     def __init__(
         self,
-        stage: Stage,
-        fleet: Fleet,
+        stage: TrialStage,
+        fleet: TrialFleet,
         on_look: Callable[[ScenarioRunner], None] = lambda runner: None,
         stride: float = STRIDE,
     ) -> None:
@@ -76,7 +76,7 @@ class ScenarioRunner:
         self._on_look = on_look
         self._stride = min(stride, STRIDE)
         self.reports = Reports(fleet.bus, fleet.keys)
-        self.moments: list[Moment] = []
+        self.moments: list[TrialEvent] = []
         self.recoveries_s: list[float] = []
         self.now = 0.0
         self.done = 0
@@ -114,7 +114,7 @@ class ScenarioRunner:
 
     def note(self, text: str, trouble: bool = False) -> None:
         """Remember that something happened now."""
-        self.moments.append(Moment(round(self.now * 1e9), text, trouble))
+        self.moments.append(TrialEvent(round(self.now * 1e9), text, trouble))
 
     # Waiting
 
@@ -192,13 +192,13 @@ class ScenarioRunner:
                         raise InvalidValue("goto: goal = 'beyond', and there are no floors")
                     goal = str(self._portals.goal)
                 self._losing.send(robot, goal)
-            case actions.Photograph(robot):
+            case actions.MapByPhotographs(robot):
                 self.photographed |= photograph(self._stage, fleet, action)
                 first = next(pose for node, pose in self.photographed.items() if node.agent == action.name)
                 self.note(f"{action.count} photographs become map {action.name}")
                 fleet.control.kidnap(robot, beside(first, self._stage.seed))
                 self._losing.mark(robot)
-            case actions.Lie(robot):
+            case actions.TryLies(robot):
                 self._recover(time.monotonic())
                 self.lies = lie(self._stage, fleet, action, self.merged(), self.note)
             case actions.Floors():

@@ -18,7 +18,7 @@ from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.coverage import explored_share, longest_loop
 from mapweave.scenarios.figures import Figures, RobotFigures, measured
-from mapweave.scenarios.recording import Lost, Recording, RobotRecord, Trajectory
+from mapweave.scenarios.recording import Lost, RobotRecord, TrialRecording, TrialTrajectory
 from mapweave.scenarios.trajectories import score_trajectory
 
 FOUND_M, FOUND_DEG = 0.25, 5.0
@@ -28,7 +28,7 @@ REACHED_M, REACHED_DEG = 0.05, 3.0
 HALF_TICK_NS = 50_000_000
 
 
-def score(recording: Recording) -> Figures:
+def score(recording: TrialRecording) -> Figures:
     """Judge a trial by the truth.
 
     Raises:
@@ -94,12 +94,12 @@ def score(recording: Recording) -> Figures:
     )  # fmt: skip
 
 
-def _lies(recording: Recording) -> dict[str, Any]:
+def _lies(recording: TrialRecording) -> dict[str, Any]:
     """The figures of lies, if a robot has lied."""
     return {} if recording.lies is None else recording.lies.figures()
 
 
-def node_truth(recording: Recording) -> dict[NodeId, Pose2]:
+def node_truth(recording: TrialRecording) -> dict[NodeId, Pose2]:
     """Where each node of the merged map truly is: `world_from_robot` when its image was taken.
 
     Raises:
@@ -116,7 +116,7 @@ def node_truth(recording: Recording) -> dict[NodeId, Pose2]:
     return truth
 
 
-def pose_at(trajectory: Trajectory, stamp_ns: int) -> Pose2:
+def pose_at(trajectory: TrialTrajectory, stamp_ns: int) -> Pose2:
     """Where a robot was at a time.
 
     Raises:
@@ -152,7 +152,7 @@ class _Fall:
     goal_s: float | None
 
 
-def _score_lost(lost: Lost, truth: Trajectory, nodes: Mapping[NodeId, Pose2]) -> _Fall:
+def _score_lost(lost: Lost, truth: TrialTrajectory, nodes: Mapping[NodeId, Pose2]) -> _Fall:
     error_m = error_deg = after_s = None
     if lost.fix is not None:
         after_s = (lost.fix.stamp_ns - lost.stamp_ns) / 1e9

@@ -5,7 +5,7 @@ from __future__ import annotations
 from rich.table import Table
 
 from mapweave.scenarios.figures import as_text
-from mapweave.scenarios.run import Trial
+from mapweave.scenarios.run import TrialResult
 from mapweave.scenarios.scenario import Scenario
 
 SHOWN = (
@@ -18,7 +18,7 @@ SHOWN = (
 """Of the figures; all of them are in figures.json."""
 
 
-def summary_table(scenario: Scenario, seed: int, trial: Trial) -> Table:
+def summary_table(scenario: Scenario, seed: int, trial: TrialResult) -> Table:
     """Verdicts first, then the figures that were measured."""
     verdict = "[green]passed[/]" if trial.passed else "[red]failed[/]"
     table = Table(title=f"{scenario.name}, seed {seed}: {verdict}", show_header=False)

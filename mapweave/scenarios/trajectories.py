@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from mapweave.evaluation.map_score import align
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
-from mapweave.scenarios.recording import Trajectory
+from mapweave.scenarios.recording import TrialTrajectory
 
 RPE_DELTA = 1.0
 """m of the true path between the two poses of a pair."""
@@ -42,7 +42,7 @@ class TrajectoryScore:
     errors: Array
 
 
-def score_trajectory(truth: Trajectory, estimate: Trajectory) -> TrajectoryScore:
+def score_trajectory(truth: TrialTrajectory, estimate: TrialTrajectory) -> TrajectoryScore:
     """Compare one map's trajectory with the truth.
 
     The alignment is the planar one of `mapweave.evaluation.map_score.align`: where evo's own in three
@@ -86,7 +86,7 @@ def score_trajectory(truth: Trajectory, estimate: Trajectory) -> TrajectoryScore
     )
 
 
-def _evo_trajectory(trajectory: Trajectory) -> Any:
+def _evo_trajectory(trajectory: TrialTrajectory) -> Any:
     """The same for evo."""
     from evo.core.trajectory import PoseTrajectory3D
 

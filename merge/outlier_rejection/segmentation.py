@@ -23,7 +23,7 @@ from mapweave.merge.outlier_rejection.loop_closures import CLAIMS, sort_loop_clo
 from mapweave.merge.outlier_rejection.pairwise_consistency import group_links, sort_links
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import RefusedLink, link_of
 from mapweave.merge.settings import ConsistencySettings
@@ -80,7 +80,7 @@ def _pieces(hybrid_map: HybridMap, s: ConsistencySettings) -> list[Fragment]:
     for graph in solver.solve(kept, whole=True):
         inside = [strand for strand in strands if strand.name in graph.rows]
         measurements = [m for strand in inside for m in strand.measurements]
-        measurements += [Measurement(*k.pair, k.a_from_b, robust=True) for k in kept if k.a in graph.rows]
+        measurements += [RelativePose(*k.pair, k.a_from_b, robust=True) for k in kept if k.a in graph.rows]
         about = sorted((r for r in refusals if r.a in graph.rows), key=lambda r: (r.pair, str(r.edge)))
         pieces.append(Fragment(graph.anchor, graph, tuple(measurements), tuple(about)))
     return pieces
@@ -92,9 +92,9 @@ def _strands(hybrid_map: HybridMap, edges: list[Edge]) -> list[Fragment]:
     graph.add_nodes_from(hybrid_map.nodes)
     graph.add_edges_from((edge.a, edge.b) for edge in edges)
     names = {node: min(piece) for piece in nx.connected_components(graph) for node in piece}
-    measurements: dict[NodeId, list[Measurement]] = {name: [] for name in sorted(set(names.values()))}
+    measurements: dict[NodeId, list[RelativePose]] = {name: [] for name in sorted(set(names.values()))}
     for edge in edges:
-        measurements[names[edge.a]].append(Measurement(edge.a, edge.b, edge.a_from_b))
+        measurements[names[edge.a]].append(RelativePose(edge.a, edge.b, edge.a_from_b))
     return [
         Fragment(name, solve_graph(name, hybrid_map.nodes[name].map_from_robot.mean, inside), tuple(inside))
         for name, inside in measurements.items()

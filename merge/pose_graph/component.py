@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.merge.pose_graph.factors import Factors, Measurement, Rows
+from mapweave.merge.pose_graph.factors import Factors, RelativePose, Rows
 from mapweave.merge.pose_graph.optimization import ANCHOR_SIGMA, optimized
 from mapweave.merge.pose_graph.solved_graph import PoseGraph, factorized
 from mapweave.registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
@@ -175,7 +175,7 @@ def pieces(part: Factors, count: int) -> Rows:
     return out
 
 
-def solve_graph(anchor: NodeId, anchor_pose: Pose2, measurements: Iterable[Measurement]) -> Component:
+def solve_graph(anchor: NodeId, anchor_pose: Pose2, measurements: Iterable[RelativePose]) -> Component:
     """Optimise one connected component, from along a tree of the most certain measurements.
 
     Args:
@@ -200,7 +200,7 @@ def solve_graph(anchor: NodeId, anchor_pose: Pose2, measurements: Iterable[Measu
 
 
 def along_tree(
-    anchor: NodeId, anchor_pose: Pose2, measurements: Sequence[Measurement]
+    anchor: NodeId, anchor_pose: Pose2, measurements: Sequence[RelativePose]
 ) -> dict[NodeId, Pose2]:
     """Poses along a minimum spanning tree of uncertainty."""
     graph: nx.Graph = nx.Graph()

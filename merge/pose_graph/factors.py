@@ -26,8 +26,8 @@ LEAST_SHARE = 2e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Measurement:
-    """A relative pose.
+class RelativePose:
+    """A measured relative pose of two nodes.
 
     Attributes:
         a: one node.
@@ -72,7 +72,7 @@ class Factors:
     weights: Array
 
     @staticmethod
-    def of(measurements: Sequence[Measurement], a: Sequence[int], b: Sequence[int]) -> Factors:
+    def of(measurements: Sequence[RelativePose], a: Sequence[int], b: Sequence[int]) -> Factors:
         """Of measurements between rows."""
         covariances = np.array([m.a_from_b.covariance for m in measurements]).reshape(-1, 3, 3)
         means = [(m.x, m.y, m.heading) for m in (measurement.a_from_b.mean for measurement in measurements)]

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 
 from mapweave.hybridmap.ids import NodeId
-from mapweave.merge.pose_graph.factors import Factors, Measurement
+from mapweave.merge.pose_graph.factors import Factors, RelativePose
 from mapweave.merge.pose_graph.links import RefusedLink
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
@@ -25,7 +25,7 @@ class Fragment:
 
     name: NodeId
     graph: PoseGraph
-    measurements: tuple[Measurement, ...]
+    measurements: tuple[RelativePose, ...]
     refused: tuple[RefusedLink, ...] = ()
 
     @property

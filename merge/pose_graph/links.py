@@ -14,7 +14,7 @@ from mapweave.hybridmap.explanation import ALIASED
 from mapweave.hybridmap.ids import MERGE_AUTHOR, EdgeId, MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import PoseGaussian
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 
 LEAST_DISTINCT = 10
 """A link with aliased and fewer other landmarks identifies no place: a recognition needs as many."""
@@ -88,9 +88,9 @@ class Link:
         return reversed_link
 
     @cached_property
-    def measurement(self) -> Measurement:
+    def measurement(self) -> RelativePose:
         """Its relative pose of the two nodes; it may be wrong."""
-        return Measurement(self.a, self.b, self.a_from_b, robust=True)
+        return RelativePose(self.a, self.b, self.a_from_b, robust=True)
 
     def canonical(self) -> Link:
         """The same link with the smaller id first."""

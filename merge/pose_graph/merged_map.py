@@ -42,7 +42,7 @@ class Placement(NamedTuple):
     merged_from_robot: PoseGaussian
 
 
-class Poses(Mapping[NodeId, Placement]):
+class NodePoses(Mapping[NodeId, Placement]):
     """The poses of all nodes of some solved components, worked out when they are asked for."""
 
     def __init__(self, graphs: Sequence[PoseGraph]) -> None:
@@ -169,13 +169,13 @@ class MergedMap:
 
     def pose(self, node: NodeId) -> Pose2:
         """Where a node is in its component's frame, without covariance: quick also in a large map."""
-        if isinstance(self.poses, Poses):
+        if isinstance(self.poses, NodePoses):
             return self.poses.pose(node)
         return self.poses[node].merged_from_robot.mean
 
     def component_of(self, node: NodeId) -> int | None:
         """Number of the node's component."""
-        if isinstance(self.poses, Poses):
+        if isinstance(self.poses, NodePoses):
             return self.poses.number(node)
         placement = self.poses.get(node)
         return None if placement is None else placement.component

@@ -15,7 +15,7 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2
 from mapweave.merge.pose_graph.component import Component
-from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.registration.pose_arrays import compose_poses
 
@@ -58,7 +58,7 @@ class PinnedFrames:
         if not pins:
             return merged
         return replace(
-            merged, graphs=graphs, poses=Poses(graphs) if holding else merged.poses, pins=tuple(pins)
+            merged, graphs=graphs, poses=NodePoses(graphs) if holding else merged.poses, pins=tuple(pins)
         )
 
     def _graph(self, graph: PoseGraph, pin: Pin) -> PoseGraph:

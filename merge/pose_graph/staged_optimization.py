@@ -21,7 +21,7 @@ from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component import Component, pieces
 from mapweave.merge.pose_graph.factors import Factors, Rows
 from mapweave.merge.pose_graph.links import RefusedLink, refuse, refuse_edge
-from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.pose_graph.optimization import optimized
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.registration.pose_arrays import compose_poses, inverse_poses
@@ -74,23 +74,26 @@ class StagedOptimization:
             return merged
         graphs = [one for g in merged.graphs for one in (kept[id(g)].graphs if id(g) in kept else (g,))]
         if len(graphs) == len(merged.graphs):
-            return replace(merged, graphs=tuple(graphs), poses=Poses(graphs))
+            return replace(merged, graphs=tuple(graphs), poses=NodePoses(graphs))
         graphs.sort(key=lambda graph: (-len(graph.nodes), graph.anchor))
         parted = set[Pair]().union(*(known.parted for known in kept.values()))
         refused = sorted(
-            (*merged.refused, *_refused(merged, implausible, parted, Poses(graphs))), key=lambda one: one.pair
+            (*merged.refused, *_refused(merged, implausible, parted, NodePoses(graphs))),
+            key=lambda one: one.pair,
         )
         return replace(
             merged,
             links=tuple(link for link in merged.links if link.key not in parted),
             refused=tuple(refused),
             components=tuple(frozenset(graph.nodes) for graph in graphs),
-            poses=Poses(graphs),
+            poses=NodePoses(graphs),
             graphs=tuple(graphs),
         )
 
 
-def _refused(merged: MergedMap, odd: Set[MapId], parted: Set[Pair], poses: Poses) -> Iterator[RefusedLink]:
+def _refused(
+    merged: MergedMap, odd: Set[MapId], parted: Set[Pair], poses: NodePoses
+) -> Iterator[RefusedLink]:
     """The links between what is not joined, and the drives."""
     for link in merged.links:
         if link.key in parted:

@@ -9,7 +9,12 @@ import numpy as np
 
 from mapweave.hybridmap.node import Node
 from mapweave.merge.pose_graph.links import Link, RefusedLink
-from mapweave.registration.recognition import Recognition, RecognitionSettings, Refusal, examine_nodes
+from mapweave.registration.recognition import (
+    Recognition,
+    RecognitionFailure,
+    RecognitionSettings,
+    examine_nodes,
+)
 
 MOST_SIGMA_XY = 0.16
 """Largest standard deviation of their relative position, m. A link that may be off by half a metre joins
@@ -48,7 +53,9 @@ def verify(a: Node, b: Node, settings: RecognitionSettings | None = None) -> Lin
     return RefusedLink(a.id, b.id, verdict.reason)
 
 
-def examine(a: Node, b: Node, settings: RecognitionSettings | None = None) -> Recognition | Refusal:
+def examine(
+    a: Node, b: Node, settings: RecognitionSettings | None = None
+) -> Recognition | RecognitionFailure:
     """Input of `verify`: the same seeds, the same numbers.
 
     Args:

@@ -15,7 +15,7 @@ from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.sim.floorplan import Rectangle
 from mapweave.sim.surface import TEXELS_PER_METRE
 from mapweave.sim.texture import Painter, Texture
-from mapweave.sim.world import Block, Panel, Piece, World, block_panels, upright_panel
+from mapweave.sim.world import Block, FurniturePiece, Panel, World, block_panels, upright_panel
 from mapweave.sim.worlds.design import DARK, Design, Furniture, Poster, Room, Wall, check_design, floor_area
 from mapweave.sim.worlds.faces import BEFORE, cut_face, nearest_face, room_before
 from mapweave.sim.worlds.lamps import lamps_of
@@ -83,7 +83,7 @@ class _Builder:
         design, plan = self._design, self._plan
         blocks: list[Block] = []
         panels: list[Panel] = []
-        pieces: list[Piece] = []
+        pieces: list[FurniturePiece] = []
         for number, (wall, base) in enumerate(zip(design.walls, plan.walls, strict=True)):
             blocks.append(Block(base, 0.0, self._height(wall)))
             seeds = iter(self._seeds(WALLS, number, wall.seed))
@@ -93,7 +93,9 @@ class _Builder:
             block = Block(base, 0.0, piece.height)
             sides = self._sides(piece, block, seeds, f"{self._where}: furniture[{number}]")
             block_range = range(len(blocks), len(blocks) + 1)
-            pieces.append(Piece(block_range, range(len(panels), len(panels) + len(sides)), piece.movable))
+            pieces.append(
+                FurniturePiece(block_range, range(len(panels), len(panels) + len(sides)), piece.movable)
+            )
             blocks.append(block)
             panels += sides
         for number, poster in enumerate(design.posters):

@@ -22,7 +22,7 @@ from mapweave.storage.settings_file import build
 
 
 @dataclass(frozen=True)
-class Kind:
+class WorldKind:
     """How one kind of world is made.
 
     Attributes:
@@ -34,13 +34,13 @@ class Kind:
     design: Callable[[Any, int], Design]
 
 
-KINDS: dict[str, Kind] = {
-    "office": Kind(OfficeParameters, office),
-    "corridor": Kind(CorridorParameters, corridor),
-    "warehouse": Kind(WarehouseParameters, warehouse),
-    "twins": Kind(TwinsParameters, twins),
-    "arena": Kind(ArenaParameters, arena),
-    "passage": Kind(PassageParameters, passage),
+KINDS: dict[str, WorldKind] = {
+    "office": WorldKind(OfficeParameters, office),
+    "corridor": WorldKind(CorridorParameters, corridor),
+    "warehouse": WorldKind(WarehouseParameters, warehouse),
+    "twins": WorldKind(TwinsParameters, twins),
+    "arena": WorldKind(ArenaParameters, arena),
+    "passage": WorldKind(PassageParameters, passage),
 }
 
 

@@ -8,8 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapweave.sim.floorplan import FloorPlan, Rectangle
-from mapweave.sim.furnishing import Site, against_wall, standing
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
+from mapweave.sim.furnishing import RoomSurroundings, against_wall, standing
 from mapweave.sim.worlds.design import Furniture
 from mapweave.sim.worlds.layout import piece_rectangle
 
@@ -31,7 +31,7 @@ Place = Callable[[np.random.Generator, Rectangle, Rectangle], Rectangle]
 
 def furnish(
     rng: np.random.Generator,
-    plan: FloorPlan,
+    plan: BuildingPlan,
     room: Rectangle,
     stock: tuple[Furniture, ...],
     by_wall: int,
@@ -47,7 +47,7 @@ def furnish(
         by_wall: so many of the pieces are placed along the walls.
         count: pieces that are wanted.
     """
-    site = Site(plan, room)
+    site = RoomSurroundings(plan, room)
     pieces: list[Furniture] = []
     for index in range(count):
         kind = stock[int(rng.integers(len(stock)))]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from mapweave.hybridmap.pose import Array
-from mapweave.sim.floorplan import FloorPlan, distances_to
+from mapweave.sim.floorplan import BuildingPlan, distances_to
 from mapweave.sim.worlds.design import DARK, Design, Room, floor_area
 from mapweave.sim.worlds.layout import exact
 from mapweave.sim.worlds.light import Vector
@@ -18,7 +18,7 @@ OPEN = 0.3
 """Light comes from the next room through an edge at least so long, m."""
 
 
-def lamps_of(design: Design, plan: FloorPlan) -> list[tuple[Vector, ...]]:
+def lamps_of(design: Design, plan: BuildingPlan) -> list[tuple[Vector, ...]]:
     """For each room the lamps that shine into it, in its frame: its own, and those of rooms it is open to."""
     own = [_hung(room, design.height) for room in design.rooms]
     lamps = []
@@ -55,7 +55,7 @@ def _touching(design: Design, number: int) -> list[int]:
     ]
 
 
-def _open(design: Design, plan: FloorPlan, a: int, b: int) -> bool:
+def _open(design: Design, plan: BuildingPlan, a: int, b: int) -> bool:
     """Whether two rooms that touch share an edge without a wall all along it."""
     rooms = design.rooms[a], design.rooms[b]
     low = np.max([room.low for room in rooms], axis=0)

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from mapweave.hybridmap.pose import Array
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 from mapweave.sim.worlds.design import Design, Furniture, Room, Wall
 
 QUANTUM = 2.0**-20
@@ -15,9 +15,9 @@ QUANTUM = 2.0**-20
 to the last bit, which is what makes twin rooms twins."""
 
 
-def plan_of(design: Design) -> FloorPlan:
+def plan_of(design: Design) -> BuildingPlan:
     """The floor plan of a design."""
-    return FloorPlan(
+    return BuildingPlan(
         tuple(room_rectangle(room) for room in design.rooms),
         tuple(wall_rectangle(wall) for wall in design.walls),
         tuple(piece_rectangle(piece) for piece in design.furniture),

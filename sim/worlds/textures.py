@@ -71,7 +71,7 @@ class Textures:
         """
         self._folder = folder
         self._common = common
-        self._pictures: dict[str, Picture] = {}
+        self._pictures: dict[str, PictureTexture] = {}
 
     def painter(self, name: str, paint: float, where: str) -> Painter:
         """The painter of a name.
@@ -109,9 +109,9 @@ class Textures:
             )
         raise InvalidValue(f"{where}: no texture {name!r}; {hint}")
 
-    def _picture(self, name: str, where: str) -> Picture:
+    def _picture(self, name: str, where: str) -> PictureTexture:
         if name not in self._pictures:
-            self._pictures[name] = Picture(_read(self._folder / name, where))
+            self._pictures[name] = PictureTexture(_read(self._folder / name, where))
         return self._pictures[name]
 
 
@@ -161,7 +161,7 @@ class Plain:
 
 
 @dataclass(frozen=True, eq=False)
-class Picture:
+class PictureTexture:
     """A picture from a file, stretched over the surface."""
 
     image: Image

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
@@ -33,7 +33,7 @@ def rangers(pose: Pose2) -> np.ndarray:
     return np.clip(np.minimum(np.abs(x), np.abs(y)) - BODY.radius, 0.0, BODY.ranger_reach)
 
 
-def live(walls, pipeline: Pipeline, ticks: int) -> tuple[list[Observation], list[Step], list[Pose2]]:
+def live(walls, pipeline: Pipeline, ticks: int) -> tuple[list[Observation], list[TickResult], list[Pose2]]:
     """Let a pipeline drive a base that executes its commands exactly."""
     pose, moved = Pose2(), Odometry(0.0, 0.0)
     observations, steps, poses = [], [], []
@@ -55,7 +55,7 @@ def on(mission, settings=None, body=BODY) -> Pipeline:
     return pipeline
 
 
-def essence(step: Step) -> tuple[object, ...]:
+def essence(step: TickResult) -> tuple[object, ...]:
     """All of a step, to the last bit."""
     return (step.command, [encode_body(change) for change in step.changes], step.questions, step.status)
 

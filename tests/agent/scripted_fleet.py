@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapweave.agent.mission import Answer, MayIDrive, Question
+from mapweave.agent.mission import MayIDrive, Question, ServerAnswer
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.robots_in_view import RobotBeside
@@ -30,7 +30,7 @@ WALL_AHEAD = np.where(np.cos(BEARINGS) > 0.8, 0.06, 3.0)
 EXACT = np.diag([1e-4, 1e-4, 1e-5])
 IMAGE = np.zeros((240, 320), np.uint8)
 TOUR = [Pose2(1.0 + 1.2 * k, 2.0) for k in range(3)]
-Fleet = Callable[[Question], Answer]
+Fleet = Callable[[Question], ServerAnswer]
 
 
 def home_world() -> World:
@@ -69,9 +69,9 @@ class Trial:
         self.asked: list[Question] = []
         self.commands: list[Command] = []
         self.said: list[tuple[str, str]] = []
-        self.traffic: Fleet = lambda question: Answer(question.number, None, "no map server answered")
+        self.traffic: Fleet = lambda question: ServerAnswer(question.number, None, "no map server answered")
         self._moved = Odometry(0.0, 0.0)
-        self._answers: tuple[Answer, ...] = ()
+        self._answers: tuple[ServerAnswer, ...] = ()
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         for tick in range(round(seconds / BODY.tick)):
@@ -109,10 +109,10 @@ def here(node: NodeId, node_from_robot: Pose2) -> Whereabouts:
     return Whereabouts(node, PoseGaussian(node_from_robot, EXACT), None, 0, 30, 0.99)
 
 
-def found(question: Question, *places: Whereabouts) -> Answer:
+def found(question: Question, *places: Whereabouts) -> ServerAnswer:
     """One place is found; several are ambiguous; none is unknown."""
     certainty = (Certainty.UNKNOWN, Certainty.FOUND)[len(places)] if len(places) < 2 else Certainty.AMBIGUOUS
-    return Answer(question.number, RelocalizeAnswer(certainty, places, "it may be a or b"))
+    return ServerAnswer(question.number, RelocalizeAnswer(certainty, places, "it may be a or b"))
 
 
 def bare(node_id: NodeId) -> Node:

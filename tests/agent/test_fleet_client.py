@@ -13,7 +13,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapweave.agent.fleet_client import NO_ANSWER, FleetClient
-from mapweave.agent.mission import Answer, MayIDrive, Question, WhatIsKnown, WhereAmI, WhichWay, WhoIsNear
+from mapweave.agent.mission import (
+    MayIDrive,
+    Question,
+    ServerAnswer,
+    WhatIsKnown,
+    WhereAmI,
+    WhichWay,
+    WhoIsNear,
+)
 from mapweave.agent.mission_control import MissionControl
 from mapweave.hybridmap.agent_status import MAX_STATUS_WORDS, AgentStatus, Status
 from mapweave.hybridmap.camera import Camera
@@ -261,7 +269,7 @@ def test_a_robot_never_waits(link: FleetClient, other: MemoryBus) -> None:
     assert link.answers() == ()
     assert time.monotonic() - begin < 20
     release.set()
-    got: list[Answer] = []
+    got: list[ServerAnswer] = []
     eventually(lambda: got.extend(link.answers()) or got)
     assert [answer.number for answer in got] == [1]
 
@@ -390,7 +398,7 @@ def test_a_question_that_cannot_be_sent_is_answered_and_the_next_one_is_asked(
     other.serve(sent_by_any(KEYS.route("s0")), lambda request: request.reply(encode(RouteAnswer((), "yes"))))
     link.ask(WhichWay(1, HERE, THERE, Pose2(), ((HERE, THERE),) * (MAX_BLOCKED + 1)))
     link.ask(WhichWay(2, HERE, THERE))
-    got: list[Answer] = []
+    got: list[ServerAnswer] = []
     eventually(lambda: got.extend(link.answers()) or len(got) == 2)
     assert got[0].content is None
     assert "length <= 256 - at `$.blocked`" in got[0].error

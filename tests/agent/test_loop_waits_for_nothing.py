@@ -19,7 +19,7 @@ from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission import Idle, WhichWay
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.agent.pipeline import Step
+from mapweave.agent.pipeline import TickResult
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.runner import Runner
@@ -186,10 +186,10 @@ class Slow:
     def clock(self) -> float:
         return self.now
 
-    def step(self, observation: Observation, answers: object, driven: object) -> Step:
+    def step(self, observation: Observation, answers: object, driven: object) -> TickResult:
         before, self.now = self.now, self.now + self.durations.pop(0)
         questions = (WhichWay(1, NODE, NODE),) if before <= self.asks_at < self.now else ()
-        return Step(Command(), (), questions, Status("mapping", "", 0, 0, Pose2(), False))
+        return TickResult(Command(), (), questions, Status("mapping", "", 0, 0, Pose2(), False))
 
 
 class Fleet:
@@ -264,7 +264,7 @@ def test_a_driver_may_reuse_the_memory_of_its_image_and_count_stamps_with_numpy(
             return super().sense()
 
     class Keeping(Slow):
-        def step(self, observation: Observation, answers: object, driven: object) -> Step:
+        def step(self, observation: Observation, answers: object, driven: object) -> TickResult:
             kept.append(observation)
             return super().step(observation, answers, driven)
 

@@ -6,7 +6,7 @@ import pytest
 
 from mapweave.agent.exploration.phase import Phase
 from mapweave.agent.mission import Explore, GoTo, Idle, Mission
-from mapweave.agent.navigation.stage import Stage
+from mapweave.agent.navigation.stage import NavigationStage
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.settings import AgentSettings, NavigatorSettings
 from mapweave.hybridmap.ids import NodeId
@@ -18,7 +18,7 @@ def test_a_robot_that_has_parked_makes_room_and_others_do_not(walls, allowed):
     navigation = NavigatorSettings(make_room=allowed)
     goal, aside = NodeId("r2", 1, 1), NodeId("r2", 1, 9)
 
-    def asked(mission: Mission, stage: Stage) -> Pipeline:
+    def asked(mission: Mission, stage: NavigationStage) -> Pipeline:
         pipeline = Pipeline(MAP, BODY, AgentSettings(navigation=navigation))
         pipeline.set_mission(GoTo(goal))
         pipeline._navigator.stage = stage
@@ -27,11 +27,11 @@ def test_a_robot_that_has_parked_makes_room_and_others_do_not(walls, allowed):
         pipeline.step(still(walls, tick=1))
         return pipeline
 
-    parked = asked(GoTo(goal), Stage.ARRIVED)
+    parked = asked(GoTo(goal), NavigationStage.ARRIVED)
     assert parked.mission == GoTo(aside if allowed else goal)
-    assert asked(GoTo(goal), Stage.LOST).mission == GoTo(goal), "it is on its way"
-    assert asked(GoTo(goal), Stage.GIVEN_UP).mission == GoTo(goal), "it has failed"
-    assert asked(Idle(), Stage.ARRIVED).mission == Idle(), "it was stopped"
+    assert asked(GoTo(goal), NavigationStage.LOST).mission == GoTo(goal), "it is on its way"
+    assert asked(GoTo(goal), NavigationStage.GIVEN_UP).mission == GoTo(goal), "it has failed"
+    assert asked(Idle(), NavigationStage.ARRIVED).mission == Idle(), "it was stopped"
     step = parked.step(still(walls, tick=2))
     assert ("makes room" in step.status.detail) == allowed
 
@@ -59,7 +59,7 @@ def test_no_server_makes_a_parked_robot_drive_for_ever(walls):
     for order in range(2):
         driven = []
         for tick in range(1, 20):
-            pipeline._navigator.stage = Stage.ARRIVED
+            pipeline._navigator.stage = NavigationStage.ARRIVED
             pipeline._others.aside = NodeId("r2", 1, 10 + tick)
             pipeline.step(still(walls, tick=20 * order + tick))
             driven.append(pipeline.mission.node.number)

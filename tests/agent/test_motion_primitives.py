@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from mapweave.agent.mission import Answer, Question, WhichWay
+from mapweave.agent.mission import Question, ServerAnswer, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.hybridmap.camera import Camera
@@ -19,12 +19,14 @@ BODY = RobotDescription(Camera(64, 48, 60, 60, 32, 24, 0.3), tick=0.1)
 HERE, THERE = NodeId("r0", 1, 1), NodeId("r1", 1, 1)
 
 
-def ask(fleet: Callable[[int, Question], Answer | None], patience: int = 100) -> tuple[Answer, list[float]]:
+def ask(
+    fleet: Callable[[int, Question], ServerAnswer | None], patience: int = 100
+) -> tuple[ServerAnswer, list[float]]:
     """Ask a way of a fleet that answers the n-th question (from 0) within a tick; when it was asked, s."""
     motion = MotionPrimitives(BODY, patience)
     behaviour = motion.ask(WhichWay(motion.number(), HERE, THERE))
     asked: list[float] = []
-    answers: tuple[Answer, ...] = ()
+    answers: tuple[ServerAnswer, ...] = ()
     while True:
         motion.take_in(Observation(0, Odometry(0.0, 0.0), None), answers)
         try:
@@ -39,11 +41,11 @@ def ask(fleet: Callable[[int, Question], Answer | None], patience: int = 100) ->
 
 
 def test_a_busy_server_is_asked_again_at_its_time() -> None:
-    def fleet(n: int, question: Question) -> Answer:
+    def fleet(n: int, question: Question) -> ServerAnswer:
         pauses = (0.8, 2.0)
         if n < len(pauses):
-            return Answer(question.number, None, "busy", pauses[n])
-        return Answer(question.number, RouteAnswer((), "here you go"))
+            return ServerAnswer(question.number, None, "busy", pauses[n])
+        return ServerAnswer(question.number, RouteAnswer((), "here you go"))
 
     answer, asked = ask(fleet)
     assert isinstance(answer.content, RouteAnswer)
@@ -54,13 +56,13 @@ def test_a_busy_server_is_asked_again_at_its_time() -> None:
 
 
 def test_a_server_that_stays_busy_is_left_with_its_retry_time() -> None:
-    answer, asked = ask(lambda _, question: Answer(question.number, None, "busy", 1.5), patience=50)
+    answer, asked = ask(lambda _, question: ServerAnswer(question.number, None, "busy", 1.5), patience=50)
     assert (answer.content, answer.error, answer.retry_after) == (None, "busy", 1.5)
     assert len(asked) == 4
 
 
 def test_another_refusal_is_final_and_silence_is_waited_for() -> None:
-    answer, asked = ask(lambda _, question: Answer(question.number, None, "no such node"))
+    answer, asked = ask(lambda _, question: ServerAnswer(question.number, None, "no such node"))
     assert (answer.error, len(asked)) == ("no such node", 1)
     answer, asked = ask(lambda *_: None, patience=7)
     assert (answer.error, len(asked)) == (NO_ANSWER, 1)

@@ -12,7 +12,7 @@ from mapweave.agent.global_localization import pose_consistency
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mission import Carried, Driven, Explore, GoTo, Idle, WhereAmI, WhoIsNear
 from mapweave.agent.observation import Command, Observation, Odometry
-from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.settings import AgentSettings, NavigatorSettings
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.ids import NodeId
@@ -302,7 +302,7 @@ def test_a_robot_carried_off_forgets_what_its_rangers_have_seen(walls, start):
     assert commands[-1] == 0.0, "the robot knows nothing of where it is now"
 
 
-def lift(walls, pipeline: Pipeline, tick: int) -> list[Step]:
+def lift(walls, pipeline: Pipeline, tick: int) -> list[TickResult]:
     """A person lifts the robot, carries it, and puts it down where it sees something else."""
     away = Pose2(0.3, 0.0, math.pi)
     seen = [still(walls, tick=tick + k, kidnapped=True) for k in range(3)]
@@ -401,7 +401,7 @@ def near_views(monkeypatch) -> None:
     monkeypatch.setattr(pose_consistency, "OTHER_VIEW", (0.2, 0.9))
 
 
-def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list[Step]]:
+def carried_after_navigating(walls, places) -> tuple[Pipeline, set[NodeId], list[TickResult]]:
     """A robot that has mapped from x = -1.0 to -0.3 m, has a goal for a while, and then is carried on.
 
     Args:

@@ -20,7 +20,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Ack
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.pose_messages import MergedPose, PoseNews
-from synthetic.own_map import OwnMap
+from synthetic.own_map import SurveyedMap
 from synthetic.world import room
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.waiting import eventually
@@ -30,10 +30,10 @@ DAY = 86_400_000_000_000
 
 
 @pytest.fixture(scope="module")
-def own() -> OwnMap:
+def own() -> SurveyedMap:
     """A map of the same way on two days."""
     rng = np.random.default_rng(3)
-    world, own = room(0, 0, 8, 4, 1600, rng), OwnMap(MAP, rng)
+    world, own = room(0, 0, 8, 4, 1600, rng), SurveyedMap(MAP, rng)
     for day, y in ((0, 2.0), (1, 2.15)):
         own.drive(world, [Pose2(1.5 + 0.6 * k, y, 0.3) for k in range(6)], day * DAY)
     return own
@@ -48,7 +48,7 @@ def retired(pipeline: Pipeline, days: int) -> list[NodeId]:
     return gone
 
 
-def test_it_does_so_while_it_rests_and_not_on_a_drive_to_a_goal(own: OwnMap) -> None:
+def test_it_does_so_while_it_rests_and_not_on_a_drive_to_a_goal(own: SurveyedMap) -> None:
     contents = tuple(own.map.contents())
     resting = Pipeline(MAP, DESCRIPTION, None, contents, 1000)
     assert not retired(resting, 10), "too soon"
@@ -60,7 +60,7 @@ def test_it_does_so_while_it_rests_and_not_on_a_drive_to_a_goal(own: OwnMap) -> 
 
 
 @pytest.fixture
-def agent(own: OwnMap, tmp_path: Path) -> Iterator[tuple[Agent, MemoryBus]]:
+def agent(own: SurveyedMap, tmp_path: Path) -> Iterator[tuple[Agent, MemoryBus]]:
     hub = MemoryHub()
     options = AgentOptions("r0", tmp_path, epoch=1, patience=0.0)
     agent = Agent(lambda: DESCRIPTION, MemoryBus(hub), KEYS, AgentSettings(), options)
@@ -68,7 +68,7 @@ def agent(own: OwnMap, tmp_path: Path) -> Iterator[tuple[Agent, MemoryBus]]:
     agent.close()
 
 
-def test_what_a_server_has_it_must_have_let_go(own: OwnMap, agent: tuple[Agent, MemoryBus]) -> None:
+def test_what_a_server_has_it_must_have_let_go(own: SurveyedMap, agent: tuple[Agent, MemoryBus]) -> None:
     robot, server = agent
     old, new = NodeId(*MAP, 1), NodeId(*MAP, 2)
     assert robot._released(old, new), "no server knows it"

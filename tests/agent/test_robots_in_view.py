@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.mission import Answer, Explore, WhoIsNear
+from mapweave.agent.mission import Explore, ServerAnswer, WhoIsNear
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.robots_in_view import EVERY, NUMBER, OLDEST, OVERDUE, SIGMAS, RobotsInView
 from mapweave.hybridmap.camera import Camera
@@ -43,7 +43,7 @@ class Eyes:
         assert (question.number, question.radius, question.speed) == (NUMBER, BODY.radius, BODY.max_forward)
         assert question.height > CAMERA.mount_height and question.sigma == pytest.approx(0.01)
         assert not self.others.due, "one question at a time"
-        self.seen = self.step(answers=(Answer(NUMBER, NearbyAnswer(robots)),))
+        self.seen = self.step(answers=(ServerAnswer(NUMBER, NearbyAnswer(robots)),))
 
     def step(
         self, seconds: float = 0.0, odometry: Odometry | None = None, answers=(), landmarks=NO_LANDMARKS
@@ -176,7 +176,7 @@ def test_the_pipeline_asks_once_it_is_on_its_map_and_marks_the_image(walls) -> N
     mapper_step = pipeline.mapper.step
     pipeline.mapper.step = lambda observation: (seen.append(observation), mapper_step(observation))[1]  # type: ignore[method-assign]
     moved, pose, who = Odometry(0.0, 0.0), Pose2(), []
-    answers: tuple[Answer, ...] = ()
+    answers: tuple[ServerAnswer, ...] = ()
     while len(seen) < 300 and (not who or answers):
         step = pipeline.step(
             Observation(len(seen) * 100_000_000, moved, walls.render(pose), rangers(pose)), answers
@@ -185,7 +185,7 @@ def test_the_pipeline_asks_once_it_is_on_its_map_and_marks_the_image(walls) -> N
         answers = ()
         if asked := [question for question in step.questions if isinstance(question, WhoIsNear)]:
             who += asked
-            answers = (Answer(NUMBER, NearbyAnswer((other(1.6, 0.0, 0.01),))),)
+            answers = (ServerAnswer(NUMBER, NearbyAnswer((other(1.6, 0.0, 0.01),))),)
         moved = Odometry(step.command.forward * BODY.tick, step.command.turn * BODY.tick)
         pose = pose @ moved.motion()
     ((nearest, node_from_robot), *_) = who[0].starts

@@ -10,7 +10,7 @@ import pytest
 from mapweave.agent.drivers.messages import decode_observation, encode_observation
 from mapweave.agent.mission import Carried, Explore, GoTo, Idle
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.ranger_monitor import RangerMonitor
 from mapweave.agent.settings import AgentSettings, ExplorerSettings
 from mapweave.hybridmap.camera import Camera
@@ -36,7 +36,7 @@ class Drive:
         self.walls, self.pipeline = walls, pipeline
         self.pose, self.tick, self._moved = Pose2(), 0, Odometry(0.0, 0.0)
 
-    def run(self, ticks: int, broken: Broken = lambda readings: readings) -> list[Step]:
+    def run(self, ticks: int, broken: Broken = lambda readings: readings) -> list[TickResult]:
         steps = []
         for _ in range(ticks):
             observation = Observation(

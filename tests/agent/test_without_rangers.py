@@ -9,7 +9,7 @@ import pytest
 from mapweave.agent.cautious_driving import CREEP, SLOW
 from mapweave.agent.mission import Carried, Driven, Explore, Mission
 from mapweave.agent.observation import Command, Observation, Odometry
-from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.ranger_monitor import announcement
 from mapweave.agent.settings import AgentSettings, ExplorerSettings
 from mapweave.hybridmap.pose import Pose2
@@ -23,11 +23,11 @@ class Life:
     """A robot before the pictures, whose base executes commands exactly until it meets something."""
 
     def __init__(self, walls, pipeline: Pipeline, body=BARE, end: float = 9.0) -> None:
-        self.pose, self.steps, self.poses = Pose2(), list[Step](), list[Pose2]()
+        self.pose, self.steps, self.poses = Pose2(), list[TickResult](), list[Pose2]()
         self._walls, self._pipeline, self._body, self._end = walls, pipeline, body, end
         self._moved, self._tick, self._bumped = Odometry(0.0, 0.0), 0, False
 
-    def go(self, ticks: int, driven: Driven | None = None) -> Step:
+    def go(self, ticks: int, driven: Driven | None = None) -> TickResult:
         for _ in range(ticks):
             proximity = rangers(self.pose) if self._body.ranger_bearings else rangers(self.pose)[:0]
             image = self._walls.render(self.pose)

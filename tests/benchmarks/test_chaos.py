@@ -22,7 +22,7 @@ from benchmarks.chaos.schedule import KILLS, LEAST_KILLS, Kind, draw_schedule
 from benchmarks.chaos.scripted_robot import ScriptedRobot
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.change import Change
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import element_of, encode_change
 
@@ -42,7 +42,10 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
         head += len(journal.append(script.map, bodies, step * STAMP))
         lines += [f"T {step} {len(bodies)} {digest(bodies)}", f"C {step} {head} {step / 10}"]
     (folder / "r0.truth").write_text("\n".join(lines))
-    entries = [Entry.read(script.map, one.sequence, encode_change(one)) for one in sent_changes(folder, 0, 5)]
+    entries = [
+        ReceivedChange.read(script.map, one.sequence, encode_change(one))
+        for one in sent_changes(folder, 0, 5)
+    ]
     store.apply(script.map, journal.log_id(script.map), entries)
     journal.close()
     store.close()
@@ -116,7 +119,9 @@ def test_what_a_store_deletes_of_a_large_map_is_not_lost(
 def test_what_is_twice_or_elsewhere_is_counted(fleet: tuple[list[Change], Journal, SqliteStore]) -> None:
     sent, journal, store = fleet
     # As if the last change had been taken twice, the second time under the next number.
-    twice = Entry.read(sent[0].map, len(sent) + 1, encode_change(replace(sent[-1], sequence=len(sent) + 1)))
+    twice = ReceivedChange.read(
+        sent[0].map, len(sent) + 1, encode_change(replace(sent[-1], sequence=len(sent) + 1))
+    )
     store.apply(sent[0].map, journal.log_id(sent[0].map), [twice])
     found = account(sent, journal, [store])
     assert (found.duplicated, found.out_of_order, found.lost) == (1, 1, 0)

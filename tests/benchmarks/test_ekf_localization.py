@@ -6,12 +6,14 @@ import numpy as np
 import pytest
 from scipy.special import chdtri
 
-from synthetic.localization_run import FEW, Place, draw_place, drive, try_drives, try_start
+from synthetic.localization_run import FEW, SurveyedNode, draw_place, drive, try_drives, try_start
 
 
 def test_a_place_has_a_pose_error() -> None:
     true = np.zeros((2, 3))
-    place = Place(true, np.array([[0.3, 0.4, 0.0], [0.0, 0.0, 0.0]]), np.array([np.eye(3), np.eye(3)]) * 0.25)
+    place = SurveyedNode(
+        true, np.array([[0.3, 0.4, 0.0], [0.0, 0.0, 0.0]]), np.array([np.eye(3), np.eye(3)]) * 0.25
+    )
     assert place.error == pytest.approx(0.5 / np.sqrt(2))
     assert place.nees == pytest.approx(0.5)
 
@@ -37,7 +39,7 @@ def test_a_start_is_judged_from_its_nineteenth_step_on() -> None:
     """A map that is wrong by a metre everywhere leaves the pose wrong, whenever it is judged."""
     place = draw_place(np.random.default_rng(33))
     wrong = np.random.default_rng(1).normal(size=place.true.shape)
-    nowhere = Place(place.true, place.true + wrong, 1e4 * place.covariances)
+    nowhere = SurveyedNode(place.true, place.true + wrong, 1e4 * place.covariances)
     early, late = (drive(np.random.default_rng(34), nowhere, steps) for steps in (18, 19))
     assert early.converged
     assert not early.near

@@ -14,10 +14,10 @@ from benchmarks.explore.start import APART, NEAR, gathered, office
 from mapweave.evaluation.map_score import crossed
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Pose2
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 from mapweave.sim.worlds.catalog import make_world
 
-PLAN = FloorPlan(
+PLAN = BuildingPlan(
     rooms=(Rectangle.spanning(0, 0, 8, 4, "hall"),),
     walls=(
         Rectangle.spanning(-0.1, -0.1, 8.1, 0), Rectangle.spanning(-0.1, 4, 8.1, 4.1),
@@ -94,11 +94,11 @@ def test_a_fleet_starts_at_one_place(seed: int) -> None:
 
 
 def test_too_many_for_one_place_are_refused() -> None:
-    closet = FloorPlan(rooms=(Rectangle.spanning(0, 0, 2, 2, "closet"),), walls=())
+    closet = BuildingPlan(rooms=(Rectangle.spanning(0, 0, 2, 2, "closet"),), walls=())
     with pytest.raises(InvalidValue, match="12 robots do not fit into one place: use --spread"):
         gathered(closet, 12, 0)
     with pytest.raises(InvalidValue, match="do not fit"):
-        gathered(FloorPlan(rooms=(), walls=(Rectangle.spanning(0, 0, 1, 1),)), 1, 0)
+        gathered(BuildingPlan(rooms=(), walls=(Rectangle.spanning(0, 0, 1, 1),)), 1, 0)
 
 
 def explored(seen: list[list[float]], nodes: int) -> Exploration:

@@ -12,7 +12,7 @@ import pytest
 
 from benchmarks.images.known_warps import load, warp
 from benchmarks.landmarks import benchmark as landmarks
-from benchmarks.landmarks.benchmark import Tally, figures, node_figures
+from benchmarks.landmarks.benchmark import KeptMatches, figures, node_figures
 from benchmarks.landmarks.pairs import _room_pair, _warped_pair, camera_of, epipolar, folder_pairs
 from benchmarks.landmarks.rivals import Packed, features
 from mapweave.hybridmap.errors import InvalidFile
@@ -124,8 +124,8 @@ def test_epipolar_geometry_of_points_that_were_really_seen_twice() -> None:
 
 
 def test_ratios_are_of_the_pairs_that_floats_match() -> None:
-    floats = Tally([100, 50, 3], [110, 60, 40], [10, 10, 10], ["a"] * 3)
-    own = Tally([90, 10, 30], [100, 40, 40], [1, 2, 3], ["a"] * 3)
+    floats = KeptMatches([100, 50, 3], [110, 60, 40], [10, 10, 10], ["a"] * 3)
+    own = KeptMatches([90, 10, 30], [100, 40, 40], [1, 2, 3], ["a"] * 3)
     one = figures({"float sift": floats, "ours": own})["ours"]
     assert one["inliers_ratio"] == pytest.approx(100 / 150, abs=1e-4)
     assert one["pairs_matched_ratio"] == pytest.approx(2 / 2)

@@ -14,7 +14,7 @@ import pytest
 
 from benchmarks.images.surface_points import Surfaces
 from benchmarks.mapping_run.benchmark import main, notes
-from benchmarks.mapping_run.scene import MappingDrive, Moment, drive
+from benchmarks.mapping_run.scene import MappingDrive, RunTick, drive
 from benchmarks.mapping_run.score import LastKnown, figures, landmark_nees, reprojection_errors, track_errors
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.observation import Odometry
@@ -179,7 +179,7 @@ def test_the_score_of_a_known_error_is_that_error() -> None:
     at = Pose2(0.4, -0.1, 0.2)
     off = at @ Pose2(0.0, 0.03, math.radians(2.0))
     pixels = camera.project(true.points_in_robot) + np.array([0.3, -0.4])
-    moment = Moment(
+    moment = RunTick(
         Odometry(0.0, 0.0), at, off, PoseGaussian.from_sigmas(off, 0.03, math.radians(2.0)), true,
         ids, pixels, True, math.nan, 1.0,
     )  # fmt: skip

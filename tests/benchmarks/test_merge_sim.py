@@ -11,7 +11,7 @@ from rich.console import Console
 
 from benchmarks.merge_sim import benchmark as merge_sim
 from benchmarks.merge_sim.benchmark import Failure, figures, measure, outcome, summary
-from benchmarks.merge_sim.run import Run, false_merges
+from benchmarks.merge_sim.run import MergeRun, false_merges
 from benchmarks.merge_sim.views import lengths, views_shared
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -21,7 +21,7 @@ from mapweave.sim.texture import Texture
 from mapweave.sim.world import PanelSet, World
 from mapweave.sim.worlds.catalog import make_world
 
-RUN = Run("office", 3, 60, 3, 1, 0.02, 9, 0, 0, 40, 8, 10, 8, 7, 0.7, 150.0, 90.0)
+RUN = MergeRun("office", 3, 60, 3, 1, 0.02, 9, 0, 0, 40, 8, 10, 8, 7, 0.7, 150.0, 90.0)
 
 
 @pytest.fixture(scope="module")
@@ -154,7 +154,7 @@ def test_runs_are_processes_and_all_are_accounted_for(monkeypatch: pytest.Monkey
 
 
 def test_median_and_sums_over_runs() -> None:
-    other = Run("office", 4, 60, 3, 2, 0.04, 5, 1, 1, 20, 4, 0, 0, 0, None, 150.0, 80.0)
+    other = MergeRun("office", 4, 60, 3, 2, 0.04, 5, 1, 1, 20, 4, 0, 0, 0, None, 150.0, 80.0)
     values = figures([RUN, other])
     assert values["merged_ate_m_median"] == pytest.approx(0.03)
     assert values["components"] == 1.5 and values["whole"] == 0.5

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from benchmarks.navigate.benchmark import summary
-from benchmarks.navigate.drives import PATIENCE, Outcome, _reason, drive
-from benchmarks.navigate.floor import Floor
+from benchmarks.navigate.drives import PATIENCE, NavigationOutcome, _reason, drive
+from benchmarks.navigate.floor import FreeFloor
 from benchmarks.navigate.office import Mapped
 from benchmarks.navigate.plots import LEAST_EDGES, Plot, draw_plot
 from mapweave.evaluation.map_score import crossed
@@ -22,7 +22,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.pose import Pose2, wrap_angle
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 from mapweave.sim.ground_truth_messages import RobotStatus, SimStatus
 from mapweave.sim.snapshot import Snapshot
 from synthetic.maps import changes_of
@@ -30,13 +30,13 @@ from synthetic.world import room, take_map
 
 RADIUS = 0.17
 WALL = Rectangle.spanning(2.9, 0.0, 3.1, 3.0, "wall")
-PLAN = FloorPlan((Rectangle.spanning(0, 0, 6, 4, "room"),), (WALL,))
+PLAN = BuildingPlan((Rectangle.spanning(0, 0, 6, 4, "room"),), (WALL,))
 """A room with a wall from the south that leaves 1 m at the north."""
 
 
 @pytest.fixture(scope="module")
-def floor() -> Floor:
-    return Floor.of(PLAN, RADIUS)
+def floor() -> FreeFloor:
+    return FreeFloor.of(PLAN, RADIUS)
 
 
 @pytest.fixture(scope="module")
@@ -49,7 +49,7 @@ def mapped() -> Mapped:
     return Mapped(contents, {node.id: pose for node, pose in zip(nodes, truth, strict=True)})
 
 
-def test_the_shortest_way_leads_around_the_corner(floor: Floor) -> None:
+def test_the_shortest_way_leads_around_the_corner(floor: FreeFloor) -> None:
     """Against the taut string around the wall's two corners, at the robot's radius."""
     start, goal = Pose2(1.5, 1.0), Pose2(4.5, 1.0)
     corners = np.array([[2.9, 3.0], [3.1, 3.0]])
@@ -68,7 +68,7 @@ def test_the_shortest_way_leads_around_the_corner(floor: Floor) -> None:
     assert expected - 0.06 <= route <= 1.03 * expected + 0.06
 
 
-def test_free_ways_are_about_straight_and_symmetric(floor: Floor) -> None:
+def test_free_ways_are_about_straight_and_symmetric(floor: FreeFloor) -> None:
     rng = np.random.default_rng(0)
     for _ in range(20):
         a, b = (Pose2(*rng.uniform((0.3, 0.3), (2.6, 3.7))) for _ in range(2))
@@ -77,14 +77,14 @@ def test_free_ways_are_about_straight_and_symmetric(floor: Floor) -> None:
         assert a.distance(b) - 1e-9 <= there <= 1.03 * a.distance(b) + 0.08
 
 
-def test_no_way_leads_into_a_wall_or_outside(floor: Floor) -> None:
+def test_no_way_leads_into_a_wall_or_outside(floor: FreeFloor) -> None:
     assert math.isinf(floor.ways_from(Pose2(1.0, 1.0)).to(Pose2(8.0, 1.0)))
     assert math.isinf(floor.ways_from(Pose2(-3.0, 1.0)).to(Pose2(1.0, 1.0)))
-    closed = FloorPlan(PLAN.rooms, (Rectangle.spanning(2.9, 0.0, 3.1, 4.0),))
-    assert math.isinf(Floor.of(closed, RADIUS).ways_from(Pose2(1.0, 1.0)).to(Pose2(5.0, 1.0)))
+    closed = BuildingPlan(PLAN.rooms, (Rectangle.spanning(2.9, 0.0, 3.1, 4.0),))
+    assert math.isinf(FreeFloor.of(closed, RADIUS).ways_from(Pose2(1.0, 1.0)).to(Pose2(5.0, 1.0)))
 
 
-def test_plots_are_valid_pictures(mapped: Mapped, floor: Floor) -> None:
+def test_plots_are_valid_pictures(mapped: Mapped, floor: FreeFloor) -> None:
     starts = set()
     for seed in range(20):
         plot = draw_plot(mapped, PLAN, floor, np.random.default_rng(seed))
@@ -102,7 +102,7 @@ def test_plots_are_valid_pictures(mapped: Mapped, floor: Floor) -> None:
     assert len(starts) == 20, "another seed is another start"
 
 
-def test_a_map_that_is_too_small_is_refused(mapped: Mapped, floor: Floor) -> None:
+def test_a_map_that_is_too_small_is_refused(mapped: Mapped, floor: FreeFloor) -> None:
     few = sorted(mapped.truth)[:LEAST_EDGES]
     small = Mapped(mapped.nodes, {node: mapped.truth[node] for node in few})
     for too_small in (small, Mapped(HybridMap(), {})):
@@ -110,12 +110,14 @@ def test_a_map_that_is_too_small_is_refused(mapped: Mapped, floor: Floor) -> Non
             draw_plot(too_small, PLAN, floor, np.random.default_rng(0))
 
 
-def outcome(mapped: Mapped, **other: object) -> Outcome:
+def outcome(mapped: Mapped, **other: object) -> NavigationOutcome:
     goal = max(mapped.truth)
     plot = Plot(Pose2(0.5, 0.5), goal, mapped.truth[goal], 5, 2.0)
     status = Status("parked at the goal", "", 10, 0, Pose2(), True, tally=DriveStatistics(4, 1, 2, 0))
     picture = np.zeros((4, 4), np.uint8)
-    one = Outcome(plot, status, "", 1.0, 30.0, 0.004, 0.3, 0, 3.0, (), picture, picture, np.zeros((2, 2)))
+    one = NavigationOutcome(
+        plot, status, "", 1.0, 30.0, 0.004, 0.3, 0, 3.0, (), picture, picture, np.zeros((2, 2))
+    )
     return replace(one, **other)  # type: ignore[arg-type]
 
 

@@ -8,14 +8,14 @@ import pytest
 
 from benchmarks.parking import benchmark as parking
 from benchmarks.parking.run import LEAST_VISIBLE, park
-from benchmarks.parking.scene import AHEAD, FARTHEST, LEAST_SEEN, MOST_TURNED, NEAREST, Scene
+from benchmarks.parking.scene import AHEAD, FARTHEST, LEAST_SEEN, MOST_TURNED, NEAREST, ParkingScene
 from mapweave.hybridmap.pose import Pose2
 
 
 @pytest.fixture(scope="module")
-def scene() -> Scene:
+def scene() -> ParkingScene:
     """One view, mapped by the robot."""
-    return Scene((4, 0), one_view=True)
+    return ParkingScene((4, 0), one_view=True)
 
 
 @pytest.mark.slow

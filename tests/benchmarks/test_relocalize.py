@@ -13,10 +13,10 @@ from benchmarks.relocalize import pictures as relocalize_pictures
 from benchmarks.relocalize.distractors import Differences, Distractors
 from benchmarks.relocalize.exhaustive import Exhaustive, asked_of, lost
 from benchmarks.relocalize.peer import Vocabulary, WordIndex
-from benchmarks.relocalize.pictures import Disturbance, Photographer, Picture, Wish, taken
-from benchmarks.relocalize.places import Place, placed, spread_out, twin_lookouts
+from benchmarks.relocalize.pictures import Photographer, TestPicture, ViewDisturbance, Wish, taken
+from benchmarks.relocalize.places import TruePlace, placed, spread_out, twin_lookouts
 from benchmarks.relocalize.queries import Query, beside
-from benchmarks.relocalize.score import Reply, ask, figures, judged, spent
+from benchmarks.relocalize.score import ScoredAnswer, ask, figures, judged, spent
 from mapweave.hybridmap.descriptor import decode, root_sift
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Node
@@ -31,11 +31,11 @@ from mapweave.sim.worlds.catalog import make_world
 from synthetic.world import CAMERA, room, take_map, take_view
 
 
-def picture_of(sift: np.ndarray) -> Picture:
+def picture_of(sift: np.ndarray) -> TestPicture:
     n = len(sift)
     rng = np.random.default_rng(0)
     pixels = rng.uniform(0, 240, (n, 2)).astype(np.float32)
-    return Picture(Pose2(), CAMERA, pixels, sift, rng.uniform(1, 4, n).astype(np.float32))
+    return TestPicture(Pose2(), CAMERA, pixels, sift, rng.uniform(1, 4, n).astype(np.float32))
 
 
 def nodes_of(seed: int, count: int) -> list[Node]:
@@ -86,7 +86,7 @@ def test_the_bag_of_words_is_tf_idf_and_cosine() -> None:
 def test_distractors_are_halves_of_real_nodes_and_always_the_same() -> None:
     rng = np.random.default_rng(5)
     donors = [
-        Place(node, Pose2(), 0, rng.integers(0, 256, (len(node.landmarks), 128)).astype(np.uint8))
+        TruePlace(node, Pose2(), 0, rng.integers(0, 256, (len(node.landmarks), 128)).astype(np.uint8))
         for node in nodes_of(5, 6)
     ]
     none = Differences(np.zeros((1, 32), np.float32), np.full((1, 128), 3, np.int16))
@@ -109,9 +109,10 @@ def test_the_loss_of_the_index_is_measured_on_the_same_views() -> None:
     picture = picture_of(np.zeros((0, 128), np.uint8))
     query = Query("near", picture, 0)
 
-    def replies(recalled: str) -> list[Reply]:
+    def replies(recalled: str) -> list[ScoredAnswer]:
         return [
-            Reply(query, Certainty.FOUND if one == "y" else Certainty.UNKNOWN, 0, 0, 1) for one in recalled
+            ScoredAnswer(query, Certainty.FOUND if one == "y" else Certainty.UNKNOWN, 0, 0, 1)
+            for one in recalled
         ]
 
     result = lost(replies("yyyyyynnnn"), replies("yyyyynyynn"))
@@ -149,7 +150,7 @@ def test_a_person_hides_about_a_third() -> None:
     artist = Photographer(world, (1,))
     for number in range(4):
         plain = artist.image(Wish(Pose2(2.0, 2.0, 0.4), number=number)).astype(int)
-        hidden = artist.image(Wish(Pose2(2.0, 2.0, 0.4), Disturbance(person=True), number)).astype(int)
+        hidden = artist.image(Wish(Pose2(2.0, 2.0, 0.4), ViewDisturbance(person=True), number)).astype(int)
         shares.append(float((np.abs(plain - hidden).mean(axis=0) > 12).mean()))
     assert 0.2 < np.mean(shares) < 0.4
 
@@ -182,11 +183,11 @@ def test_far_is_exactly_half_a_metre_and_twenty_degrees() -> None:
 
 def test_answers_are_judged_by_the_truth() -> None:
     node = nodes_of(10, 1)[0]
-    place = Place(node, Pose2(1.0, 2.0, 0.3), 0, np.zeros((0, 128), np.uint8))
+    place = TruePlace(node, Pose2(1.0, 2.0, 0.3), 0, np.zeros((0, 128), np.uint8))
     truth = {node.id: place}
     here = place.world_from_node @ Pose2(0.2, 0.1, 0.1)
     sift = np.zeros((0, 128), np.uint8)
-    picture = Picture(here, CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
+    picture = TestPicture(here, CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
 
     def scored(pose: Pose2, site: int, kind: str = "near") -> dict[str, float]:
         estimated = PoseGaussian.from_sigmas(pose, 0.1, 0.05)
@@ -226,7 +227,7 @@ def test_the_fit_finds_the_weights_that_made_the_data() -> None:
 
 def test_the_benchmarks_own_work_is_not_timed() -> None:
     sift = np.zeros((0, 128), np.uint8)
-    picture = Picture(Pose2(), CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
+    picture = TestPicture(Pose2(), CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
     making = np.zeros(2)
 
     def answer(_: View) -> RelocalizeAnswer:

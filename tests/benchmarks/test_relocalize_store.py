@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from benchmarks.relocalize.distractors import Differences, Distractors
-from benchmarks.relocalize.places import Place
+from benchmarks.relocalize.places import TruePlace
 from benchmarks.relocalize_start.store import fill
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -23,7 +23,7 @@ def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path: Path) -> None
     tour = [Pose2(2.5, 2.0, 0.7 * k) for k in range(6)]
     nodes = take_map(room(0, 0, 5, 4, 400, rng), MapId("m0", 1), tour, rng)[0]
     places = [
-        Place(node, pose, 0, rng.integers(0, 256, (len(node.landmarks), 128)).astype(np.uint8))
+        TruePlace(node, pose, 0, rng.integers(0, 256, (len(node.landmarks), 128)).astype(np.uint8))
         for node, pose in zip(nodes, tour, strict=True)
     ]
     none = Differences(np.zeros((1, 32), np.float32), np.zeros((1, 128), np.int16))

@@ -11,12 +11,12 @@ from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
-from synthetic.wrong_geometry import SCENES, Fault, draw_fleet
+from synthetic.wrong_geometry import SCENES, OdometryFault, draw_fleet
 
 
 @pytest.mark.parametrize("rule", [*TRIAL_RULES, *PLACE_RULES])
 def test_fleets_are_merged_and_answered_without_a_rule(rule: str, caplog: pytest.LogCaptureFixture) -> None:
-    fleet = draw_fleet(11, SCENES["room"], Fault.NONE, stops=1, views=4)
+    fleet = draw_fleet(11, SCENES["room"], OdometryFault.NONE, stops=1, views=4)
     switches: tuple[Switch, ...] = {**TRIAL_RULES, **PLACE_RULES}[rule]
     merger = Merger()
     for map_id, (nodes, edges) in fleet.maps.items():

@@ -9,8 +9,8 @@ import pytest
 
 from benchmarks.figures import scale
 from benchmarks.figures.measurements import MEASUREMENTS
-from benchmarks.figures.results import Result, load
-from benchmarks.figures.scale import Costs, Plan, scale_page
+from benchmarks.figures.results import StoredResult, load
+from benchmarks.figures.scale import Costs, ScalePlan, scale_page
 from benchmarks.fleet.drives import drive
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.change import Change, EdgePut
@@ -18,14 +18,14 @@ from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import encode_change
 from mapweave.wire.messages import encode, encode_view
 
 
 @pytest.fixture(scope="module")
-def results() -> dict[str, Result]:
+def results() -> dict[str, StoredResult]:
     return {name: load(name) for name in MEASUREMENTS}
 
 
@@ -49,7 +49,7 @@ def test_bytes_are_those_of_today(tmp_path: Path) -> None:
         tour, map_id, entries = drive(robot, 20, 731), MapId(f"r{robot}", 1), []
         for body in (body for stop in tour.changes for body in stop):
             message = encode_change(Change(map_id, len(entries) + 1, 10**18, body))
-            entries.append(Entry.read(map_id, len(entries) + 1, message))
+            entries.append(ReceivedChange.read(map_id, len(entries) + 1, message))
             edges += [len(message)] * isinstance(body, EdgePut)
         nodes += len(tour.changes)
         store.apply(map_id, 7, entries)
@@ -59,10 +59,10 @@ def test_bytes_are_those_of_today(tmp_path: Path) -> None:
     assert len(encode_view(tour.view)) == pytest.approx(scale.QUESTION_BYTES, rel=0.1)
 
 
-def test_the_sums_are_those_of_simulated_minutes(results: dict[str, Result]) -> None:
+def test_the_sums_are_those_of_simulated_minutes(results: dict[str, StoredResult]) -> None:
     """One robot after the other, minute by minute, instead of by rates."""
     costs = Costs.of(results)
-    plan = Plan.of(costs)
+    plan = ScalePlan.of(costs)
     robots, minutes = scale.ROBOTS // scale.SITES, 60 * 24
     sent, nodes, answers = 0.0, 0, 0
     for robot in range(robots):
@@ -79,7 +79,7 @@ def test_the_sums_are_those_of_simulated_minutes(results: dict[str, Result]) -> 
     assert plan.memory > plan.nodes * costs.kept_bytes > 0
 
 
-def test_a_server_carries_the_largest_fleet_that_is_in_time(results: dict[str, Result]) -> None:
+def test_a_server_carries_the_largest_fleet_that_is_in_time(results: dict[str, StoredResult]) -> None:
     row = {"server_cpu": 0.5, "router_cpu": 0.1, "ack_p99_ms": 90.0}
     figures = {
         "agents": {"50": row, "1000": {**row, "ack_p99_ms": 400.0}, "2000": {**row, "ack_p99_ms": 9e3}}

@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from benchmarks.shards import benchmark
-from benchmarks.shards.askers import IN_A_ROW, Tally
+from benchmarks.shards.askers import IN_A_ROW, AnswerLog
 from benchmarks.shards.benchmark import all_compared, main
 from benchmarks.shards.fleet import BuildingFleet
 from benchmarks.shards.shared_store import NEEDED, SharedStore
@@ -30,7 +30,7 @@ def standbys() -> bool:
 
 def test_recovery_by_hand() -> None:
     times = [1.0, 2.0, 2.1, 4.5, *(4.6 + 0.1 * k for k in range(IN_A_ROW))]
-    tally = Tally([(at, at not in (2.0, 2.1)) for at in times])
+    tally = AnswerLog([(at, at not in (2.0, 2.1)) for at in times])
     assert tally.recovery(1.5) == pytest.approx(3.0)
     assert tally.whole(4.55) and not tally.whole(5.0)
 

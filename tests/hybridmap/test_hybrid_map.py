@@ -13,7 +13,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.route import Ways
+from mapweave.hybridmap.route import RouteTable
 from synthetic.world import CAMERA
 
 
@@ -110,9 +110,9 @@ def test_what_robots_ask_of_their_map_loads_no_networkx(monkeypatch: pytest.Monk
         [*(NodePut(node(k)) for k in range(4)), EdgePut(edge(8, 0, 1)), EdgePut(edge(9, 1, 2))]
     )
     first, third, lonely = (node(k).id for k in (0, 2, 3))
-    assert len(Ways(hybrid_map).find(first, third).edges) == 2
-    assert "nothing joins" in Ways(hybrid_map).find(first, lonely).reason
-    assert "blocked" in Ways(hybrid_map, blocked=[(node(1).id, third)]).find(first, third).reason
+    assert len(RouteTable(hybrid_map).find(first, third).edges) == 2
+    assert "nothing joins" in RouteTable(hybrid_map).find(first, lonely).reason
+    assert "blocked" in RouteTable(hybrid_map, blocked=[(node(1).id, third)]).find(first, third).reason
     assert len(hybrid_map.components()) == 2
     hybrid_map.apply(NodeRetired(node(1).id))
     assert not hybrid_map.edges

@@ -11,7 +11,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.route import RouteSettings, Ways, edge_cost
+from mapweave.hybridmap.route import RouteSettings, RouteTable, edge_cost
 from synthetic.maps import changes_of
 from synthetic.world import CAMERA
 
@@ -51,7 +51,7 @@ def test_costs_no_more_than_dijkstra(seed: int, optimised: bool) -> None:
         assert cost >= poses[e.a].distance(poses[e.b])
         graph.add_edge(e.a, e.b, weight=cost)
     start, goal = NodeId("r0", 1, 0), NodeId("r0", 1, 13)
-    result = Ways(hybrid_map, poses=poses if optimised else None, penalties=penalties).find(start, goal)
+    result = RouteTable(hybrid_map, poses=poses if optimised else None, penalties=penalties).find(start, goal)
     if start in graph and goal in graph and nx.has_path(graph, start, goal):
         assert result.cost == pytest.approx(nx.dijkstra_path_length(graph, start, goal))
         assert result.nodes[0] == start and result.nodes[-1] == goal
@@ -71,24 +71,24 @@ def test_blocked_pairs_are_gone_around_in_either_order() -> None:
     nodes, one = chain(Pose2(0, 0), Pose2(1, 0), Pose2(2, 0), Pose2(2, 3))
     one.apply(EdgePut(edge(200, nodes[0], nodes[3])))
     one.apply(EdgePut(edge(201, nodes[3], nodes[2])))
-    assert len(Ways(one).find(nodes[0].id, nodes[2].id).edges) == 2
-    around = Ways(one, blocked=[(nodes[2].id, nodes[1].id)]).find(nodes[0].id, nodes[2].id)
+    assert len(RouteTable(one).find(nodes[0].id, nodes[2].id).edges) == 2
+    around = RouteTable(one, blocked=[(nodes[2].id, nodes[1].id)]).find(nodes[0].id, nodes[2].id)
     assert around.nodes == (nodes[0].id, nodes[3].id, nodes[2].id)
     barred = [(nodes[1].id, nodes[2].id), (nodes[3].id, nodes[2].id)]
-    nowhere = Ways(one, blocked=barred).find(nodes[0].id, nodes[2].id)
+    nowhere = RouteTable(one, blocked=barred).find(nodes[0].id, nodes[2].id)
     assert nowhere.nodes == () and "blocked" in nowhere.reason
 
 
 def test_turning_costs() -> None:
     nodes, one = chain(Pose2(0, 0, 0), Pose2(0, 0, 3.0))
     s = RouteSettings(per_edge=0.1, per_turn=0.4)
-    assert Ways(one, settings=s).find(nodes[0].id, nodes[1].id).cost == pytest.approx(0.1 + 0.4 * 3.0)
+    assert RouteTable(one, settings=s).find(nodes[0].id, nodes[1].id).cost == pytest.approx(0.1 + 0.4 * 3.0)
 
 
 def test_of_two_edges_the_cheaper_is_driven() -> None:
     nodes, one = chain(Pose2(0, 0), Pose2(1, 0))
     one.apply(EdgePut(edge(5, nodes[0], nodes[1])))
-    route = Ways(one, penalties={NodeId("e", 1, 5): 1.0}).find(nodes[0].id, nodes[1].id)
+    route = RouteTable(one, penalties={NodeId("e", 1, 5): 1.0}).find(nodes[0].id, nodes[1].id)
     assert route.edges == (NodeId("e", 1, 100),)
 
 
@@ -102,10 +102,10 @@ def test_a_driven_link_costs_its_length() -> None:
         edge(3, nodes[2], nodes[1]),
     ]
     hybrid_map = HybridMap(changes_of(nodes, edges))
-    around = Ways(hybrid_map).find(nodes[0].id, nodes[1].id)
+    around = RouteTable(hybrid_map).find(nodes[0].id, nodes[1].id)
     assert around.edges == (edges[1].id, edges[2].id)
     hybrid_map.apply(EdgePut(edge(4, nodes[0], nodes[1], EdgeKind.DRIVEN)))
-    straight = Ways(hybrid_map).find(nodes[0].id, nodes[1].id)
+    straight = RouteTable(hybrid_map).find(nodes[0].id, nodes[1].id)
     assert straight.edges == (NodeId("e", 1, 4),) and straight.cost == pytest.approx(2.02)
 
 
@@ -116,17 +116,17 @@ def test_links_between_maps_without_common_frame_are_driven() -> None:
     link = Edge(NodeId("e", 1, 1), a.id, b.id, relative, EdgeKind.MERGED)
     hybrid_map = HybridMap([NodePut(a), NodePut(b), EdgePut(link)])
     s = RouteSettings(per_edge=0.1, per_turn=0.0, per_undriven=0.5)
-    assert Ways(hybrid_map, settings=s).find(a.id, b.id).cost == pytest.approx(1.5 + 0.1)
+    assert RouteTable(hybrid_map, settings=s).find(a.id, b.id).cost == pytest.approx(1.5 + 0.1)
 
 
 def test_reasons() -> None:
     nodes, one = chain(Pose2(0, 0), Pose2(1, 0))
     lonely = node(9, Pose2(5, 5))
     one.apply(NodePut(lonely))
-    assert Ways(one).find(nodes[0].id, nodes[0].id).nodes == (nodes[0].id,)
-    assert "nothing joins" in Ways(one).find(nodes[0].id, lonely.id).reason
-    assert "not in the map" in Ways(one).find(nodes[0].id, NodeId("r9", 1, 1)).reason
-    assert "no pose" in Ways(one, poses={nodes[0].id: Pose2()}).find(nodes[0].id, nodes[1].id).reason
+    assert RouteTable(one).find(nodes[0].id, nodes[0].id).nodes == (nodes[0].id,)
+    assert "nothing joins" in RouteTable(one).find(nodes[0].id, lonely.id).reason
+    assert "not in the map" in RouteTable(one).find(nodes[0].id, NodeId("r9", 1, 1)).reason
+    assert "no pose" in RouteTable(one, poses={nodes[0].id: Pose2()}).find(nodes[0].id, nodes[1].id).reason
 
 
 @settings(max_examples=100, deadline=None)
@@ -158,7 +158,7 @@ def test_there_is_a_way_or_a_reason_as_networkx_finds_it(seed: int) -> None:
         open_ones = [] if frozenset((a, b)) in barred else [costs[key] for key in costs.keys() - closed]
         if open_ones or toll is not None:
             free.add_edge(a, b, weight=min(open_ones) if open_ones else min(costs.values()) + (toll or 0.0))
-    ways = Ways(
+    ways = RouteTable(
         hybrid_map, poses=poses, blocked=blocked, closed=closed, toll=toll, factors=factors, portals=portals
     )
     for goal in ids[1:]:
@@ -184,8 +184,11 @@ def test_closed_edges_are_as_if_they_were_not_there(seed: int) -> None:
         if not (isinstance(change, EdgePut) and change.edge.id in closed)
     )
     start, goal = NodeId("r0", 1, 0), NodeId("r0", 1, 13)
-    result, expected = Ways(hybrid_map, closed=closed).find(start, goal), Ways(left).find(start, goal)
+    result, expected = (
+        RouteTable(hybrid_map, closed=closed).find(start, goal),
+        RouteTable(left).find(start, goal),
+    )
     assert (result.nodes, result.edges) == (expected.nodes, expected.edges)
     assert result.cost == pytest.approx(expected.cost)
-    if not result.nodes and Ways(hybrid_map).find(start, goal).nodes:
+    if not result.nodes and RouteTable(hybrid_map).find(start, goal).nodes:
         assert "only ties poses" in result.reason

@@ -27,7 +27,7 @@ from mapweave.hybridmap.query import (
     Whereabouts,
 )
 from mapweave.mapserver.node_views import NoView
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
@@ -97,7 +97,7 @@ class StubServices:
         raise InvalidValue(f"{robot} stays where it is")
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
-        return Places(Router(self.merged()), self.annotations()).answer(request)
+        return PlaceResolver(Router(self.merged()), self.annotations()).answer(request)
 
     def why_no_view(self, node: NodeId) -> str:
         return "" if node in self.images else f"{node.agent} is away, or keeps no views"

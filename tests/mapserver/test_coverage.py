@@ -13,7 +13,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from mapweave.hybridmap.query import MAX_KNOWN, KnownAnswer, KnownRequest
-from mapweave.mapserver.coverage import Coverage
+from mapweave.mapserver.coverage import SharedCoverage
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer
@@ -53,7 +53,7 @@ def scene() -> Scene:
 
 
 def test_others_views_are_where_they_truly_are(scene: Scene) -> None:
-    answer = Coverage(scene.merged).answer(A, (5.0, 0.0), 100.0)
+    answer = SharedCoverage(scene.merged).answer(A, (5.0, 0.0), 100.0)
     own = scene.merged.maps[A].nodes
     true = [scene.truth[n] for n in sorted(scene.truth) if n.map == B]
     assert len(answer.views) == len(true)
@@ -70,20 +70,20 @@ def test_others_views_are_where_they_truly_are(scene: Scene) -> None:
 
 
 def test_only_near_views_are_returned_nearest_first(scene: Scene) -> None:
-    everything = Coverage(scene.merged).answer(A, (5.0, 0.0), 100.0).views
+    everything = SharedCoverage(scene.merged).answer(A, (5.0, 0.0), 100.0).views
     away = np.hypot(everything[:, 0] - 5.0, everything[:, 1])
     assert (np.diff(away) >= 0).all()
     reach = float(np.median(away))
-    near = Coverage(scene.merged).answer(A, (5.0, 0.0), reach).views
+    near = SharedCoverage(scene.merged).answer(A, (5.0, 0.0), reach).views
     assert np.array_equal(near, everything[away <= reach])
 
 
 def test_the_agent_of_an_isolated_map_gets_no_poses(scene: Scene) -> None:
     for asking, reason in ((C, "no other map is joined to c"), (MapId("d", 1), "is not in the merged map")):
-        answer = Coverage(scene.merged).answer(asking, (0.0, 0.0), 100.0)
+        answer = SharedCoverage(scene.merged).answer(asking, (0.0, 0.0), 100.0)
         assert answer.views.shape == (0, 4)
         assert reason in answer.reason
-    assert not Coverage(MergedMap.empty()).answer(A, (0.0, 0.0), 9.0).views.size
+    assert not SharedCoverage(MergedMap.empty()).answer(A, (0.0, 0.0), 9.0).views.size
 
 
 def test_a_bent_map_is_aligned_at_its_nearest_node() -> None:
@@ -101,7 +101,7 @@ def test_a_bent_map_is_aligned_at_its_nearest_node() -> None:
     poses = {n: Placement(0, PoseGaussian(p, np.zeros((3, 3)))) for n, p in places.items()}
     maps = {A: HybridMap(map(NodePut, nodes)), B: HybridMap([NodePut(other)])}
     merged = MergedMap(maps, (), (), (frozenset(places),), poses)
-    ((x, y, heading, _),) = Coverage(merged).answer(A, (9.0, 9.0), 1.0).views
+    ((x, y, heading, _),) = SharedCoverage(merged).answer(A, (9.0, 9.0), 1.0).views
     expected = turned @ Pose2(0.3, 0.1, 0.2)
     assert (x, y, heading) == pytest.approx((expected.x, expected.y, expected.heading))
 
@@ -110,7 +110,7 @@ def test_answers_fit_into_a_message(scene: Scene) -> None:
     views = np.zeros((MAX_KNOWN + 9, 4))
     views[:, 0] = np.arange(len(views))[::-1]
 
-    class Many(Coverage):
+    class Many(SharedCoverage):
         def _views(self, *_: object) -> list[tuple[float, float, float, float]]:
             return [(float(x), 0.0, 0.0, 0.5) for x, *_ in views]
 

@@ -29,7 +29,7 @@ from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.map_files import merged_of
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -276,7 +276,7 @@ def test_very_many_floors_of_a_part_are_as_many_as_a_message_holds(merged: Merge
         for which in maps
     ))  # fmt: skip
     graphs = (SimpleNamespace(maps=maps),)
-    places = Places(Router(merged), labels)
+    places = PlaceResolver(Router(merged), labels)
     places.router = SimpleNamespace(merged=SimpleNamespace(graphs=graphs))  # type: ignore[assignment]
     entry = RobotEntry("r0", True, floor=places.floor_of(0))
     assert decode(encode(FleetStatus((entry,))), FleetStatus).robots == (entry,)
@@ -290,19 +290,19 @@ def test_a_place_whose_node_is_superseded_is_the_nearest_active_node(merged: Mer
     away = {node: merged.pose(node).distance(merged.pose(THERE)) for node in merged.poses if node != THERE}
     nearest = min(away, key=away.__getitem__)
     older = replace(merged, superseded={THERE: Superseded(max(away, key=away.__getitem__), 9, 0.1, 0.1)})
-    found = Places(Router(older), record("kitchen", Place(THERE))).resolve("kitchen")
+    found = PlaceResolver(Router(older), record("kitchen", Place(THERE))).resolve("kitchen")
     assert found.node == nearest and "r0.1.3 is superseded" in found.note
 
 
 def test_a_place_whose_node_is_in_no_map_any_more_says_why(merged: MergedMap) -> None:
     kitchen = record("kitchen", Place(NodeId("r9", 1, 1)))
     with pytest.raises(InvalidValue, match=r"place kitchen is at r9\.1\.1, which is not in the merged map"):
-        Places(Router(merged), kitchen).resolve("kitchen")
+        PlaceResolver(Router(merged), kitchen).resolve("kitchen")
     # All of its map is retired: no node of it is left to take its place.
     constraint = ManualConstraint(RetiredMap(THERE.map), True, "bob", 0, "the old flat")
     none = replace(merged, poses={}, components=(), graphs=(), constraints=ManualConstraints([constraint]))
     with pytest.raises(InvalidValue, match=r'map r0\.1 is retired by bob on .* "the old flat"'):
-        Places(Router(none), record("kitchen", Place(THERE))).resolve("kitchen")
+        PlaceResolver(Router(none), record("kitchen", Place(THERE))).resolve("kitchen")
 
 
 def test_a_place_whose_node_is_retired_is_the_nearest_one_of_its_map(merged: MergedMap) -> None:
@@ -311,7 +311,7 @@ def test_a_place_whose_node_is_retired_is_the_nearest_one_of_its_map(merged: Mer
     at = merged.maps[THERE.map].nodes[THERE].map_from_robot.mean
     own = merged.maps[THERE.map].nodes
     nearest = min(left, key=lambda node: at.distance(own[node].map_from_robot.mean))
-    found = Places(Router(without), record("kitchen", Place(THERE))).resolve("kitchen")
+    found = PlaceResolver(Router(without), record("kitchen", Place(THERE))).resolve("kitchen")
     assert found.node == nearest and "r0.1.3 takes no part" in found.note
 
 
@@ -322,13 +322,13 @@ def test_an_area_is_the_active_node_next_to_its_centre(merged: MergedMap) -> Non
         merged.pose(min(merged.poses)),
         [(x - 0.05, y - 0.04), (x + 0.05, y - 0.04), (x + 0.05, y + 0.04), (x - 0.05, y + 0.04)],
     )
-    places = Places(Router(merged), record("desk", Place(area=area)))
+    places = PlaceResolver(Router(merged), record("desk", Place(area=area)))
     assert places.resolve("desk").node == THERE
     assert places.name_at(0, anchor) == "desk" and places.name_at(0, Pose2(x + 0.1, y)) == ""
     far = Place(area=Area.around(THERE, 0.5))
     shifted = replace(far.area, corners=tuple((px + 20.0, py) for px, py in far.area.corners))
     with pytest.raises(InvalidValue, match="in which no node is active"):
-        Places(Router(merged), record("yard", Place(area=shifted))).resolve("yard")
+        PlaceResolver(Router(merged), record("yard", Place(area=shifted))).resolve("yard")
 
 
 def test_the_narrowest_place_names_a_position(merged: MergedMap) -> None:
@@ -339,7 +339,7 @@ def test_the_narrowest_place_names_a_position(merged: MergedMap) -> None:
         Annotation("one", Place(first), False, "", 3),
         Annotation("two", Place(second), False, "", 4),
     ]
-    places = Places(Router(merged), Annotations(tuple(entries)))
+    places = PlaceResolver(Router(merged), Annotations(tuple(entries)))
     assert places.name_at(0, merged.pose(first)) == "one"
     assert places.name_at(0, merged.pose(second)) == "two"
     assert places.name_at(0, merged.pose(first) @ Pose2(3.5, 0.0)) == "room"

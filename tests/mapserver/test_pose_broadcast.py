@@ -17,7 +17,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver import pose_broadcast
 from mapweave.mapserver.pose_broadcast import PoseBroadcast
 from mapweave.mapserver.server import MapServer
-from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.keys import Keys
@@ -37,7 +37,7 @@ def graph(nodes: list[NodeId], shift: float = 0.0, turn: float = 0.0) -> PoseGra
 
 
 def merged(*graphs: PoseGraph) -> MergedMap:
-    whole = replace(MergedMap.empty(), poses=Poses(graphs), graphs=graphs)
+    whole = replace(MergedMap.empty(), poses=NodePoses(graphs), graphs=graphs)
     return replace(whole, components=tuple(frozenset(one.nodes) for one in graphs))
 
 

@@ -30,7 +30,7 @@ from mapweave.hybridmap.mission_order import MAX_VIA, MissionKind, MissionOrder,
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver import http
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.quotas import Quotas
 from mapweave.mapserver.roster import MOST_ALIVE, STAGGER, STATUSES_PER_S, Roster
 from mapweave.mapserver.routes import Router
@@ -185,7 +185,7 @@ def test_a_robot_that_is_alive_under_many_maps_is_named_and_harms_itself_alone()
         bus.announce(KEYS.agent_alive(MapId("r1", 1)))
         eventually(lambda: roster.alive("r1"))
         eventually(lambda: quotas.over() == {"r3": "over its quota: 32 liveliness tokens"})
-        assert roster.robots(Places(Router(MergedMap.empty()), Annotations())).robots[1].over_quota
+        assert roster.robots(PlaceResolver(Router(MergedMap.empty()), Annotations())).robots[1].over_quota
         assert roster.alive("r3") and len(roster._alive["r3"]) == MOST_ALIVE
         for token in tokens:
             token.close()

@@ -23,7 +23,7 @@ from mapweave.hybridmap.route import edge_cost
 from mapweave.mapserver.annotator import check_edge
 from mapweave.mapserver.goals import node_of_goal
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
 from tests.mapserver.test_reservations import place_node
@@ -154,7 +154,7 @@ def test_an_explanation_names_who_closed_the_way_until_when_and_the_detour(grid)
     refused = explain_route(grid.at(inside, 0), at(0, 0), at(4, 0))
     assert refused.reason == f'goal {at(4, 0)} is in hall, which is closed by anna: "wet floor"'
     with pytest.raises(InvalidValue, match="is in hall, which is closed by anna"):
-        node_of_goal(str(at(4, 0)), MAP, Places(grid.at(inside, 0), inside))
+        node_of_goal(str(at(4, 0)), MAP, PlaceResolver(grid.at(inside, 0), inside))
 
 
 def test_an_explanation_names_who_prefers_a_way(grid) -> None:

@@ -25,7 +25,7 @@ from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.mapserver.answers import Answers
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.merge_worker import MergeWorker
@@ -75,7 +75,7 @@ def stored(path: Path, logs: dict[MapId, list[bytes]]) -> Store:
     """A store that has taken them in, as far as it does."""
     store = SqliteStore(path)
     for map_id, log in logs.items():
-        entries = [Entry.read(map_id, k + 1, message) for k, message in enumerate(log)]
+        entries = [ReceivedChange.read(map_id, k + 1, message) for k, message in enumerate(log)]
         store.apply(map_id, 7, entries, len(entries))
     return store
 
@@ -305,7 +305,7 @@ class Beside:
         # Maps are sorted by name.
         map_id = MapId(str(rng.choice(["a", "r00", "x"])), seed)
         entries = [
-            Entry.read(map_id, k + 1, message)
+            ReceivedChange.read(map_id, k + 1, message)
             for k, message in enumerate(messages(map_id, content(rng, map_id, self.nodes)))
         ]
         self.store.apply(map_id, 7, entries)

@@ -17,9 +17,9 @@ from prometheus_client.parser import text_string_to_metric_families
 
 from mapweave.agent.mission import WhereAmI
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.agent.pipeline import Step
+from mapweave.agent.pipeline import TickResult
 from mapweave.agent.replication.replicator import ReplicationStatus
-from mapweave.agent.sensor_health.sensor_monitor import Fault
+from mapweave.agent.sensor_health.sensor_monitor import SensorFault
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.errors import NotConnected, SettingsError
@@ -55,13 +55,13 @@ class Scrape:
         return self.values[f"mapweave_agent_{name}", *labels]
 
 
-def step(fault: Fault | None = None) -> Step:
-    return Step(Command(), (), (), STATUS, fault)
+def step(fault: SensorFault | None = None) -> TickResult:
+    return TickResult(Command(), (), (), STATUS, fault)
 
 
 def test_ticks_and_faults_are_counted() -> None:
     metrics = AgentMetrics("r0")
-    camera = Fault("camera", "it is dark")
+    camera = SensorFault("camera", "it is dark")
     for busy, fault in ((0.0, None), (0.01, camera), (0.03, camera), (3.0, None), (0.1, camera)):
         metrics.step(step(fault), busy)
     scrape = Scrape(metrics.scrape())

@@ -7,7 +7,7 @@ import io
 from rich.console import Console
 
 from mapweave.agent.observation import Command, Observation, Odometry
-from mapweave.agent.pipeline import Step
+from mapweave.agent.pipeline import TickResult
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent_progress import A_SECOND, BURST, AgentProgress
@@ -20,7 +20,7 @@ def test_a_robot_that_changes_its_mind_each_tick_does_not_fill_the_log() -> None
 
     def tick(doing: str) -> None:
         status = Status(doing, "", 0, 0, Pose2(), False)
-        show(Observation(0, Odometry(0.0, 0.0)), Step(Command(), (), (), status))
+        show(Observation(0, Odometry(0.0, 0.0)), TickResult(Command(), (), (), status))
 
     for k in range(600):
         now = 0.1 * k
@@ -39,5 +39,5 @@ def test_one_node_is_no_nodes() -> None:
     output = io.StringIO()
     show = AgentProgress(Console(file=output, width=200), "r0", None, lambda: 0.0)
     status = Status("mapping", "", 1, 0, Pose2(), False)
-    show(Observation(0, Odometry(0.0, 0.0)), Step(Command(), (), (), status))
+    show(Observation(0, Odometry(0.0, 0.0)), TickResult(Command(), (), (), status))
     assert "r0: mapping (1 node)" in output.getvalue()

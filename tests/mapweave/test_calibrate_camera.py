@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 import mapweave.agent.drivers.camera
-from mapweave.agent.drivers.camera import Frame
+from mapweave.agent.drivers.camera import StampedImage
 from mapweave.agent.drivers.settings import Geometry
 from mapweave.agent.drivers.settings_writer import camera_table, write_camera
 from mapweave.cli import main
@@ -119,13 +119,13 @@ class EmulatedCamera:
         self._interrupted = interrupted
         self._frames, self.given, self.closed = [frame for frame in frames for _ in range(2)], 0, False
 
-    def newer(self, stamp_ns: int, patience: float) -> Frame | None:
+    def newer(self, stamp_ns: int, patience: float) -> StampedImage | None:
         if self.given == len(self._frames):
             if self._interrupted:
                 raise KeyboardInterrupt
             return None
         self.given += 1
-        return Frame(self.given, self._frames[self.given - 1])
+        return StampedImage(self.given, self._frames[self.given - 1])
 
     def close(self) -> None:
         self.closed = True
@@ -165,7 +165,7 @@ def test_a_stream_that_ends_early_is_refused_with_what_is_missing(
 
 def test_the_page_shows_the_camera_and_the_guidance(frames) -> None:
     from mapweave.drawing.guidance_picture import guidance_picture
-    from mapweave.scenarios.live import Live
+    from mapweave.scenarios.live import LiveFilm
     from mapweave.vision.calibration.collection import ViewCollection
     from mapweave.vision.calibration.views import BoardDetector
 
@@ -176,7 +176,7 @@ def test_the_page_shows_the_camera_and_the_guidance(frames) -> None:
     assert collection.views and guidance.hint
     picture = guidance_picture(image, guidance, collection.views)
     assert picture.shape == (710, 800, 3)
-    with Live(0, "Camera calibration") as page:
+    with LiveFilm(0, "Camera calibration") as page:
         page.show(picture)
         with urllib.request.urlopen(page.url) as answer:
             assert answer.status == 200

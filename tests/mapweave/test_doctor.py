@@ -23,7 +23,7 @@ from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.cli import main
 from mapweave.commands import doctor as doctor_command
 from mapweave.doctor import camera, camera_model, driver, machine
-from mapweave.doctor.finding import Finding, Verdict
+from mapweave.doctor.finding import Finding, FindingLevel
 from mapweave.doctor.motion import MotionComparison
 from mapweave.exit_status import NO
 from mapweave.hybridmap.camera import Camera
@@ -46,7 +46,7 @@ def doctor(capfd: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict
     """Exit status, findings by their subjects, and the subject of the first that is wrong."""
     status = main(["doctor", "--json", *map(str, words)])
     answer = json.loads(capfd.readouterr().out)
-    found = [Finding(**{**one, "verdict": Verdict(one["verdict"])}) for one in answer["findings"]]
+    found = [Finding(**{**one, "verdict": FindingLevel(one["verdict"])}) for one in answer["findings"]]
     findings = {one.subject: one for one in found}
     return status, findings, (answer["first_wrong"] or {"subject": ""})["subject"]
 
@@ -84,21 +84,21 @@ def test_it_runs_without_libraries_and_names_them(missing: list[str], tmp_path: 
 def test_a_clock_before_the_installation_and_a_place_that_is_no_folder(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(time, "time", lambda: 3600.0)
     (finding,) = machine.clock()
-    assert finding.verdict is Verdict.WRONG and "1970" in finding.detail
+    assert finding.verdict is FindingLevel.WRONG and "1970" in finding.detail
     (tmp_path / "file").write_text("")
     *_, finding = machine.disk(tmp_path / "file")
-    assert finding.verdict is Verdict.WRONG and "--data" in finding.advice
+    assert finding.verdict is FindingLevel.WRONG and "--data" in finding.advice
 
 
 def test_a_full_or_slow_disk(tmp_path, monkeypatch) -> None:
     usage = machine.shutil.disk_usage(tmp_path)
     monkeypatch.setattr(machine.shutil, "disk_usage", lambda path: usage._replace(free=5_000_000))
     (finding,) = machine.disk(tmp_path)
-    assert finding.verdict is Verdict.WRONG and "free" in finding.advice
+    assert finding.verdict is FindingLevel.WRONG and "free" in finding.advice
     monkeypatch.setattr(machine.shutil, "disk_usage", lambda path: usage._replace(free=10**10))
-    assert next(machine.disk(tmp_path)).verdict is Verdict.GOOD
+    assert next(machine.disk(tmp_path)).verdict is FindingLevel.GOOD
     monkeypatch.setattr(machine, "SLOW_SYNC", 0.0)
-    assert next(machine.disk(tmp_path)).verdict is Verdict.WARNING
+    assert next(machine.disk(tmp_path)).verdict is FindingLevel.WARNING
 
 
 # Calibration
@@ -120,7 +120,7 @@ CAMERA = Camera(640, 480, 610.0, 612.0, 322.0, 238.0, 0.25, 0.1)
 def test_a_calibration_that_cannot_be_right(declared, distortion, words) -> None:
     (finding,) = camera_model.examine(RobotDescription(declared, distortion))
     assert (
-        finding.verdict is Verdict.WRONG
+        finding.verdict is FindingLevel.WRONG
         and words in finding.detail
         and "mapweave calibrate" in finding.advice
     )
@@ -136,7 +136,7 @@ def test_distortion_folds_where_opencv_brings_two_points_to_one() -> None:
     assert radius == pytest.approx(610.0 * rays[int(pixels[:, 0, 0].argmax()), 0], rel=0.03)
     assert camera_model.folding_radius(RobotDescription(CAMERA, (-0.28, 0.07, 0.0, 0.0, 0.0))) is None
     good = list(camera_model.examine(RobotDescription(CAMERA, (-0.28, 0.07, 0.0, 0.0, 0.0))))
-    assert [one.verdict for one in good] == [Verdict.GOOD]
+    assert [one.verdict for one in good] == [FindingLevel.GOOD]
 
 
 # Camera and driver: a video file for the one, a pseudo-terminal for the other
@@ -211,9 +211,11 @@ def test_a_robot_whose_camera_is_another_one(walls, sketch, tmp_path, capfd) -> 
     status, findings, first = doctor(
         capfd, "--settings", settings, "--drive", "--offline", "--data", tmp_path
     )
-    assert findings["camera"].verdict is Verdict.GOOD and "320x240 px" in findings["camera"].detail
-    assert findings["driver"].verdict is Verdict.GOOD and "3 proximity sensors" in findings["driver"].detail
-    assert findings["encoders"].verdict is Verdict.WRONG
+    assert findings["camera"].verdict is FindingLevel.GOOD and "320x240 px" in findings["camera"].detail
+    assert (
+        findings["driver"].verdict is FindingLevel.GOOD and "3 proximity sensors" in findings["driver"].detail
+    )
+    assert findings["encoders"].verdict is FindingLevel.WRONG
     assert "the encoders count and the image stands still" in findings["encoders"].detail
     eventually(lambda: sketch.wheels.speeds == (0.0, 0.0))
     assert 0.08 < sketch.wheels.way()[1] < 0.2
@@ -233,7 +235,7 @@ def test_a_dark_camera_and_a_port_that_is_not_there(walls, tmp_path, capfd) -> N
     settings = robot_toml(tmp_path, dark, tmp_path / "ttyUSB7")
     status, findings, first = doctor(capfd, "--settings", settings, "--offline", "--data", tmp_path)
     assert (status, first) == (NO, "image") and "dark" in findings["image"].detail
-    assert findings["driver"].verdict is Verdict.WRONG and "no such port" in findings["driver"].detail
+    assert findings["driver"].verdict is FindingLevel.WRONG and "no such port" in findings["driver"].detail
     assert "mapweave find-port" in findings["driver"].advice
 
 
@@ -254,7 +256,7 @@ def test_a_driver_with_few_images(walls) -> None:
     ]
     description = replace(DESCRIPTION, ranger_bearings=(0.5, 0.0, -0.5), ranger_reach=1.5)
     (finding,) = driver._judge(description, seen)
-    assert finding.verdict is Verdict.WARNING and "5 with an image" in finding.detail
+    assert finding.verdict is FindingLevel.WARNING and "5 with an image" in finding.detail
 
 
 def test_the_end_of_the_terminal_is_no_person(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -290,20 +292,20 @@ def push(walls: PhotoWalls) -> list:
 @pytest.mark.parametrize(
     ("spoil", "verdict", "words"),
     [
-        (lambda one, first: one, Verdict.GOOD, "agree with the image"),
+        (lambda one, first: one, FindingLevel.GOOD, "agree with the image"),
         (lambda one, first: replace(one, odometry=Odometry(0.0, 0.0)),
-         Verdict.WRONG, "encoders do not count"),
-        (lambda one, first: replace(one, image=first.image), Verdict.WRONG, "the image stands still"),
+         FindingLevel.WRONG, "encoders do not count"),
+        (lambda one, first: replace(one, image=first.image), FindingLevel.WRONG, "the image stands still"),
         (lambda one, first: replace(one, odometry=Odometry(one.odometry.forward, -one.odometry.turn)),
-         Verdict.WRONG, "the image turns the other way"),
+         FindingLevel.WRONG, "the image turns the other way"),
         (lambda one, first: replace(one, odometry=Odometry(-one.odometry.forward, one.odometry.turn)),
-         Verdict.WRONG, "forward by the encoders is backward by the image"),
+         FindingLevel.WRONG, "forward by the encoders is backward by the image"),
         (lambda one, first: replace(one, odometry=Odometry(one.odometry.forward, one.odometry.turn / 2)),
-         Verdict.WRONG, "turns 2.0"),
+         FindingLevel.WRONG, "turns 2.0"),
         (lambda one, first: replace(one, image=first.image, odometry=Odometry(0.0, 0.0)),
-         Verdict.SKIPPED, "nothing has moved"),
+         FindingLevel.SKIPPED, "nothing has moved"),
         (lambda one, first: replace(one, image=np.full_like(one.image, 90)),
-         Verdict.SKIPPED, "too little to follow"),
+         FindingLevel.SKIPPED, "too little to follow"),
     ],
 )  # fmt: skip
 def test_encoders_are_compared_with_the_image(push, spoil, verdict, words) -> None:
@@ -338,10 +340,12 @@ def test_servers(router: tuple[ZenohBus, str], tmp_path, capfd) -> None:
     serving = bus.serve(ours.server_status("s0"), lambda request: request.reply(encode_record(record)))
     status, findings, _ = doctor(capfd, *asked)
     assert (
-        status == 0 and findings["server"].verdict is Verdict.WARNING and "0.0.1" in findings["server"].detail
+        status == 0
+        and findings["server"].verdict is FindingLevel.WARNING
+        and "0.0.1" in findings["server"].detail
     )
     record["version"] = version("mapweave")
-    assert doctor(capfd, *asked)[1]["server"].verdict is Verdict.GOOD
+    assert doctor(capfd, *asked)[1]["server"].verdict is FindingLevel.GOOD
     serving.close()
 
 

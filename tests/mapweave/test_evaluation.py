@@ -17,7 +17,7 @@ import skimage.data
 from mapweave.cli import main
 from mapweave.evaluation.asking_again import Asked, trial_figures, trials_of
 from mapweave.evaluation.photographs import evidence
-from mapweave.evaluation.verdict import Verdict, figures
+from mapweave.evaluation.verdict import JudgedAnswer, figures
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -211,14 +211,14 @@ def test_photographs(walk: Path, capfd, tmp_path: Path) -> None:
 def test_figures_by_hand() -> None:
     result, unknown, ambiguous = Certainty.FOUND, Certainty.UNKNOWN, Certainty.AMBIGUOUS
     verdicts = [
-        Verdict("1", True, result, "a", True, True, error_m=0.2, error_deg=1.0, answer_ms=10.0),
-        Verdict("2", True, result, "a", True, True, error_m=0.4, error_deg=3.0, answer_ms=20.0),
-        Verdict("3", True, result, "b", False, False, error_m=9.0, error_deg=3.0, answer_ms=30.0),
-        Verdict("4", True, unknown, first=True),
-        Verdict("5", True, ambiguous, "a", True, True),
-        Verdict("6", False, result, "a", False, False, error_m=30.0, error_deg=90.0),
-        Verdict("7", False, unknown, first=False),
-        Verdict("8", None, result, "a"),
+        JudgedAnswer("1", True, result, "a", True, True, error_m=0.2, error_deg=1.0, answer_ms=10.0),
+        JudgedAnswer("2", True, result, "a", True, True, error_m=0.4, error_deg=3.0, answer_ms=20.0),
+        JudgedAnswer("3", True, result, "b", False, False, error_m=9.0, error_deg=3.0, answer_ms=30.0),
+        JudgedAnswer("4", True, unknown, first=True),
+        JudgedAnswer("5", True, ambiguous, "a", True, True),
+        JudgedAnswer("6", False, result, "a", False, False, error_m=30.0, error_deg=90.0),
+        JudgedAnswer("7", False, unknown, first=False),
+        JudgedAnswer("8", None, result, "a"),
     ]
     outcome = figures(verdicts)
     assert (outcome["queries"], outcome["expected"], outcome["found"]) == (8, 5, 5)

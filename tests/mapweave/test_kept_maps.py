@@ -15,7 +15,7 @@ import pytest
 
 from mapweave.agent.drivers.messages import decode_step, encode_description, encode_observation
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.agent.pipeline import Step
+from mapweave.agent.pipeline import TickResult
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.settings import AgentSettings
@@ -271,7 +271,7 @@ class Carried:
     def close(self) -> None:
         pass
 
-    def stepped(self, observation: Observation, step: Step) -> None:
+    def stepped(self, observation: Observation, step: TickResult) -> None:
         self._nodes += sum(isinstance(change, NodePut) for change in step.changes)
 
 

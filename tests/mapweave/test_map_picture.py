@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from mapweave.drawing import map_picture
 from mapweave.drawing.map_picture import (
     COLOURS,
-    Drive,
+    DrawnDrive,
     MapPicture,
     Outline,
     bounds_of,
@@ -22,7 +22,7 @@ from mapweave.drawing.names import CELL, NamePlacement
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 
 NODES = {
     NodeId(agent, 1, k): Pose2(k, i, 0.2 * k) for i, agent in enumerate(("r0", "r1")) for k in range(1, 5)
@@ -87,7 +87,7 @@ def test_nothing_is_cut_at_the_edge(tmp_path, title, width, height):
 
 
 def test_the_floor_the_landmarks_and_the_drive_are_drawn(tmp_path):
-    plan = FloorPlan(
+    plan = BuildingPlan(
         (Rectangle.spanning(0, -1, 6, 3, "room 0"), Rectangle.spanning(6, 0, 6.2, 1, "door 0")),
         (Rectangle.spanning(0, 3, 6, 3.2),),
         (Rectangle(4.5, 2.2, 1.0, 0.6, 0.4, "table"),),
@@ -95,7 +95,9 @@ def test_the_floor_the_landmarks_and_the_drive_are_drawn(tmp_path):
     outline = outline_of(plan)
     assert [name for name, _ in outline.rooms] == ["room 0", ""], "doors have no name to be written"
     assert len(outline.solids) == 2
-    drive = Drive(np.array([[1.0, 0.0], [2.0, 2.0], [4.0, 1.0]]), Pose2(1, 0), Pose2(4, 1), "drive of r0")
+    drive = DrawnDrive(
+        np.array([[1.0, 0.0], [2.0, 2.0], [4.0, 1.0]]), Pose2(1, 0), Pose2(4, 1), "drive of r0"
+    )
     landmarks = np.random.default_rng(0).uniform([0, -1], [6, 3], (500, 2))
     bare = drawn(tmp_path, MapPicture("a map", NODES, EDGES))
     full = drawn(tmp_path, MapPicture("a map", NODES, EDGES, outline, [drive], landmarks))

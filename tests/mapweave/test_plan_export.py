@@ -16,8 +16,8 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.mapserver.floor_plans import check_plan
 from mapweave.merge.pose_graph.component import Component
-from mapweave.merge.pose_graph.factors import Factors, Measurement
-from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.factors import Factors, RelativePose
+from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 
 SCALE = 0.05
 IMAGE = PlanImage("0" * 64, 400, 300, "office.pgm")
@@ -34,11 +34,13 @@ def placed(request: pytest.FixtureRequest) -> PlacedPlan:
     nodes = tuple(NodeId("a", 1, k) for k in range(4))
     means = np.column_stack([points, np.zeros(4)])
     step = [
-        Measurement(nodes[k], nodes[k + 1], PoseGaussian(Pose2(*(means[k + 1] - means[k])), 1e-4 * np.eye(3)))
+        RelativePose(
+            nodes[k], nodes[k + 1], PoseGaussian(Pose2(*(means[k + 1] - means[k])), 1e-4 * np.eye(3))
+        )
         for k in range(3)
     ]
     graph = Component(nodes[0], nodes, means, Factors.of(step, [0, 1, 2], [1, 2, 3]))
-    merged = MergedMap({}, (), (), (frozenset(nodes),), Poses([graph]), (graph,))
+    merged = MergedMap({}, (), (), (frozenset(nodes),), NodePoses([graph]), (graph,))
     pairs = [PlanPair(node, 0.0, 0.0, u, v) for node, (u, v) in zip(nodes, PIXELS.tolist(), strict=True)]
     plan = FloorPlan(tuple(pairs), IMAGE, SCALE, request.param)
     return PlacedPlan("3. floor: east", plan, check_plan(plan, merged).parts)

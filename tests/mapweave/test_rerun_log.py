@@ -27,7 +27,7 @@ from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.scenarios.fleet import Stage
+from mapweave.scenarios.fleet import TrialStage
 from mapweave.scenarios.scenario import load_scenario, scenario_path
 from mapweave.storage.map_file import read_map_file
 from mapweave.vision.lens import Lens
@@ -245,7 +245,7 @@ def test_each_robot_of_a_trial_has_a_log_and_one_that_is_started_again_another(t
     from mapweave.scenarios.local_fleet import LocalFleet
 
     scenario = load_scenario(scenario_path("office"), ["robots=2", "world.rooms=3"])
-    fleet = LocalFleet(Stage(scenario, 1, tmp_path, AgentSettings(), rerun=True))
+    fleet = LocalFleet(TrialStage(scenario, 1, tmp_path, AgentSettings(), rerun=True))
     fleet.start()
     fleet.advance(6)
     fleet.kill_agent("r0")

@@ -13,7 +13,7 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.node import CODE_BYTES, Landmarks
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.photographs import Stretch
-from mapweave.visual_trajectory import FOUND, INTERPOLATED, FollowedImage, trajectory_of, tum_lines
+from mapweave.visual_trajectory import FOUND, INTERPOLATED, TrackedImage, trajectory_of, tum_lines
 
 CAMERA = Camera(640, 480, 500.0, 505.0, 318.0, 241.0, mount_height=1.4, mount_forward=0.2)
 NODES = (Pose2(2.0, 1.0, 0.4), Pose2(2.6, 1.3, 0.5))
@@ -43,10 +43,10 @@ def stretch() -> Stretch:
     return Stretch(list(NODES), [landmarks_of(rng) for _ in NODES], features, [])
 
 
-def followed(stretch: Stretch, k: int, stamp_ns: int, seen: Array) -> FollowedImage:
+def followed(stretch: Stretch, k: int, stamp_ns: int, seen: Array) -> TrackedImage:
     pixels = np.full((COUNT + 15, 2), np.nan, np.float32)
     pixels[stretch.features[k]] = seen
-    return FollowedImage(stamp_ns, pixels)
+    return TrackedImage(stamp_ns, pixels)
 
 
 def test_a_camera_that_is_tilted_and_held_higher_is_placed_upright(stretch: Stretch) -> None:

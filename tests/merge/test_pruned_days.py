@@ -14,7 +14,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component import Component, solve_graph
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.marginalization import LINKS, is_marginal, marginal_links
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -96,7 +96,7 @@ def test_pruning_joins_nothing_wrongly(seed: int, false_share: float, days: int)
     assert len(merged.components) == len(full.components) == 1, "what is one without pruning is one with it"
     # The optimum of all measurements of all days, with the links that are known to be true.
     measured = [
-        Measurement(edge.a, edge.b, edge.a_from_b)
+        RelativePose(edge.a, edge.b, edge.a_from_b)
         for hybrid_map in whole.maps.values()
         for edge in hybrid_map.edges.values()
     ]

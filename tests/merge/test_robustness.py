@@ -13,7 +13,7 @@ from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.links import Link
 from synthetic.city import draw_grid
 from synthetic.fleet import BARE, CAMERA, FleetSettings, draw_fleet
@@ -25,7 +25,7 @@ GATE = 16.27
 SMALL = FleetSettings(nodes=40, side=8.0)
 
 
-def chi2(measurement: Measurement, poses: dict[NodeId, Pose2]) -> float:
+def chi2(measurement: RelativePose, poses: dict[NodeId, Pose2]) -> float:
     relative = poses[measurement.a].inverse() @ poses[measurement.b]
     return replace(measurement.a_from_b, covariance=measurement.covariance).mahalanobis2(relative)
 
@@ -38,16 +38,16 @@ def test_graduation_finds_the_cheapest_set_of_all(seed: int) -> None:
     true = [Pose2(0.5 * k, np.sin(k), 0.3 * k) for k in range(10)]
     sigmas = np.array([0.03, 0.03, 0.01])
 
-    def measured(i: int, j: int, robust: bool, off: Pose2) -> Measurement:
+    def measured(i: int, j: int, robust: bool, off: Pose2) -> RelativePose:
         mean = true[i].inverse() @ true[j] @ off @ Pose2.from_vector(rng.normal(0, sigmas))
-        return Measurement(ids[i], ids[j], PoseGaussian(mean, np.diag(sigmas**2)), robust)
+        return RelativePose(ids[i], ids[j], PoseGaussian(mean, np.diag(sigmas**2)), robust)
 
     way = [measured(k, k + 1, False, Pose2()) for k in range(9)]
     good = [measured(i, j, True, Pose2()) for i, j in ((0, 9), (1, 7), (2, 8))]
     bad = [measured(i, j, True, Pose2(*rng.uniform(0.6, 1.5, 2), 0.5)) for i, j in ((0, 5), (3, 9), (1, 8))]
     links = good + bad
 
-    def cost(left_out: tuple[Measurement, ...]) -> float:
+    def cost(left_out: tuple[RelativePose, ...]) -> float:
         used = way + [m for m in links if m not in left_out]
         graph = solve_graph(ids[0], true[0], used)
         poses = {node: graph.pose(node) for node in graph.nodes}

@@ -19,14 +19,14 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge import torn_maps
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.links import RefusedLink, refuse
-from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.settings import ConsistencySettings
 from mapweave.merge.torn_maps import TornMapSearch
-from mapweave.scenarios.liar.lies import Setting, altered, altered_places, bodies, chain
+from mapweave.scenarios.liar.lies import LieInputs, altered, altered_places, bodies, chain
 from mapweave.wire.codec import decode_change
-from synthetic.wrong_geometry import ODD, SCENES, Fault, Fleet, draw_fleet
+from synthetic.wrong_geometry import ODD, SCENES, FaultyFleet, OdometryFault, draw_fleet
 from tests.examined import examined_once
 from tests.quick import first_quick
 
@@ -51,12 +51,12 @@ def other_views() -> Iterator[None]:
 
 
 @pytest.fixture(scope="module")
-def fleet() -> Fleet:
-    return draw_fleet(SEED, SCENES["house"], Fault.NONE, stops=2)
+def fleet() -> FaultyFleet:
+    return draw_fleet(SEED, SCENES["house"], OdometryFault.NONE, stops=2)
 
 
 def joined_with_copies(
-    fleet: Fleet, shift: Pose2, *, in_turns: bool = False, off: Pose2 = NOT_OFF
+    fleet: FaultyFleet, shift: Pose2, *, in_turns: bool = False, off: Pose2 = NOT_OFF
 ) -> MergedMap:
     """Copies of r0's nodes, and of r1's shifted against where they are, merged with the true maps.
 
@@ -69,7 +69,9 @@ def joined_with_copies(
     theirs = [node for some in (zip(*both, strict=True) if in_turns else both) for node in some]
     wrong = {node.id: off for node in both[0][::5]} | {node.id: shift for node in both[1]}
     poses = [AWAY @ wrong.get(node.id, NOT_OFF) @ fleet.truth[node.id] for node in theirs]
-    copied = chain(Setting(ODD, fleet.maps[ODD], sound, rng), [altered(node, rng) for node in theirs], poses)
+    copied = chain(
+        LieInputs(ODD, fleet.maps[ODD], sound, rng), [altered(node, rng) for node in theirs], poses
+    )
     merger = Merger()
     for map_id, content in {**sound, ODD: copied}.items():
         for body in bodies(content):
@@ -78,7 +80,7 @@ def joined_with_copies(
 
 
 @pytest.fixture(scope="module")
-def copies(fleet: Fleet) -> Callable[[Pose2], MergedMap]:
+def copies(fleet: FaultyFleet) -> Callable[[Pose2], MergedMap]:
     """`joined_with_copies` by the shift, of which most tests have the same."""
     return cache(partial(joined_with_copies, fleet))
 
@@ -124,7 +126,7 @@ def test_two_robots_that_agree_exclude_a_torn_map(
 
 @pytest.mark.parametrize(("shift", "torn"), [(TORN, True), (Pose2(), False)])
 def test_nodes_of_two_robots_in_turns_are_tested_beside_each_other(
-    fleet: Fleet, shift: Pose2, torn: bool, monkeypatch: pytest.MonkeyPatch
+    fleet: FaultyFleet, shift: Pose2, torn: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of more nodes than are tested, those of one robot alone were tested: every second one."""
     merged = beside(joined_with_copies(fleet, shift, in_turns=True), ("r0", "r1"))
@@ -134,7 +136,9 @@ def test_nodes_of_two_robots_in_turns_are_tested_beside_each_other(
 
 
 @pytest.mark.parametrize(("shift", "torn"), [(TORN, True), (Pose2(), False)])
-def test_nodes_that_are_a_little_off_are_of_no_other_place(fleet: Fleet, shift: Pose2, torn: bool) -> None:
+def test_nodes_that_are_a_little_off_are_of_no_other_place(
+    fleet: FaultyFleet, shift: Pose2, torn: bool
+) -> None:
     """They counted as of another one: a map with everything nearly where it is seemed torn."""
     off = Pose2(0.5, 0.4, 0.0)
     merged = beside(joined_with_copies(fleet, shift, in_turns=True, off=off), ("r0", "r1"))
@@ -156,7 +160,7 @@ def test_what_did_not_change_is_not_tested_again(
     # The others have moved.
     assert search.torn(merged) == {} and len(tested) == 2
     graphs = tuple(copy(graph) if len(graph.maps) > 1 else graph for graph in merged.graphs)
-    assert not search.torn(replace(merged, graphs=graphs, poses=Poses(graphs))) and len(tested) == 3
+    assert not search.torn(replace(merged, graphs=graphs, poses=NodePoses(graphs))) and len(tested) == 3
 
 
 @pytest.mark.slow
@@ -168,19 +172,22 @@ def test_a_second_map_of_its_robot_that_joins_it_is_no_defect(copies: Callable[[
     more = MapId(ODD.agent, ODD.epoch + 1)
     node = replace(merged.maps[ODD].nodes[alone.nodes[0]], id=NodeId(*more, 1))
     both = solve_graph(alone.nodes[0], alone.pose(alone.nodes[0]), [
-        *(Measurement(edge.a, edge.b, edge.a_from_b) for edge in merged.maps[ODD].edges.values()),
-        Measurement(alone.nodes[0], node.id, PoseGaussian(Pose2(0.1, 0.0, 0.0), 1e-4 * np.eye(3))),
+        *(RelativePose(edge.a, edge.b, edge.a_from_b) for edge in merged.maps[ODD].edges.values()),
+        RelativePose(alone.nodes[0], node.id, PoseGaussian(Pose2(0.1, 0.0, 0.0), 1e-4 * np.eye(3))),
     ])  # fmt: skip
     graphs = tuple(both if graph is alone else graph for graph in merged.graphs)
     maps = {**merged.maps, more: HybridMap([NodePut(node)])}
-    assert search.torn(replace(merged, maps=maps, graphs=graphs, poses=Poses(graphs))).keys() == {ODD, more}
+    assert search.torn(replace(merged, maps=maps, graphs=graphs, poses=NodePoses(graphs))).keys() == {
+        ODD,
+        more,
+    }
 
 
 @pytest.mark.slow
-def test_altered_copies_behind_a_true_drive_are_found_out_by_their_arrangement(fleet: Fleet) -> None:
+def test_altered_copies_behind_a_true_drive_are_found_out_by_their_arrangement(fleet: FaultyFleet) -> None:
     """Copies of two robots' places, each robot's in its own frame: their map contradicts those that agree."""
     sound = {map_id: content for map_id, content in fleet.maps.items() if map_id != ODD}
-    lie = altered_places(Setting(ODD, fleet.maps[ODD], sound, np.random.default_rng(SEED)))
+    lie = altered_places(LieInputs(ODD, fleet.maps[ODD], sound, np.random.default_rng(SEED)))
     merger = Merger()
     for map_id, content in sound.items():
         for body in bodies(content):

@@ -11,8 +11,8 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.registration import recognition
 from mapweave.registration.recognition import (
     Recognition,
+    RecognitionFailure,
     RecognitionSettings,
-    Refusal,
     examine_nodes,
     examine_view,
     recognise,
@@ -79,7 +79,7 @@ def test_views_of_elsewhere_are_not_recognised() -> None:
         a = somewhere(rng)
         view, _ = take_view(world(99), near(a, rng), rng)
         verdict = examine_view(node_at(a, rng), view, None, rng)
-        assert isinstance(verdict, Refusal) and verdict.reason
+        assert isinstance(verdict, RecognitionFailure) and verdict.reason
 
 
 def test_two_nodes_register_the_same_in_both_directions() -> None:
@@ -151,7 +151,7 @@ def test_each_rule_refuses_with_its_own_reason(
     a = Pose2(2.5, 2.0, 0.3)
     view, _ = take_view(world(), near(a, rng), rng)
     verdict = examine_view(node_at(a, rng), view, settings, rng)
-    assert isinstance(verdict, Refusal) and word in verdict.reason
+    assert isinstance(verdict, RecognitionFailure) and word in verdict.reason
 
 
 def test_a_patch_in_a_corner_does_not_make_a_place() -> None:
@@ -166,7 +166,7 @@ def test_a_patch_in_a_corner_does_not_make_a_place() -> None:
         pixels=np.concatenate([view.pixels[corner], foreign.pixels]),
         codes=np.concatenate([view.codes[corner], foreign.codes]),
     )
-    assert isinstance(examine_view(node, mixed, None, rng), Refusal)
+    assert isinstance(examine_view(node, mixed, None, rng), RecognitionFailure)
 
 
 def test_empty_nodes_and_views_are_refused_in_words() -> None:
@@ -175,4 +175,4 @@ def test_empty_nodes_and_views_are_refused_in_words() -> None:
     empty = replace(node_at(a, rng), landmarks=Landmarks.empty())
     view, _ = take_view(world(), a, rng)
     verdict = examine_view(empty, view, None, rng)
-    assert isinstance(verdict, Refusal) and "0 features match" in verdict.reason
+    assert isinstance(verdict, RecognitionFailure) and "0 features match" in verdict.reason

@@ -10,7 +10,7 @@ import pytest
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 from mapweave.sim.world import Block, PanelSet, World
 from mapweave.sim.worlds.catalog import make_world
 from tests.sim.stage import Stage
@@ -85,14 +85,14 @@ def office() -> World:
 @pytest.fixture
 def bare() -> World:
     """Nothing but floor, 200 m wide."""
-    return World("bare", FloorPlan((Rectangle.spanning(-100, -100, 100, 100, "room 0"),), ()), (), ())
+    return World("bare", BuildingPlan((Rectangle.spanning(-100, -100, 100, 100, "room 0"),), ()), (), ())
 
 
 @pytest.fixture
 def walled() -> World:
     """A floor with one wall, its face at x = 1 m."""
     wall = Rectangle.spanning(1.0, -3.0, 1.2, 3.0)
-    plan = FloorPlan((Rectangle.spanning(-10, -10, 10, 10, "room 0"),), (wall,))
+    plan = BuildingPlan((Rectangle.spanning(-10, -10, 10, 10, "room 0"),), (wall,))
     return World("walled", plan, (Block(wall, 0.0, 2.0),), ())
 
 

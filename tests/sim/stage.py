@@ -16,7 +16,7 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.sim.bridge import SimBridge
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 from mapweave.sim.ground_truth_client import SimControl
 from mapweave.sim.keys import SimKeys
 from mapweave.sim.simulation_interface import Simulated
@@ -25,7 +25,7 @@ from mapweave.wire.memory import MemoryBus, MemoryHub
 KEYS = SimKeys("test")
 TICK_NS = 100_000_000
 CAMERA = Camera(width=32, height=24, fx=27.0, fy=27.0, cx=15.5, cy=11.5, mount_height=0.3)
-PLAN = FloorPlan(
+PLAN = BuildingPlan(
     rooms=(Rectangle.spanning(0, 0, 4, 3, "office"),),
     walls=(Rectangle.spanning(0, -0.1, 4, 0), Rectangle(1.0, 3.0, 2.0, 0.1, 0.3, "slanted")),
     furniture=(Rectangle(2.0, 1.0, 0.5, 0.4, 1.2, "desk"),),
@@ -34,7 +34,7 @@ PLAN = FloorPlan(
 
 @dataclass(frozen=True)
 class FakeWorld:
-    plan: FloorPlan = PLAN
+    plan: BuildingPlan = PLAN
 
 
 @dataclass

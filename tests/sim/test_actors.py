@@ -13,7 +13,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.actors import AHEAD, FIGURES, Actor
 from mapweave.sim.events import Walk
-from mapweave.sim.floorplan import FloorPlan, distances_to
+from mapweave.sim.floorplan import BuildingPlan, distances_to
 from mapweave.sim.placement import is_clear, sampled
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World
@@ -124,7 +124,7 @@ def test_the_picture_of_a_person_is_where_the_person_is(bare: World, stand) -> N
 
 def test_legs_through_walls_are_refused(walled: World) -> None:
     """Also those that only graze one, and legs without length."""
-    plan: FloorPlan = walled.plan
+    plan: BuildingPlan = walled.plan
     assert plan.walls[0].x == pytest.approx(1.1)
     with Simulation(walled, ["r0"], 1, [Pose2(-3.0, 0.0)]) as simulation:
         simulation.apply(Walk(path=((-2.0, 1.0), (0.7, 1.0))))

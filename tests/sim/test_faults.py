@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mapweave.agent.observation import Command, Odometry
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.events import Fail
-from mapweave.sim.faults import Faults, describe
+from mapweave.sim.faults import SensorFaults, describe
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World
 
@@ -82,7 +82,7 @@ def test_encoders_fail_wheel_by_wheel(office: World, healthy: list) -> None:
 )  # fmt: skip
 def test_encoder_faults_in_any_combination(forward: float, turn: float, hows: set[str]) -> None:
     """Against the wheels taken one by one."""
-    faults = Faults(AXLE, (1,))
+    faults = SensorFaults(AXLE, (1,))
     for how in sorted(hows):
         faults.begin(Fail("r0", "encoders", how), 0, 5)
     left, right = wheels(Odometry(forward, turn))

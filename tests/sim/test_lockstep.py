@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mapweave.agent.drivers.messages import AGAIN, StepRequest
 from mapweave.agent.observation import Command
-from mapweave.sim.lockstep import Lockstep
+from mapweave.sim.lockstep import StepBarrier
 
 
 @dataclass
@@ -34,7 +34,7 @@ class Table:
     """A lock-step with names for what the tests do all the time."""
 
     def __init__(self, robots: list[str]) -> None:
-        self.steps = Lockstep(robots, patience=20.0)
+        self.steps = StepBarrier(robots, patience=20.0)
 
     def ask(self, name: str, sequence: int, now: float = 0.0) -> Question:
         question = Question()

@@ -12,11 +12,11 @@ from mapweave.hybridmap.errors import SettingsError
 from mapweave.wire.bus import Reply, Request, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.dispatch import Dispatcher
-from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
+from mapweave.wire.memory import MemoryBus, MemoryHub, MessageFaults
 from tests.waiting import eventually
 
 
-def run(faults: Faults, count: int = 300, seed: int = 1) -> list[int]:
+def run(faults: MessageFaults, count: int = 300, seed: int = 1) -> list[int]:
     """The numbers that arrive out of 0 .. count, and those that calming the hub sets free."""
     hub = MemoryHub()
     sender, receiver = MemoryBus(hub), MemoryBus(hub)
@@ -34,7 +34,7 @@ def run(faults: Faults, count: int = 300, seed: int = 1) -> list[int]:
 
 
 def test_without_faults_all_arrives_in_order() -> None:
-    assert run(Faults()) == list(range(300))
+    assert run(MessageFaults()) == list(range(300))
 
 
 def test_one_bus_can_be_disturbed_alone() -> None:
@@ -42,7 +42,7 @@ def test_one_bus_can_be_disturbed_alone() -> None:
     bad, good, receiver = MemoryBus(hub), MemoryBus(hub), MemoryBus(hub)
     got: list[bytes] = []
     receiver.subscribe("n", lambda sample: got.append(sample.payload))
-    hub.disturb(Faults(drop=1.0), np.random.default_rng(1), bad)
+    hub.disturb(MessageFaults(drop=1.0), np.random.default_rng(1), bad)
     for _ in range(20):
         bad.publish("n", b"bad")
         good.publish("n", b"good")
@@ -55,27 +55,27 @@ def test_one_bus_can_be_disturbed_alone() -> None:
 
 
 def test_dropped_messages_are_gone_and_the_others_in_order() -> None:
-    got = run(Faults(drop=0.3))
+    got = run(MessageFaults(drop=0.3))
     assert got == sorted(set(got))
     assert 150 < len(got) < 270
 
 
 def test_doubled_messages_come_twice() -> None:
-    got = run(Faults(double=0.3))
+    got = run(MessageFaults(double=0.3))
     assert got == sorted(got)
     assert set(got) == set(range(300))
     assert 330 < len(got) < 450
 
 
 def test_delayed_messages_come_later_but_come() -> None:
-    got = run(Faults(delay=0.3, longest_delay=5))
+    got = run(MessageFaults(delay=0.3, longest_delay=5))
     assert sorted(got) == list(range(300))
     assert got != sorted(got)
     assert max(abs(place - n) for place, n in enumerate(got)) <= 10
 
 
 def test_the_same_seed_makes_the_same_faults() -> None:
-    faults = Faults(0.2, 0.2, 0.2)
+    faults = MessageFaults(0.2, 0.2, 0.2)
     assert run(faults, seed=3) == run(faults, seed=3)
     assert run(faults, seed=3) != run(faults, seed=4)
 

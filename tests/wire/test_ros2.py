@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from mapweave.hybridmap.errors import InvalidMessage, SettingsError
 from mapweave.wire.ros2.attachment import Attachment, decode_attachment, encode_attachment
-from mapweave.wire.ros2.keys import Endpoint, RmwZenohKeys, Role
+from mapweave.wire.ros2.keys import Endpoint, EndpointRole, RmwZenohKeys
 from mapweave.wire.ros2.messages import decode, make, type_hash
 from mapweave.wire.ros2.node import Arrival, Ros2Node
 from mapweave.wire.ros2.settings import Ros2Link
@@ -56,7 +56,7 @@ def test_keys_and_tokens_are_those_of_the_design_document() -> None:
     chatter = Endpoint("/chatter", STRING, HASHES[STRING])
     assert keys.messages(chatter) == f"2/chatter/std_msgs::msg::dds_::String_/{HASHES[STRING]}"
     assert keys.node() == "@ros2_lv/2/8b20917502ee955ac4476e0266340d5c/0/0/NN/%/%/talker"
-    token = keys.token(Role.PUBLISHER, 10, chatter, False, 7)
+    token = keys.token(EndpointRole.PUBLISHER, 10, chatter, False, 7)
     session = "@ros2_lv/2/8b20917502ee955ac4476e0266340d5c/0/10/MP/%/%/talker/%chatter"
     # Nothing is left out of the quality of service, for what is left out is the reader's default.
     assert token == f"{session}/std_msgs::msg::dds_::String_/{HASHES[STRING]}/1:2:1,7:,:,:,,"

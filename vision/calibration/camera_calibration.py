@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
-from mapweave.vision.calibration.coverage import PLACES, Coverage, coverage_of, diverse
-from mapweave.vision.calibration.estimation import Fit, fit, refit, residuals_of_held_out
+from mapweave.vision.calibration.coverage import PLACES, ViewCoverage, coverage_of, diverse
+from mapweave.vision.calibration.estimation import LensEstimate, fit, refit, residuals_of_held_out
 from mapweave.vision.calibration.projection import project, rays_of
 from mapweave.vision.calibration.views import BoardView
 from mapweave.vision.equidistant import WIDEST
@@ -52,9 +52,9 @@ class CameraCalibration:
     """
 
     image_size: tuple[int, int]
-    fit: Fit
+    fit: LensEstimate
     views: tuple[BoardView, ...]
-    coverage: Coverage
+    coverage: ViewCoverage
     uncertainty_px: Array
     held_out_px: float
     compared: dict[LensModel, float]
@@ -90,7 +90,7 @@ def calibrate_camera(views: Sequence[BoardView], model: LensModel | None = None)
             f"images of different sizes: {', '.join(f'{w}x{h}' for w, h in sorted(counts))}{which}"
         )
     chosen = diverse(views, MOST_VIEWS)
-    fits: dict[LensModel, Fit] = {}
+    fits: dict[LensModel, LensEstimate] = {}
     failure: InvalidValue | None = None
     for one in [model] if model is not None else list(LensModel):
         try:
@@ -121,7 +121,9 @@ def calibrate_camera(views: Sequence[BoardView], model: LensModel | None = None)
     )  # fmt: skip
 
 
-def held_out_error(views: Sequence[BoardView], found: Fit, judged: Sequence[NDArray[np.bool_]]) -> float:
+def held_out_error(
+    views: Sequence[BoardView], found: LensEstimate, judged: Sequence[NDArray[np.bool_]]
+) -> float:
     """RMS error of a corner in one direction, px, over parts of the views that the fit does without.
 
     Args:
@@ -144,7 +146,7 @@ def held_out_error(views: Sequence[BoardView], found: Fit, judged: Sequence[NDAr
     return math.sqrt(squares / count)
 
 
-def uncertainty_of(found: Fit, image_size: tuple[int, int]) -> Array:
+def uncertainty_of(found: LensEstimate, image_size: tuple[int, int]) -> Array:
     """Standard deviation of projections, see `CameraCalibration.uncertainty_px`.
 
     An error of the intrinsics that acts as a rotation of the camera is none: nothing but the mount tells
@@ -176,7 +178,9 @@ def uncertainty_of(found: Fit, image_size: tuple[int, int]) -> Array:
     return out.reshape(GRID[1], GRID[0])
 
 
-def _problems(found: Fit, image_size: tuple[int, int], uncertainty: Array, held_out: float) -> list[str]:
+def _problems(
+    found: LensEstimate, image_size: tuple[int, int], uncertainty: Array, held_out: float
+) -> list[str]:
     limit = MOST_ERROR * image_size[0] / reduced_size(*image_size).width
     problems = []
     worst = float(np.nanmax(uncertainty))

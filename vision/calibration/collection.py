@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.vision.calibration.camera_calibration import CameraCalibration, calibrate_camera
-from mapweave.vision.calibration.coverage import Coverage, coverage_of, is_new
+from mapweave.vision.calibration.coverage import ViewCoverage, coverage_of, is_new
 from mapweave.vision.calibration.views import BoardDetector, BoardView
 from mapweave.vision.lens import LensModel
 
@@ -30,7 +30,7 @@ class Guidance:
         taken: whether it was kept.
     """
 
-    coverage: Coverage
+    coverage: ViewCoverage
     hint: str
     view: BoardView | None
     taken: bool

@@ -27,8 +27,8 @@ PLACES = (
 
 
 @dataclass(frozen=True, eq=False)
-class Coverage:
-    """Of a set of views.
+class ViewCoverage:
+    """How well a set of views covers the image.
 
     Attributes:
         views: how many.
@@ -41,10 +41,10 @@ class Coverage:
     missing: tuple[str, ...]
 
 
-def coverage_of(views: Sequence[BoardView]) -> Coverage:
+def coverage_of(views: Sequence[BoardView]) -> ViewCoverage:
     """Compute the bars, and what is missing."""
     if not views:
-        return Coverage(0, np.zeros(4), ("show the board to the camera, flat and whole",))
+        return ViewCoverage(0, np.zeros(4), ("show the board to the camera, flat and whole",))
     placements = np.array([view.placement for view in views])
     low, high = placements.min(axis=0), placements.max(axis=0)
     # The board is seen from the front and from afar in any case: size and skew begin at 0.
@@ -68,7 +68,7 @@ def coverage_of(views: Sequence[BoardView]) -> Coverage:
         missing.append(f"show the board in the {PLACES[row][column]} of the image: no view has it there")
     if not missing and len(views) < FEWEST_VIEWS:
         missing.append(f"show {FEWEST_VIEWS - len(views)} more views that differ: other places, other tilts")
-    return Coverage(len(views), bars, tuple(missing))
+    return ViewCoverage(len(views), bars, tuple(missing))
 
 
 def is_new(view: BoardView, views: Sequence[BoardView]) -> bool:

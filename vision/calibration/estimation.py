@@ -49,8 +49,8 @@ NEAR_PX = 4.0
 
 
 @dataclass(frozen=True, eq=False)
-class Fit:
-    """What views show.
+class LensEstimate:
+    """Lens, poses and noise as a set of views shows them.
 
     Attributes:
         model: of the lens.
@@ -69,7 +69,7 @@ class Fit:
     sigma_px: float
 
 
-def fit(views: Sequence[BoardView], model: LensModel) -> Fit:
+def fit(views: Sequence[BoardView], model: LensModel) -> LensEstimate:
     """Estimate from nothing.
 
     Raises:
@@ -98,7 +98,7 @@ def fit(views: Sequence[BoardView], model: LensModel) -> Fit:
     return _with_covariance(views, found)
 
 
-def refit(views: Sequence[BoardView], found: Fit, which: Sequence[int]) -> Fit:
+def refit(views: Sequence[BoardView], found: LensEstimate, which: Sequence[int]) -> LensEstimate:
     """Estimate again from some of the views, beginning at what all of them show."""
     chosen = [views[k] for k in which]
     begun = replace(found, poses=found.poses[list(which)], kept=tuple(found.kept[k] for k in which))
@@ -106,7 +106,7 @@ def refit(views: Sequence[BoardView], found: Fit, which: Sequence[int]) -> Fit:
 
 
 def residuals_of_held_out(
-    views: Sequence[BoardView], found: Fit, poses: Array, kept: Sequence[NDArray[np.bool_]]
+    views: Sequence[BoardView], found: LensEstimate, poses: Array, kept: Sequence[NDArray[np.bool_]]
 ) -> Array:
     """(M, 2) px: corners of other views, whose poses alone are estimated.
 
@@ -121,7 +121,7 @@ def residuals_of_held_out(
     return np.concatenate([r[k] for r, k in zip(_residuals(views, posed), posed.kept, strict=True)])
 
 
-def _first(views: Sequence[BoardView], model: LensModel) -> Fit:
+def _first(views: Sequence[BoardView], model: LensModel) -> LensEstimate:
     """The best of some focal lengths, without distortion."""
     width, height = views[0].image_size
     few = views[:: math.ceil(len(views) / FEW)]
@@ -138,11 +138,11 @@ def _first(views: Sequence[BoardView], model: LensModel) -> Fit:
     return _posed(views, model, best[1])
 
 
-def _posed(views: Sequence[BoardView], model: LensModel, intrinsics: Array) -> Fit:
+def _posed(views: Sequence[BoardView], model: LensModel, intrinsics: Array) -> LensEstimate:
     poses = [_pose(view, model, intrinsics) for view in views]
     known = np.array([UNKNOWN_POSE if pose is None else pose for pose in poses])
     everything = tuple(np.ones(len(view.points), np.bool_) for view in views)
-    return Fit(model, intrinsics, np.zeros((0, 0)), known, everything, 0.0)
+    return LensEstimate(model, intrinsics, np.zeros((0, 0)), known, everything, 0.0)
 
 
 def _pose(view: BoardView, model: LensModel, intrinsics: Array) -> Array | None:
@@ -164,7 +164,7 @@ def _pose(view: BoardView, model: LensModel, intrinsics: Array) -> Array | None:
     return np.concatenate([turn.ravel(), shift.ravel()])
 
 
-def _posed_again(views: Sequence[BoardView], found: Fit) -> Fit:
+def _posed_again(views: Sequence[BoardView], found: LensEstimate) -> LensEstimate:
     """Views that were led astray by the first intrinsics get poses by the present ones."""
     poses = found.poses.copy()
     for k, (view, pose) in enumerate(zip(views, found.poses, strict=True)):
@@ -180,7 +180,7 @@ def _posed_again(views: Sequence[BoardView], found: Fit) -> Fit:
     return replace(found, poses=poses)
 
 
-def _projected(views: Sequence[BoardView], found: Fit) -> list[Projected]:
+def _projected(views: Sequence[BoardView], found: LensEstimate) -> list[Projected]:
     return [
         project(found.model, found.intrinsics, pose, view.points)
         for view, pose in zip(views, found.poses, strict=True)
@@ -192,11 +192,11 @@ def _off(views: Sequence[BoardView], seen: Sequence[Projected]) -> list[Array]:
     return [one.pixels - view.pixels for view, one in zip(views, seen, strict=True)]
 
 
-def _residuals(views: Sequence[BoardView], found: Fit) -> list[Array]:
+def _residuals(views: Sequence[BoardView], found: LensEstimate) -> list[Array]:
     return _off(views, _projected(views, found))
 
 
-def _medians(views: Sequence[BoardView], found: Fit) -> list[float]:
+def _medians(views: Sequence[BoardView], found: LensEstimate) -> list[float]:
     """Median residual of each view, px; large where it has no pose."""
     return [
         float(np.median(np.nan_to_num(np.linalg.norm(r, axis=1), nan=1e9, posinf=1e9)))
@@ -210,7 +210,7 @@ def _spread(residuals: Sequence[Array], kept: Sequence[NDArray[np.bool_]]) -> fl
     return max(MAD * float(np.median(np.abs(flat))), LEAST_SIGMA)
 
 
-def _plausible(views: Sequence[BoardView], found: Fit) -> Fit:
+def _plausible(views: Sequence[BoardView], found: LensEstimate) -> LensEstimate:
     """All corners of views that fit about as well as the others; a view of something else fits nowhere."""
     off = _medians(views, found)
     limit = FAR_OFF * max(float(np.median(off)), LEAST_SIGMA)
@@ -218,7 +218,7 @@ def _plausible(views: Sequence[BoardView], found: Fit) -> Fit:
     return replace(found, kept=kept)
 
 
-def _inliers(views: Sequence[BoardView], found: Fit) -> tuple[NDArray[np.bool_], ...]:
+def _inliers(views: Sequence[BoardView], found: LensEstimate) -> tuple[NDArray[np.bool_], ...]:
     """Corners within a few deviations; a view with too few of them is left out."""
     residuals = _residuals(views, found)
     limit = REJECTED * _spread(residuals, found.kept)
@@ -226,7 +226,9 @@ def _inliers(views: Sequence[BoardView], found: Fit) -> tuple[NDArray[np.bool_],
     return tuple(k if k.sum() >= max(FEWEST_CORNERS, len(k) / 2) else np.zeros_like(k) for k in kept)
 
 
-def _minimised(views: Sequence[BoardView], begun: Fit, free: NDArray[np.bool_], robust: bool) -> Fit:
+def _minimised(
+    views: Sequence[BoardView], begun: LensEstimate, free: NDArray[np.bool_], robust: bool
+) -> LensEstimate:
     """Levenberg and Marquardt over the free intrinsics and all poses."""
     at, damping = begun, 1e-3
     # OpenCV works out the slopes with the pixels: they are kept for the next step.
@@ -317,7 +319,7 @@ def _inverses(own: Array) -> Array:
     return np.asarray(np.linalg.inv(own * scale + 1e-12 * np.eye(6)) * scale)
 
 
-def _with_covariance(views: Sequence[BoardView], found: Fit) -> Fit:
+def _with_covariance(views: Sequence[BoardView], found: LensEstimate) -> LensEstimate:
     """Noise from the residuals, and with it the covariance of the intrinsics."""
     free = np.ones(len(found.intrinsics), np.bool_)
     by_all, _, blocks = _normal(views, _projected(views, found), found.kept, free, np.inf)

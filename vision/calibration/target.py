@@ -32,7 +32,7 @@ class Pattern(StrEnum):
     CHESSBOARD = "chessboard"
 
 
-class Rectangle(NamedTuple):
+class TargetRectangle(NamedTuple):
     """A black rectangle of the target, m: x right, y down from its upper left corner.
 
     Attributes:
@@ -122,11 +122,11 @@ class CalibrationTarget:
         dictionary = cv2.aruco.getPredefinedDictionary(DICTIONARIES[self.dictionary])
         return cv2.aruco.CharucoBoard((self.columns, self.rows), self.square, self.marker, dictionary)
 
-    def rectangles(self) -> list[Rectangle]:
+    def rectangles(self) -> list[TargetRectangle]:
         """All that is black."""
         s = self.square
         black = [
-            Rectangle(column * s, row * s, s, s)
+            TargetRectangle(column * s, row * s, s, s)
             for row in range(self.rows)
             for column in range(self.columns)
             if (row + column) % 2 == 0
@@ -139,7 +139,7 @@ class CalibrationTarget:
                 cell = self.marker / len(cells)
                 x, y = column * s + margin, row * s + margin
                 black += [
-                    Rectangle(x + first * cell, y + k * cell, (last - first) * cell, cell)
+                    TargetRectangle(x + first * cell, y + k * cell, (last - first) * cell, cell)
                     for k, line in enumerate(cells)
                     for first, last in _runs(line)
                 ]

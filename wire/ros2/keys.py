@@ -31,7 +31,7 @@ RELIABLE, TRANSIENT_LOCAL, VOLATILE, KEEP_LAST = 1, 1, 2, 1
 """Numbers of rmw/types.h."""
 
 
-class Role(StrEnum):
+class EndpointRole(StrEnum):
     """What an endpoint of a topic does."""
 
     PUBLISHER = "MP"
@@ -128,7 +128,9 @@ class RmwZenohKeys:
         """The token of the node itself."""
         return f"{ADMIN}/{self._domain}/{self._session}/0/0/NN/%/{self._namespace}/{self._node}"
 
-    def token(self, role: Role, number: int, endpoint: Endpoint, latched: bool, depth: int) -> str | None:
+    def token(
+        self, role: EndpointRole, number: int, endpoint: Endpoint, latched: bool, depth: int
+    ) -> str | None:
         """The token of a publisher or subscriber of the node.
 
         Args:
@@ -145,7 +147,7 @@ class RmwZenohKeys:
             f"{_mangled(endpoint.topic)}/{dds_type(endpoint.kind)}/{endpoint.type_hash}/{qos}"
         )
 
-    def all_tokens(self, role: Role, topic: str | None = None) -> str:
+    def all_tokens(self, role: EndpointRole, topic: str | None = None) -> str:
         """The pattern of the tokens of a topic, or of all topics."""
         name = "*" if topic is None else _mangled(topic)
         return f"{ADMIN}/{self._domain}/*/*/*/{role}/*/*/*/{name}/*/*/*"
@@ -180,11 +182,13 @@ class BridgeKeys:
         """There is none."""
         return None
 
-    def token(self, role: Role, number: int, endpoint: Endpoint, latched: bool, depth: int) -> str | None:
+    def token(
+        self, role: EndpointRole, number: int, endpoint: Endpoint, latched: bool, depth: int
+    ) -> str | None:
         """There is none."""
         return None
 
-    def all_tokens(self, role: Role, topic: str | None = None) -> str:
+    def all_tokens(self, role: EndpointRole, topic: str | None = None) -> str:
         """The pattern of the tokens of a topic, or of all topics."""
         name = "*" if topic is None else topic.strip("/").replace("/", "§")
         return f"@/*/{ADMIN}/{role}/{name}/*/*"

@@ -17,7 +17,7 @@ from mapweave.wire.bus import Closing, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.ros2.attachment import GID_BYTES, Attachment, decode_attachment, encode_attachment
 from mapweave.wire.ros2.entities import TopicPublication, TopicSubscription
-from mapweave.wire.ros2.keys import BridgeKeys, Endpoint, Keys, RmwZenohKeys, Role
+from mapweave.wire.ros2.keys import BridgeKeys, Endpoint, EndpointRole, Keys, RmwZenohKeys
 from mapweave.wire.ros2.messages import encode, type_hash
 from mapweave.wire.ros2.settings import Ros2Link
 from mapweave.wire.zenoh_bus import ZenohBus
@@ -67,7 +67,7 @@ class Ros2Node:
         token = self.keys.node()
         if token is not None:
             self._bus.declare(Token(self._bus.owner, token))
-        self.watch(Role.PUBLISHER, None, self._publisher)
+        self.watch(EndpointRole.PUBLISHER, None, self._publisher)
 
     @property
     def bus(self) -> ZenohBus:
@@ -82,7 +82,9 @@ class Ros2Node:
         """Topics with a publisher of messages of these types."""
         return sorted({one.topic for one in tuple(self._publishers.values()) if one.kind in kinds})
 
-    def watch(self, role: Role, topic: str | None, handler: Callable[[Endpoint, str, bool], None]) -> Closing:
+    def watch(
+        self, role: EndpointRole, topic: str | None, handler: Callable[[Endpoint, str, bool], None]
+    ) -> Closing:
         """Call the handler with who else publishes or subscribes (endpoint, token, alive), now and later."""
 
         def presence(token: str, alive: bool) -> None:
@@ -115,7 +117,7 @@ class Ros2Node:
         """
         return Publisher(self, topic, kind, latched)
 
-    def announce(self, role: Role, endpoint: Endpoint, latched: bool = False) -> str:
+    def announce(self, role: EndpointRole, endpoint: Endpoint, latched: bool = False) -> str:
         """Announce a publisher or subscriber; returns its token, or with the bridge another unique name."""
         with self._lock:
             self._entities += 1
@@ -174,7 +176,7 @@ class Subscriber:
         self.topic, self.kinds, self.refused = topic, tuple(kinds), ""
         self._node, self._handler, self._latched = node, handler, latched
         self._announced: dict[Endpoint, str] = {}
-        node.watch(Role.PUBLISHER, topic, self._presence)
+        node.watch(EndpointRole.PUBLISHER, topic, self._presence)
         node.listen(topic, self._receive, latched)
 
     def _presence(self, endpoint: Endpoint, token: str, alive: bool) -> None:
@@ -183,7 +185,7 @@ class Subscriber:
         if endpoint.kind not in self.kinds:
             self.refused = endpoint.kind
         elif endpoint not in self._announced:
-            self._announced[endpoint] = self._node.announce(Role.SUBSCRIBER, endpoint, self._latched)
+            self._announced[endpoint] = self._node.announce(EndpointRole.SUBSCRIBER, endpoint, self._latched)
 
     def _receive(self, sample: Sample) -> None:
         kind, _ = self._node.keys.kind_of(sample.key)
@@ -220,7 +222,7 @@ class Publisher:
         own = Endpoint(topic, kind, "" if node.link.bridge else type_hash(kind))
         self._publications: dict[Endpoint, TopicPublication] = {}
         self._gid = self._add(own)
-        node.watch(Role.SUBSCRIBER, topic, self._presence)
+        node.watch(EndpointRole.SUBSCRIBER, topic, self._presence)
 
     @property
     def keys(self) -> list[str]:
@@ -240,7 +242,7 @@ class Publisher:
             self._node.send(publication, payload, attachment)
 
     def _add(self, endpoint: Endpoint) -> bytes:
-        token = self._node.announce(Role.PUBLISHER, endpoint, self._latched)
+        token = self._node.announce(EndpointRole.PUBLISHER, endpoint, self._latched)
         publication = self._node.publication(endpoint, self._latched)
         with self._lock:
             self._publications[endpoint] = publication

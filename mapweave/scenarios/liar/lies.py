@@ -41,8 +41,8 @@ CODE_SIGMA = 0.12
 
 
 @dataclass(frozen=True, eq=False)
-class Lie:
-    """What a robot sends.
+class LyingMessages:
+    """The messages that a lying robot sends.
 
     Attributes:
         logs: the changes of each of its maps.
@@ -55,7 +55,7 @@ class Lie:
 
 
 @dataclass(frozen=True, eq=False)
-class Setting:
+class LieInputs:
     """What a lie is made of.
 
     Attributes:
@@ -98,7 +98,7 @@ def messages(map_id: MapId, changes: Sequence[ChangeBody]) -> list[bytes]:
     return [encode_change(Change(map_id, k, 0, body)) for k, body in enumerate(changes, start=1)]
 
 
-def chain(setting: Setting, nodes: Sequence[Node], poses: Sequence[Pose2], covariance: Array = SURE) -> Map:
+def chain(setting: LieInputs, nodes: Sequence[Node], poses: Sequence[Pose2], covariance: Array = SURE) -> Map:
     """Nodes at poses of one's choice, with the edges and the times that a drive would have."""
     out: list[Node] = []
     edges: list[Edge] = []
@@ -124,30 +124,30 @@ def forged(body: ChangeBody, **fields: object) -> bytes:
     return packed
 
 
-def honest(s: Setting) -> Lie:
+def honest(s: LieInputs) -> LyingMessages:
     """Nothing is false: what the others end with beside a fourth robot."""
-    return Lie({s.map: messages(s.map, bodies(s.own))})
+    return LyingMessages({s.map: messages(s.map, bodies(s.own))})
 
 
-def far_node(s: Setting) -> Lie:
+def far_node(s: LieInputs) -> LyingMessages:
     """Every third node is at 1e9 m, by a message that no encoder writes."""
     log = []
     for k, body in enumerate(bodies(s.own), start=1):
         far = isinstance(body, NodePut) and k % 3 == 0
         fields = {"p": raw_pose(Pose2(1e9, 0.0, 0.0), SURE)} if far else {}
         log.append(wrap_body(k, 0, forged(body, **fields)))
-    return Lie({s.map: log})
+    return LyingMessages({s.map: log})
 
 
-def long_steps(s: Setting) -> Lie:
+def long_steps(s: LieInputs) -> LyingMessages:
     """Each edge is as long as a message allows."""
     nodes = s.own[0]
-    return Lie({s.map: messages(s.map, bodies(chain(
+    return LyingMessages({s.map: messages(s.map, bodies(chain(
         s, nodes, [Pose2(0.0, 0.99 * MAX_MEASURED * (k % 2), 0.0) for k in range(len(nodes))]
     )))})  # fmt: skip
 
 
-def covariance_of_zero(s: Setting) -> Lie:
+def covariance_of_zero(s: LieInputs) -> LyingMessages:
     """Steps a tenth too long, of which the robot is perfectly certain."""
     nodes, edges = s.own
     steps = [edge.a_from_b.mean for edge in edges]
@@ -155,55 +155,57 @@ def covariance_of_zero(s: Setting) -> Lie:
         replace(edge, a_from_b=PoseGaussian(Pose2(1.1 * step.x, 1.1 * step.y, step.heading), 0.0 * SURE))
         for edge, step in zip(edges, steps, strict=True)
     ]
-    return Lie({s.map: messages(s.map, bodies((nodes, wrong)))})
+    return LyingMessages({s.map: messages(s.map, bodies((nodes, wrong)))})
 
 
-def covariance_of_1e12(s: Setting) -> Lie:
+def covariance_of_1e12(s: LieInputs) -> LyingMessages:
     """Each edge has a covariance of 1e12 m^2."""
     log = []
     for k, body in enumerate(bodies(s.own), start=1):
         wide = {"p": raw_pose(body.edge.a_from_b.mean, 1e12 * np.eye(3))} if isinstance(body, EdgePut) else {}
         log.append(wrap_body(k, 0, forged(body, **wide)))
-    return Lie({s.map: log})
+    return LyingMessages({s.map: log})
 
 
-def greatest_covariance(s: Setting) -> Lie:
+def greatest_covariance(s: LieInputs) -> LyingMessages:
     """Wrong steps, of each of which the robot knows nothing: the greatest covariance that a message holds."""
     nodes, _ = s.own
     poses = [Pose2.from_vector(s.rng.uniform(-50.0, 50.0, 3)) for _ in nodes]
-    return Lie({s.map: messages(s.map, bodies(chain(s, nodes, poses, 0.99 * MAX_VARIANCE * np.eye(3))))})
+    return LyingMessages(
+        {s.map: messages(s.map, bodies(chain(s, nodes, poses, 0.99 * MAX_VARIANCE * np.eye(3))))}
+    )
 
 
-def contradicting_clocks(s: Setting) -> Lie:
+def contradicting_clocks(s: LieInputs) -> LyingMessages:
     """True views and a true way, at the very times at which another robot was at the same places."""
     first, *_ = (nodes for nodes, _ in s.others.values())
     nodes, edges = s.own
     stamps = [max(first, key=lambda other: alike(node, other)).stamp_ns for node in nodes]
-    return Lie({s.map: messages(s.map, bodies(([
+    return LyingMessages({s.map: messages(s.map, bodies(([
         replace(node, stamp_ns=stamp) for node, stamp in zip(nodes, stamps, strict=True)
     ], edges)))})  # fmt: skip
 
 
-def same_times(s: Setting) -> Lie:
+def same_times(s: LieInputs) -> LyingMessages:
     """True views and a true way, with another robot's clock from first to last."""
     first, *_ = (nodes for nodes, _ in s.others.values())
     nodes, edges = s.own
     stamps = [first[min(k, len(first) - 1)].stamp_ns for k in range(len(nodes))]
-    return Lie({s.map: messages(s.map, bodies(([
+    return LyingMessages({s.map: messages(s.map, bodies(([
         replace(node, stamp_ns=stamp) for node, stamp in zip(nodes, stamps, strict=True)
     ], edges)))})  # fmt: skip
 
 
-def many_landmarks(s: Setting) -> Lie:
+def many_landmarks(s: LieInputs) -> LyingMessages:
     """As many landmarks as fifty messages hold: 100 000, a few of them true."""
     nodes = [
         replace(node, landmarks=_filled(node, s.rng)) for node in (s.own[0] * math.ceil(50 / len(s.own[0])))
     ][:50]
     poses = [Pose2(0.3 * k, 0.0, 0.0) for k in range(len(nodes))]
-    return Lie({s.map: messages(s.map, bodies(chain(s, nodes, poses)))})
+    return LyingMessages({s.map: messages(s.map, bodies(chain(s, nodes, poses)))})
 
 
-def edges_to_nowhere(s: Setting) -> Lie:
+def edges_to_nowhere(s: LieInputs) -> LyingMessages:
     """Edges to nodes that do not exist, and between nodes of others, all of them certain and false."""
     own, log = [node.id for node in s.own[0]], bodies(s.own)
     theirs = [node.id for node in s.theirs()]
@@ -213,53 +215,57 @@ def edges_to_nowhere(s: Setting) -> Lie:
         kind = list(EdgeKind)[k % len(EdgeKind)]
         pose = PoseGaussian(Pose2.from_vector(s.rng.uniform(-5.0, 5.0, 3)), SURE)
         log.append(EdgePut(Edge(s.id(10_001 + 2 * k), a, b, pose, kind, evidence={"inliers": 200.0})))
-    return Lie({s.map: messages(s.map, log)})
+    return LyingMessages({s.map: messages(s.map, log)})
 
 
-def greatest_sequence(s: Setting) -> Lie:
+def greatest_sequence(s: LieInputs) -> LyingMessages:
     """A log that goes on at 2^53."""
     log = messages(s.map, bodies(s.own))
     last = encode_change(Change(s.map, MAX_NUMBER, 0, NodePut(s.own[0][0])))
-    return Lie({s.map: log[:5]}, ((s.map, MAX_NUMBER, last),))
+    return LyingMessages({s.map: log[:5]}, ((s.map, MAX_NUMBER, last),))
 
 
-def many_epochs(s: Setting) -> Lie:
+def many_epochs(s: LieInputs) -> LyingMessages:
     """A new map for every few nodes, again and again, each with true views and wrong ways between them."""
     return _shuffled(s, EPOCHS, 3, 3)
 
 
-def shuffled_maps(s: Setting) -> Lie:
+def shuffled_maps(s: LieInputs) -> LyingMessages:
     """The same with more nodes a map, so that its geometry can be tested."""
     return _shuffled(s, EPOCHS // 2, 4, 9)
 
 
-def copied_to_tear(s: Setting) -> Lie:
+def copied_to_tear(s: LieInputs) -> LyingMessages:
     """Nodes of two others as they are, with wrong ways between them: each says that the two lie elsewhere."""
-    return Lie({s.map: messages(s.map, bodies(_torn(s, s.theirs())))})
+    return LyingMessages({s.map: messages(s.map, bodies(_torn(s, s.theirs())))})
 
 
-def altered_to_tear(s: Setting) -> Lie:
+def altered_to_tear(s: LieInputs) -> LyingMessages:
     """The same, each copy altered as much as another view would differ."""
-    return Lie({s.map: messages(s.map, bodies(_torn(s, [altered(node, s.rng) for node in s.theirs()])))})
+    return LyingMessages(
+        {s.map: messages(s.map, bodies(_torn(s, [altered(node, s.rng) for node in s.theirs()])))}
+    )
 
 
-def copied_places(s: Setting) -> Lie:
+def copied_places(s: LieInputs) -> LyingMessages:
     """Nodes of others as they are, behind the end of the own drive: their places would be elsewhere."""
-    return Lie({s.map: messages(s.map, bodies(_captured(s, s.theirs())))})
+    return LyingMessages({s.map: messages(s.map, bodies(_captured(s, s.theirs())))})
 
 
-def altered_places(s: Setting) -> Lie:
+def altered_places(s: LieInputs) -> LyingMessages:
     """The same, each copy altered as much as another view would differ."""
-    return Lie({s.map: messages(s.map, bodies(_captured(s, [altered(node, s.rng) for node in s.theirs()])))})
+    return LyingMessages(
+        {s.map: messages(s.map, bodies(_captured(s, [altered(node, s.rng) for node in s.theirs()])))}
+    )
 
 
-def places_from_aside(s: Setting) -> Lie:
+def places_from_aside(s: LieInputs) -> LyingMessages:
     """The same, each copy as it would look from a little aside, with some of its landmarks."""
     seen = [seen_from_aside(node, s.rng) for node in s.theirs()]
-    return Lie({s.map: messages(s.map, bodies(_captured(s, seen)))})
+    return LyingMessages({s.map: messages(s.map, bodies(_captured(s, seen)))})
 
 
-def mixed_landmarks(s: Setting) -> Lie:
+def mixed_landmarks(s: LieInputs) -> LyingMessages:
     """The own map, with half of each node's landmarks taken from others' nodes."""
     theirs, nodes = s.theirs(), []
     for k, node in enumerate(s.own[0]):
@@ -268,7 +274,7 @@ def mixed_landmarks(s: Setting) -> Lie:
         nodes.append(replace(node, landmarks=joined(some)))
     # What landmarks an edge's ends share would give it away.
     edges = [replace(edge, shared=edge.shared[:0]) for edge in s.own[1]]
-    return Lie({s.map: messages(s.map, bodies((nodes, edges)))})
+    return LyingMessages({s.map: messages(s.map, bodies((nodes, edges)))})
 
 
 def altered(node: Node, rng: np.random.Generator) -> Node:
@@ -329,7 +335,7 @@ def _filled(node: Node, rng: np.random.Generator) -> Landmarks:
     return joined([more, node.landmarks])
 
 
-def _shuffled(s: Setting, maps: int, least: int, most: int) -> Lie:
+def _shuffled(s: LieInputs, maps: int, least: int, most: int) -> LyingMessages:
     """Maps of so many true views each, with wrong ways between them."""
     logs = {}
     for k in range(maps):
@@ -338,10 +344,10 @@ def _shuffled(s: Setting, maps: int, least: int, most: int) -> Lie:
         some = [s.own[0][n] for n in sorted(s.rng.choice(len(s.own[0]), size, replace=False))]
         poses = [Pose2.from_vector(s.rng.uniform(-4.0, 4.0, 3)) for _ in some]
         logs[which.map] = messages(which.map, bodies(chain(which, some, poses)))
-    return Lie(logs)
+    return LyingMessages(logs)
 
 
-def _torn(s: Setting, nodes: Sequence[Node]) -> Map:
+def _torn(s: LieInputs, nodes: Sequence[Node]) -> Map:
     """Copies of two maps' nodes in turns, each of the second's shifted against where it is."""
     poses = [
         node.map_from_robot.mean if k % 2 == 0 else Pose2(OFF_M, -OFF_M, 1.0) @ node.map_from_robot.mean
@@ -350,7 +356,7 @@ def _torn(s: Setting, nodes: Sequence[Node]) -> Map:
     return chain(s, nodes, poses)
 
 
-def _captured(s: Setting, nodes: Sequence[Node]) -> Map:
+def _captured(s: LieInputs, nodes: Sequence[Node]) -> Map:
     """The own drive, and others' nodes behind its end, apart from each other by as much as theirs."""
     own, _ = s.own
     begin = own[-1].map_from_robot.mean @ Pose2(4 * OFF_M, 0.0, 0.0)
@@ -359,7 +365,7 @@ def _captured(s: Setting, nodes: Sequence[Node]) -> Map:
     return chain(s, [*own, *nodes], poses)
 
 
-WAYS: dict[str, Callable[[Setting], Lie]] = {
+WAYS: dict[str, Callable[[LieInputs], LyingMessages]] = {
     "node at 1e9 m": far_node,
     "edges of 1e5 m": long_steps,
     "covariance of zero": covariance_of_zero,
@@ -377,10 +383,10 @@ WAYS: dict[str, Callable[[Setting], Lie]] = {
     "altered copied places": altered_places,
     "half copied landmarks": mixed_landmarks,
 }
-UNDECIDABLE: dict[str, Callable[[Setting], Lie]] = {
+UNDECIDABLE: dict[str, Callable[[LieInputs], LyingMessages]] = {
     "another's times": same_times,
     "places seen from aside": places_from_aside,
 }
 """Maps that are right in themselves and could be of a second building that looks the same: nothing that a
 server knows tells which of the two robots lies. Answers may become ambiguous."""
-EVERY: Mapping[str, Callable[[Setting], Lie]] = {**WAYS, **UNDECIDABLE}
+EVERY: Mapping[str, Callable[[LieInputs], LyingMessages]] = {**WAYS, **UNDECIDABLE}

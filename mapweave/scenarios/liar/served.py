@@ -37,8 +37,8 @@ NOWHERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 
 
 @dataclass(frozen=True, eq=False)
-class Answer:
-    """To a lost robot.
+class TrialAnswer:
+    """The answer that a lost robot got.
 
     Attributes:
         found: whether it says where the robot is, for certain, on the map of the robots concerned.
@@ -52,7 +52,7 @@ class Answer:
     pose: PoseGaussian = NOWHERE
     right: bool = False
 
-    def agrees(self, other: Answer) -> bool:
+    def agrees(self, other: TrialAnswer) -> bool:
         """Whether two answers say the same, within what they are certain of."""
         off = self.pose.inverse() @ other.pose
         spread = off.covariance + np.diag([FLOOR_XY**2, FLOOR_XY**2, FLOOR_HEADING**2])
@@ -61,8 +61,8 @@ class Answer:
 
 
 @dataclass(frozen=True, eq=False)
-class Seen:
-    """What some robots end with.
+class FleetResult:
+    """The links, poses and answers that some robots end with.
 
     Attributes:
         links: between their maps and within them.
@@ -74,7 +74,7 @@ class Seen:
     links: frozenset[tuple[NodeId, NodeId]]
     components: frozenset[frozenset[NodeId]]
     poses: Mapping[NodeId, Pose2]
-    answers: Sequence[Answer]
+    answers: Sequence[TrialAnswer]
 
 
 class Served:
@@ -148,7 +148,7 @@ class Served:
 
     def seen(
         self, maps: Collection[MapId], lost: Sequence[tuple[View, Pose2]], truth: Mapping[NodeId, Pose2]
-    ) -> Seen:
+    ) -> FleetResult:
         """What the robots of some maps end with.
 
         Args:
@@ -159,7 +159,7 @@ class Served:
         merged = self._server.merged()
         frames = _frames(merged, maps)
         parts = {first: frozenset(n for n in frames if frames[n] == first) for first in frames.values()}
-        return Seen(
+        return FleetResult(
             frozenset(link.pair for link in merged.links if {link.a.map, link.b.map} <= {*maps}),
             frozenset(parts.values()),
             {node: merged.pose(first).inverse() @ merged.pose(node) for node, first in frames.items()},
@@ -173,20 +173,20 @@ class Served:
         view: View,
         at: Pose2,
         truth: Mapping[NodeId, Pose2],
-    ) -> Answer:
+    ) -> TrialAnswer:
         replies = self._bus.ask(KEYS.relocalize("s0"), encode_view(view), 60.0)
         answer = decode(replies[0].payload, RelocalizeAnswer)
         if answer.certainty is not Certainty.FOUND:
-            return Answer(False)
+            return TrialAnswer(False)
         best = answer.candidates[0]
         number = merged.component_of(best.node)
         first = next((f for f in sorted({*frames.values()}) if merged.component_of(f) == number), None)
         if first is None:
             # On a map of the fourth robot alone: it is of no use to the others, true or not.
-            return Answer(True)
+            return TrialAnswer(True)
         way = merged.pose(first).inverse() @ merged.pose(best.node)
         pose = PoseGaussian(way, np.zeros((3, 3))) @ best.node_from_robot
-        return Answer(True, first, pose, (truth[first] @ pose.mean).distance(at) < RIGHT_M)
+        return TrialAnswer(True, first, pose, (truth[first] @ pose.mean).distance(at) < RIGHT_M)
 
     def _hear(self, sample: Sample) -> None:
         ack = Ack.decode(sample.payload)

@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import View
-from mapweave.scenarios.liar.lies import WAYS, Lie, Map, Setting, bodies, honest, messages
-from mapweave.scenarios.liar.served import Answer, Seen, Served, difference
+from mapweave.scenarios.liar.lies import WAYS, LieInputs, LyingMessages, Map, bodies, honest, messages
+from mapweave.scenarios.liar.served import FleetResult, Served, TrialAnswer, difference
 
 MOVED_M = 0.05
 """More than this moves no node of the others, m."""
@@ -25,8 +25,8 @@ Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class Outcome:
-    """What became of the others.
+class ContainmentOutcome:
+    """What a lie changed for the other robots.
 
     Attributes:
         contained: whether they have what they would have without the robot that lies.
@@ -54,7 +54,7 @@ class Outcome:
         return bool(self.named) and self.in_status
 
 
-def changed_answer(before: Answer, after: Answer) -> bool:
+def changed_answer(before: TrialAnswer, after: TrialAnswer) -> bool:
     """Whether a lost robot is sent less, something else, or something that is not true.
 
     An answer where there was none is one more if it is right: true views of the fourth robot are no lie.
@@ -64,7 +64,7 @@ def changed_answer(before: Answer, after: Answer) -> bool:
     return after.found and not after.right
 
 
-def compared(before: Seen, after: Seen) -> tuple[float, Bools, int]:
+def compared(before: FleetResult, after: FleetResult) -> tuple[float, Bools, int]:
     """Greatest difference of a pose, m; which answers differ; links that do."""
     if before.components != after.components:
         moved = float("inf")
@@ -74,7 +74,7 @@ def compared(before: Seen, after: Seen) -> tuple[float, Bools, int]:
     return moved, np.array(changed), len(before.links ^ after.links)
 
 
-class Trial:
+class LiarTrial:
     """Three honest robots whose maps are on a server's disk, and a fourth one."""
 
     def __init__(
@@ -109,14 +109,14 @@ class Trial:
         self._left_out = np.zeros(len(lost), np.bool_)
         self.beside, self._left_out = self._outcome(honest)
 
-    def outcome(self, lie: Callable[[Setting], Lie]) -> Outcome:
+    def outcome(self, lie: Callable[[LieInputs], LyingMessages]) -> ContainmentOutcome:
         """Add the fourth robot with a lie. Views that an honest one changes the answers to are left out."""
         return self._outcome(lie)[0]
 
-    def _outcome(self, lie: Callable[[Setting], Lie]) -> tuple[Outcome, Bools]:
+    def _outcome(self, lie: Callable[[LieInputs], LyingMessages]) -> tuple[ContainmentOutcome, Bools]:
         """Add the fourth robot, and compare; and again when the server was started again."""
         rng = np.random.default_rng([self._seed, 0x11E])
-        sent = lie(Setting(self._liar, self._own, self._others, rng))
+        sent = lie(LieInputs(self._liar, self._own, self._others, rng))
         folder = self._folder / "way"
         shutil.copytree(self._base, folder)
         began = time.monotonic()
@@ -134,13 +134,13 @@ class Trial:
         moved, links = max(first[0], again[0]), max(first[2], again[2])
         changed = (first[1] | again[1]) & ~self._left_out
         contained = alive and moved <= MOVED_M and not changed.any() and not links
-        outcome = Outcome(
+        outcome = ContainmentOutcome(
             contained, named, in_status, round(moved, 4), int(changed.sum()), links, alive, round(seconds, 2)
         )
         return outcome, changed
 
 
-def row(name: str, one: Outcome) -> str:
+def row(name: str, one: ContainmentOutcome) -> str:
     """An outcome as a line."""
     figures = (
         f"{one.max_pose_difference_m:.3f} m, {one.answers_changed} answers, {one.links_changed} links changed"
@@ -152,7 +152,7 @@ def row(name: str, one: Outcome) -> str:
     return f"{name}: {verdict}, {figures}, {one.seconds:.0f} s; {named}"
 
 
-def totals(outcomes: Mapping[str, Outcome]) -> dict[str, Any]:
+def totals(outcomes: Mapping[str, ContainmentOutcome]) -> dict[str, Any]:
     """Of the ways that can be found out, and which of them were not."""
     listed = {name: one for name, one in outcomes.items() if name in WAYS}
     return {

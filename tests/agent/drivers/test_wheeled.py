@@ -13,7 +13,7 @@ import pytest
 
 from mapweave.agent.drivers import wheeled
 from mapweave.agent.drivers.base import BaseReading, WheelCounter, Wheels
-from mapweave.agent.drivers.camera import Frame
+from mapweave.agent.drivers.camera import StampedImage
 from mapweave.agent.drivers.checked import CheckedRobot
 from mapweave.agent.drivers.clock import now_ns
 from mapweave.agent.drivers.settings import CameraSettings, Geometry, RobotSettings
@@ -74,12 +74,12 @@ class LateCamera:
         self.delay = delay
         self.silent = False
 
-    def newer(self, stamp_ns: int, patience: float) -> Frame | None:
+    def newer(self, stamp_ns: int, patience: float) -> StampedImage | None:
         end = time.monotonic() + patience
         while time.monotonic() < end:
             taken = now_ns() - round(self.delay * 1e9)
             if taken > stamp_ns and not self.silent:
-                return Frame(taken, IMAGE)
+                return StampedImage(taken, IMAGE)
             time.sleep(0.005)
         return None
 

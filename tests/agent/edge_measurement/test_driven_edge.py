@@ -10,7 +10,7 @@ import pytest
 from mapweave.agent.edge_measurement.driven_edge import driven_edge
 from mapweave.agent.edge_measurement.traverse import Traverse
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.mission import Answer, GoTo
+from mapweave.agent.mission import GoTo, ServerAnswer
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Pipeline
 from mapweave.hybridmap.camera import Camera
@@ -127,10 +127,10 @@ def drive(pipeline: Pipeline, walls, begin: Pose2, goal: NodeId, slip: float) ->
     pose, odometry = begin, Odometry(0.0, 0.0)
     changes: list[EdgePut] = []
     pipeline.set_mission(GoTo(goal))
-    answers: tuple[Answer, ...] = ()
+    answers: tuple[ServerAnswer, ...] = ()
     for tick in range(600):
         step = pipeline.step(Observation(tick * 100_000_000, odometry, walls.render(pose), FREE), answers)
-        answers = tuple(Answer(question.number, None, "no server") for question in step.questions)
+        answers = tuple(ServerAnswer(question.number, None, "no server") for question in step.questions)
         changes += [change for change in step.changes if isinstance(change, EdgePut)]
         if step.status.finished:
             return pose, changes

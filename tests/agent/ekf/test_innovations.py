@@ -14,7 +14,7 @@ from mapweave.agent.ekf.innovations import (
     wheel_errors,
     whiten,
 )
-from mapweave.agent.ekf.mapping_state import MappingState, Step
+from mapweave.agent.ekf.mapping_state import MappingState, WheelStep
 from mapweave.agent.ekf.measurement_model import ImageMeasurement, Pinhole, slots_of
 from mapweave.agent.ekf.motion import move_pose, move_rays, propagate
 from mapweave.agent.ekf.update_report import Health
@@ -79,7 +79,7 @@ def test_a_step_is_linearised_where_it_is_asked(
     at = Odometry(forward, turn)
     measured = Odometry(forward + rng.normal(0, 0.02), turn + rng.normal(0, 0.05)) if elsewhere else at
     wheel_root, side_slip = rng.normal(size=(2, 2)) * 0.01, 0.003
-    taken = Step(state, measured, wheel_root, side_slip, mount, at, state.pose_vector, state.rays)
+    taken = WheelStep(state, measured, wheel_root, side_slip, mount, at, state.pose_vector, state.rays)
     pose_vector, by_pose, pose_by_input = move_pose(state.pose_vector, at)
     moved = move_rays(state.rays, at, mount)
     if moved.scale.min() < 0.05:
@@ -243,7 +243,7 @@ def test_the_step_is_linearised_at_the_turn_of_the_image(size: tuple[int, int]) 
     slots, root = some_slots(rng, n), rng.normal(size=(2, 2)) * 0.01
     measured, variances = Odometry(0.05, 0.02), rng.uniform(0.2, 2.0, 2)
     expected = move_rays(state.rays, measured, 0.1).rays
-    step = Step(state, measured, root, 0.003, 0.1, measured, state.pose_vector, expected)
+    step = WheelStep(state, measured, root, 0.003, 0.1, measured, state.pose_vector, expected)
     slopes = expected[slots, :2] + rng.normal(0, 0.01, (len(slots), 2))
     vote = turn_by_image(expected, slots, slopes, root, 4.0)
     after, examined = step.glanced(slots, slopes, variances, 4.0)

@@ -11,9 +11,9 @@ import pytest
 from mapweave.agent.exploration.explorer import Explorer
 from mapweave.agent.exploration.phase import Phase
 from mapweave.agent.exploration.viewpoint_selection import REACH
-from mapweave.agent.mission import Answer, Explore, WhatIsKnown
+from mapweave.agent.mission import Explore, ServerAnswer, WhatIsKnown
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.settings import AgentSettings, ExplorerSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -36,8 +36,8 @@ ALL_AROUND = np.array([[0.1, 0.1, heading, 0.5] for heading in np.arange(-math.p
 
 
 def live(
-    walls, settings: ExplorerSettings, ticks: int, result: dict[int, Answer], seed: int = 0
-) -> list[Step]:
+    walls, settings: ExplorerSettings, ticks: int, result: dict[int, ServerAnswer], seed: int = 0
+) -> list[TickResult]:
     """Let a pipeline explore a wide room with pictures ahead, with given answers at some ticks."""
     pipeline = Pipeline(MAP, BODY, AgentSettings(exploration=settings, seed=seed))
     pipeline.set_mission(Explore())
@@ -53,13 +53,13 @@ def live(
     return steps
 
 
-def doings(steps: list[Step]) -> list[str]:
+def doings(steps: list[TickResult]) -> list[str]:
     """What it did, in order, without repetitions."""
     lines = [step.status.doing for step in steps]
     return [b for a, b in zip([None, *lines], lines, strict=False) if a != b]
 
 
-def questions(steps: list[Step]) -> list[WhatIsKnown]:
+def questions(steps: list[TickResult]) -> list[WhatIsKnown]:
     return [q for step in steps for q in step.questions if isinstance(q, WhatIsKnown)]
 
 
@@ -76,7 +76,7 @@ def test_it_asks_about_its_own_map_and_nothing_waits_for_the_answer(walls):
 
 @pytest.mark.parametrize("error", first_quick(["no map server answered", "no key known"], 1))
 def test_no_answer_changes_nothing(walls, error):
-    steps = live(walls, ExplorerSettings(), 40, {1: Answer(-1, None, error)})
+    steps = live(walls, ExplorerSettings(), 40, {1: ServerAnswer(-1, None, error)})
     assert [step.command for step in steps] == [
         step.command for step in live(walls, ExplorerSettings(), 40, {})
     ]
@@ -85,16 +85,16 @@ def test_no_answer_changes_nothing(walls, error):
 def test_it_does_not_map_places_that_others_have_covered(walls):
     alone = doings(live(walls, ExplorerSettings(), 12, {}))
     assert alone[:2] == [Phase.LOOKING, Phase.DRIVING]
-    result = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(ALL_AROUND, ""))})
+    result = live(walls, ExplorerSettings(), 12, {0: ServerAnswer(-1, KnownAnswer(ALL_AROUND, ""))})
     assert doings(result)[1] == Phase.SCANNING
-    half = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(ALL_AROUND[:4], ""))})
+    half = live(walls, ExplorerSettings(), 12, {0: ServerAnswer(-1, KnownAnswer(ALL_AROUND[:4], ""))})
     assert doings(half)[1] == Phase.DRIVING
     far = ALL_AROUND + np.array([2.0, 0.0, 0.0, 0.0])
-    elsewhere = live(walls, ExplorerSettings(), 12, {0: Answer(-1, KnownAnswer(far, ""))})
+    elsewhere = live(walls, ExplorerSettings(), 12, {0: ServerAnswer(-1, KnownAnswer(far, ""))})
     assert doings(elsewhere)[1] == Phase.DRIVING
 
 
-def turns(steps: list[Step]) -> list[float]:
+def turns(steps: list[TickResult]) -> list[float]:
     """Side of each turn between two views: 1 to the left, -1 to the right."""
     sides, turning = [], False
     for step in steps:

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from mapweave.agent.clearance import ASIDE, BEFORE, clearance
 from mapweave.agent.exploration.fleet_coverage import FleetCoverage
 from mapweave.agent.exploration.viewpoint_selection import next_viewpoint, seen_around, views_of
-from mapweave.agent.mission import Answer, WhatIsKnown
+from mapweave.agent.mission import ServerAnswer, WhatIsKnown
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.settings import ExplorerSettings, OccupancyGridSettings
@@ -109,7 +109,7 @@ def test_any_robots_views_cover_a_place():
     coverage = FleetCoverage(MAP, 8.7)
     assert coverage.question(np.array([1.0, 2.0])) == WhatIsKnown(-1, MAP, 1.0, 2.0, 8.7)
     theirs = np.concatenate([looks(3.0, 0.0, ALL_AROUND), looks(6.0, 0.0, ALL_AROUND[:4])])
-    coverage.take(Answer(-1, KnownAnswer(theirs, "")))
+    coverage.take(ServerAnswer(-1, KnownAnswer(theirs, "")))
     places = coverage.places(coverage.views, 0.7, 0.75)
     assert np.unique(places, axis=0).tolist() == [[3.0, 0.0]]
     mine = looks(6.1, 0.0, ALL_AROUND[4:])
@@ -120,8 +120,8 @@ def test_any_robots_views_cover_a_place():
 def test_a_server_that_does_not_answer_takes_nothing_back():
     coverage = FleetCoverage(MAP, 8.7)
     assert coverage.places(looks(0.0, 0.0, ALL_AROUND), 0.7, 0.75).shape == (0, 2)
-    coverage.take(Answer(-1, KnownAnswer(looks(3.0, 0.0, ALL_AROUND), "")))
-    coverage.take(Answer(-1, None, "no map server answered"))
+    coverage.take(ServerAnswer(-1, KnownAnswer(looks(3.0, 0.0, ALL_AROUND), "")))
+    coverage.take(ServerAnswer(-1, None, "no map server answered"))
     assert len(coverage.views) == len(ALL_AROUND)
 
 

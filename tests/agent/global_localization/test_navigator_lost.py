@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.global_localization.candidates import FleetMap, OwnMap
+from mapweave.agent.global_localization.candidates import FleetMapSource, OwnMapSource
 from mapweave.agent.global_localization.global_localization import GlobalLocalization
 from mapweave.agent.global_localization.search_policy import TO_NAVIGATE
-from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
+from mapweave.agent.mission import Question, ServerAnswer, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.hybridmap.change import NodePut
@@ -57,9 +57,9 @@ def test_it_drives_elsewhere_to_tell_two_places_apart(home):
     start = Pose2(2.5, 2.0)
     eyes = Eyes(home, start)
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhichWay):
-            return Answer(question.number, RouteAnswer(straight(bare(A), bare(C)), "a way"))
+            return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(C)), "a way"))
         if start.distance(eyes.pose) < 0.5:
             return found(question, here(A, Pose2()), here(B, Pose2()))
         return found(question, here(A, Pose2(0.1, 0.2, 0.3)))
@@ -79,11 +79,11 @@ def test_views_that_prove_nothing_alone_are_a_place_once_they_agree(home, moves_
     start = Pose2(2.5, 2.0)
     eyes = Eyes(home, start)
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhichWay):
-            return Answer(question.number, RouteAnswer(straight(bare(A), bare(C)), "a way"))
+            return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(C)), "a way"))
         place = here(A, start.inverse() @ eyes.pose if moves_along else Pose2(0.1, 0.2, 0.3))
-        return Answer(question.number, RelocalizeAnswer(Certainty.UNKNOWN, (place,), "not sure"))
+        return ServerAnswer(question.number, RelocalizeAnswer(Certainty.UNKNOWN, (place,), "not sure"))
 
     trial = Trial(navigator(eyes, NOWHERE, C), eyes, fleet)
     trial.run(12.0, lambda: trial.navigator.fix is not None)
@@ -143,7 +143,7 @@ def test_the_fleet_has_priority_over_the_own_map(home, own_map):
 def test_a_silent_fleet_is_not_asked_at_each_view(home):
     eyes = Eyes(home, Pose2(2.5, 2.0))
     navigator_ = navigator(eyes, NOWHERE, C)
-    trial = Trial(navigator_, eyes, lambda question: Answer(question.number, None, NO_ANSWER))
+    trial = Trial(navigator_, eyes, lambda question: ServerAnswer(question.number, None, NO_ANSWER))
     trial.run(18.0)
     assert len(trial.asked) == 1
     trial.run(15.0)
@@ -155,12 +155,12 @@ def test_a_robot_that_has_lost_all_landmarks_turns_to_headings_of_nearby_nodes(h
     turned = 2.4
     eyes = Eyes(home, TOUR[1] @ Pose2(0.05, 0.0, turned))
     motion = MotionPrimitives(BODY, 50)
-    own = OwnMap(own_map, np.random.default_rng(0))
-    lost = GlobalLocalization(BODY, eyes, motion, own, TO_NAVIGATE, FleetMap(motion))  # type: ignore[arg-type]
+    own = OwnMapSource(own_map, np.random.default_rng(0))
+    lost = GlobalLocalization(BODY, eyes, motion, own, TO_NAVIGATE, FleetMapSource(motion))  # type: ignore[arg-type]
     # The wheels' belief is off by a little.
     estimated = TOUR[0].inverse() @ TOUR[1] @ Pose2(0.1, -0.05, turned + 0.08)
     behaviour, moved, way, fix = lost.search(estimated), Odometry(0.0, 0.0), 0.0, None
-    answers: tuple[Answer, ...] = ()
+    answers: tuple[ServerAnswer, ...] = ()
     for tick in range(200):
         motion.take_in(Observation(tick * 100_000_000, moved, IMAGE, FREE), answers)
         try:

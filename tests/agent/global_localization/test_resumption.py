@@ -9,7 +9,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
-from mapweave.agent.global_localization.candidates import OwnMap
+from mapweave.agent.global_localization.candidates import OwnMapSource
 from mapweave.agent.global_localization.global_localization import MOVE, GlobalLocalization
 from mapweave.agent.global_localization.pose_consistency import OTHER_VIEW
 from mapweave.agent.global_localization.resumption import Resumption
@@ -308,7 +308,7 @@ def test_it_drives_toward_what_it_has_recognised_wherever_that_is(
     motion = MotionPrimitives(BODY)
     motion.take_in(Observation(0, Odometry(0.0, 0.0), proximity=FREE), ())
     localization = GlobalLocalization(
-        BODY, Body(None, Pose2()), motion, OwnMap(own_map, np.random.default_rng(0)), QUICK  # type: ignore[arg-type]
+        BODY, Body(None, Pose2()), motion, OwnMapSource(own_map, np.random.default_rng(0)), QUICK  # type: ignore[arg-type]
     )  # fmt: skip
     node = Pose2(0.8 * math.cos(direction), 0.8 * math.sin(direction))
     localization._hint = 40, node

@@ -17,7 +17,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.reachability import FARTHEST, WIDEST
 from mapweave.hybridmap.superseding import CROWD
 from mapweave.registration.recognition import register
-from synthetic.own_map import OwnMap
+from synthetic.own_map import SurveyedMap
 from synthetic.world import room
 
 MAP = MapId("r0", 1)
@@ -33,7 +33,7 @@ class Robot:
     def __init__(self, *tours: list[Pose2], seed: int = 3) -> None:
         rng = np.random.default_rng(seed)
         self.world = room(0, 0, 8, 4, 1600, rng)
-        self.own = OwnMap(MAP, rng)
+        self.own = SurveyedMap(MAP, rng)
         for day, tour in enumerate(tours):
             self.own.drive(self.world, tour, day * DAY)
 
@@ -137,7 +137,7 @@ def test_a_clock_that_is_put_back_holds_nothing_up() -> None:
 def test_a_year_of_drives_makes_no_larger_map() -> None:
     rng = np.random.default_rng(5)
     world = room(0, 0, 5, 4, 900, rng)
-    own = OwnMap(MAP, rng)
+    own = SurveyedMap(MAP, rng)
     retirement, sizes = NodeRetirement(own.map), list[int]()
     for week in range(52):
         tour = [Pose2(1.2 + 0.5 * k, 1.8 + rng.uniform(-0.2, 0.2), rng.uniform(-0.2, 0.2)) for k in range(6)]

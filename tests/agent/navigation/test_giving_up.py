@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from mapweave.agent.mission import Answer, Question, WhereAmI
+from mapweave.agent.mission import Question, ServerAnswer, WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER
-from mapweave.agent.navigation.stage import Stage
+from mapweave.agent.navigation.stage import NavigationStage
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
@@ -34,10 +34,10 @@ def trial_without_a_route(
     """A robot that finds itself at A at once, and a fleet that always gives the same answer to routes."""
     eyes = Eyes(home, Pose2(2.5, 2.0))
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2()))
-        return Answer(question.number, answer, "" if answer else NO_ANSWER)
+        return ServerAnswer(question.number, answer, "" if answer else NO_ANSWER)
 
     return Trial(navigator(eyes, NOWHERE, UNKNOWN, settings), eyes, fleet)
 
@@ -47,7 +47,7 @@ def test_a_goal_that_does_not_exist_is_given_up_with_the_reason(home):
     trial = trial_without_a_route(home, RouteAnswer((), f"goal {UNKNOWN} is not in the merged map"))
     trial.run(135.0, lambda: trial.navigator.given_up)
     assert trial.navigator.tally.relocalizations == 2, "its pose may be wrong: it looks once more"
-    assert trial.navigator.stage == Stage.GIVEN_UP and not trial.navigator.arrived
+    assert trial.navigator.stage == NavigationStage.GIVEN_UP and not trial.navigator.arrived
     assert f"goal {UNKNOWN} is not in the merged map" in trial.navigator.detail
     asked = len(trial.asked)
     trial.run(10.0)
@@ -69,12 +69,12 @@ def test_a_way_that_stays_blocked_is_given_up(home):
     """The server has a way each time that the block is forgotten; the robot never gets through."""
     eyes = Eyes(home, Pose2(2.5, 2.0))
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2()))
         if {A, B} in [set(pair) for pair in question.blocked]:
-            return Answer(question.number, RouteAnswer((), "every way is blocked"))
-        return Answer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
+            return ServerAnswer(question.number, RouteAnswer((), "every way is blocked"))
+        return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
 
     settings = NavigatorSettings(patience=100.0, blind_distance=1e9)
     trial = Trial(navigator(eyes, NOWHERE, B, settings), eyes, fleet, WALL_AHEAD, held=True)
@@ -89,10 +89,10 @@ def test_who_gets_on_does_not_give_up(home):
     eyes = Eyes(home, Pose2(0.3, 2.0))
     nodes = [bare(NodeId("s", 1, number)) for number in range(1, 12)]
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2()))
-        return Answer(question.number, RouteAnswer(straight(*nodes, step=1.0), "a way"))
+        return ServerAnswer(question.number, RouteAnswer(straight(*nodes, step=1.0), "a way"))
 
     settings = NavigatorSettings(patience=12.0, blind_distance=1e9)
     trial = Trial(navigator(eyes, NOWHERE, nodes[-1].id, settings), eyes, fleet)

@@ -13,7 +13,7 @@ import pytest
 
 from mapweave.agent.global_localization.refuted_places import RefutedPlaces
 from mapweave.agent.localization.fix import TURN_SHARE, Fix
-from mapweave.agent.mission import Answer, Question, WhereAmI
+from mapweave.agent.mission import Question, ServerAnswer, WhereAmI
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.navigation.answer_trial import TRIALS, AnswerTrial
 from mapweave.agent.observation import Observation, Odometry
@@ -56,10 +56,10 @@ def test_a_place_of_which_nothing_is_in_view_is_refuted_and_given_up(home):
     """The same wrong answer for ever. Before, the robot drove on by it until its patience ended, 300 s."""
     eyes = Eyes(home, START)
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2()))
-        return Answer(question.number, RouteAnswer(straight(bare(A), bare(B), step=9.0), "a way"))
+        return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(B), step=9.0), "a way"))
 
     trial = Trial(navigator(eyes, NOWHERE, B), eyes, fleet)
     trial.run(200.0, lambda: trial.navigator.given_up)
@@ -76,10 +76,10 @@ def test_places_that_contradict_each_other_end_the_same_way(home):
     eyes = Eyes(home, START)
     asked = iter(range(1, 10_000, 2))
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(NodeId("s", 1, next(asked)), Pose2(0.1)))
-        return Answer(
+        return ServerAnswer(
             question.number, RouteAnswer(straight(bare(question.start), bare(B), step=9.0), "a way")
         )
 
@@ -94,10 +94,10 @@ def test_the_own_view_corrects_a_wrong_pose_before_the_robot_drives(home, wrong)
     eyes = Eyes(home, START)
     node, true = real_node(home, START @ Pose2(-0.3), A), Pose2(0.3)
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, true @ wrong))
-        return Answer(question.number, RouteAnswer(straight(node, bare(B), step=3.0), "a way"))
+        return ServerAnswer(question.number, RouteAnswer(straight(node, bare(B), step=3.0), "a way"))
 
     trial = Trial(navigator(eyes, NOWHERE, B), eyes, fleet)
     trial.run(10.0, lambda: any(command.forward for command in trial.commands))
@@ -116,12 +116,12 @@ def test_answers_that_agree_with_the_wheels_are_not_called_wrong(home, apart):
     eyes, goal = Eyes(home, START), START @ Pose2(20.0)
     asked = iter(range(1, 10_000, 2))
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             node = NodeId("s", 1, next(asked))
             return found(question, here(node, Pose2(0.0, apart * (node.number % 4 - 2))))
         way = (eyes.pose.inverse() @ goal).x
-        return Answer(
+        return ServerAnswer(
             question.number, RouteAnswer(straight(bare(question.start), bare(B), step=way), "a way")
         )
 

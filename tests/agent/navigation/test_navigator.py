@@ -7,12 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
+from mapweave.agent.mission import Question, ServerAnswer, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER
 from mapweave.agent.navigation.blocks import Blocks
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.navigation.onboard_router import onboard_route
-from mapweave.agent.navigation.stage import Stage
+from mapweave.agent.navigation.stage import NavigationStage
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -53,13 +53,13 @@ def blocked_trial(home: World, forget: float = 15.0) -> tuple[Trial, list[tuple[
     nav = navigator(eyes, NOWHERE, B, settings)
     routes: list[tuple[float, WhichWay]] = []
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2()))
         routes.append((len(trial.commands) * BODY.tick, question))
         if {A, B} in [set(pair) for pair in question.blocked]:
-            return Answer(question.number, RouteAnswer((), "every way is blocked"))
-        return Answer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
+            return ServerAnswer(question.number, RouteAnswer((), "every way is blocked"))
+        return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
 
     trial = Trial(nav, eyes, fleet, WALL_AHEAD, held=True)
     return trial, routes
@@ -70,10 +70,10 @@ def test_a_blocked_robot_reports_the_obstacle_and_waits(home):
     trial.run(40.0, lambda: len(routes) >= 2)
     assert routes[0][1].blocked == ()
     assert routes[1][1].blocked == ((A, B),), "the server hears of it with the next question"
-    words = next(detail for stage, detail in trial.said if stage == Stage.BLOCKED)
+    words = next(detail for stage, detail in trial.said if stage == NavigationStage.BLOCKED)
     assert "0.06 m off" in words and str(A) in words and str(B) in words
     trial.run(1.0)
-    assert trial.navigator.stage == Stage.WAITING and "blocked" in trial.navigator.detail
+    assert trial.navigator.stage == NavigationStage.WAITING and "blocked" in trial.navigator.detail
     assert trial.navigator.fix is not None, "it still knows where it is"
     assert trial.navigator.tally.blocks == 1 and trial.navigator.tally.relocalizations == 1
 
@@ -96,12 +96,12 @@ def test_it_goes_around_by_another_way(home):
     nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1e9))
     answered: list[tuple[NodeId, ...]] = []
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2()))
         legs = straight(bare(A), bare(C), bare(B)) if question.blocked else straight(bare(A), bare(B))
         answered.append(tuple(leg.node.id for leg in legs))
-        return Answer(question.number, RouteAnswer(legs, "a way"))
+        return ServerAnswer(question.number, RouteAnswer(legs, "a way"))
 
     trial = Trial(nav, eyes, fleet, WALL_AHEAD, held=True)
     trial.run(40.0, lambda: len(answered) == 2)
@@ -118,11 +118,11 @@ def held_at_the_goal(home: World, proximity: np.ndarray = FREE) -> tuple[Navigat
     nav = navigator(eyes, NOWHERE, B, settings)
     routes: list[WhichWay] = []
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2()))
         routes.append(question)
-        return Answer(question.number, RouteAnswer(straight(bare(A), bare(B), step=0.3), "a way"))
+        return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(B), step=0.3), "a way"))
 
     trial = Trial(nav, eyes, fleet, proximity, held=True)
     trial.run(20.0, lambda: len(routes) == 3)
@@ -179,7 +179,7 @@ def test_without_a_server_its_own_map_leads_the_way(home, own_map):
     goal = max(own_map.nodes)
     eyes = Eyes(home, TOUR[0])
     silent = Trial(
-        navigator(eyes, own_map, goal), eyes, lambda question: Answer(question.number, None, NO_ANSWER)
+        navigator(eyes, own_map, goal), eyes, lambda question: ServerAnswer(question.number, None, NO_ANSWER)
     )
     silent.run(10.0, lambda: silent.navigator.legs > 0)
     assert silent.navigator.legs == 3
@@ -206,9 +206,9 @@ def test_a_goal_without_features_is_reached_by_its_neighbours(home, seen):
     node = replace(nodes[0], id=A) if seen else bare(A)
     observations: list[float] = []
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhichWay):
-            return Answer(question.number, RouteAnswer(straight(node, bare(B), step=0.6), "a way"))
+            return ServerAnswer(question.number, RouteAnswer(straight(node, bare(B), step=0.6), "a way"))
         observations.append((start.inverse() @ eyes.pose).x)
         return found(question, here(A, start.inverse() @ eyes.pose))
 
@@ -235,10 +235,10 @@ def test_a_photograph_of_unknown_distance_is_driven_to_and_a_vague_pose_is_not(h
         certainty = Certainty.FOUND if known else Certainty.PLACE
         place = replace(here(A, Pose2()), node_from_robot=vague, distance_known=known)
 
-        def fleet(question: Question, certainty=certainty, place=place) -> Answer:
+        def fleet(question: Question, certainty=certainty, place=place) -> ServerAnswer:
             if isinstance(question, WhichWay):
-                return Answer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
-            return Answer(question.number, RelocalizeAnswer(certainty, (place,), "it looks like a"))
+                return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
+            return ServerAnswer(question.number, RelocalizeAnswer(certainty, (place,), "it looks like a"))
 
         Trial(nav, eyes, fleet).run(3.0, lambda nav=nav: nav.fix is not None)
         fixed.append(nav.fix is not None)
@@ -253,18 +253,18 @@ def test_without_landmarks_it_drives_on_a_little_before_it_is_lost(home):
     observations: list[float] = []
     ahead = RouteLeg(bare(B), PoseGaussian(Pose2(9.0), EXACT), None)
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhichWay):
             here_first = PoseGaussian(Pose2(), EXACT) if question.start == B else ahead.previous_from_node
             legs = (replace(ahead, previous_from_node=here_first),)
-            return Answer(question.number, RouteAnswer(legs, "a way"))
+            return ServerAnswer(question.number, RouteAnswer(legs, "a way"))
         observations.append(eyes.pose.x - 0.5)
         return found(question, here(A, Pose2())) if len(observations) == 1 else found(question)
 
     trial = Trial(nav, eyes, fleet)
-    trial.run(60.0, lambda: nav.stage == Stage.LOST and len(observations) > 3)
+    trial.run(60.0, lambda: nav.stage == NavigationStage.LOST and len(observations) > 3)
     assert observations[1:4] == pytest.approx([1.0, 1.5, 2.0], abs=0.1)
-    assert nav.stage == Stage.LOST and nav.fix is None
+    assert nav.stage == NavigationStage.LOST and nav.fix is None
     assert nav.tally.relocalizations == 1
 
 
@@ -273,7 +273,7 @@ def test_a_look_that_shows_nothing_does_not_confirm_that_the_goal_is_reached(hom
     goal = min(own_map.nodes)
     eyes = Eyes(home, TOUR[0] @ Pose2(0.1, 0.0, 0.05))
     nav = navigator(eyes, own_map, goal)
-    trial = Trial(nav, eyes, lambda question: Answer(question.number, None, NO_ANSWER))
+    trial = Trial(nav, eyes, lambda question: ServerAnswer(question.number, None, NO_ANSWER))
     trial.run(10.0, lambda: nav.fix is not None)
     assert nav.fix is not None and nav.fix.node == goal
     eyes.world = World(home.points[:1], home.normals[:1], home.vectors[:1])
@@ -298,7 +298,7 @@ def test_a_goal_before_a_blank_wall_is_reached_by_two_looks_at_what_is_beside_it
     nodes[1] = replace(nodes[1], landmarks=bare(goal).landmarks)
     eyes = BlankAtTheGoal(home, TOUR[0] @ Pose2(0.1, 0.0, 0.05))
     nav = navigator(eyes, HybridMap(changes_of(nodes, edges)), goal)
-    trial = Trial(nav, eyes, lambda question: Answer(question.number, None, NO_ANSWER))
+    trial = Trial(nav, eyes, lambda question: ServerAnswer(question.number, None, NO_ANSWER))
     trial.run(150.0, lambda: nav.arrived or nav.given_up)
     assert nav.arrived and "its own landmarks" in nav.detail, trial.said
     assert TOUR[1].distance(eyes.pose) < 0.08
@@ -320,11 +320,11 @@ def test_a_touch_blocks_the_edge_and_another_way_is_sought(home):
     nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1e9), BARE)
     blocked: list[tuple[tuple[NodeId, NodeId], ...]] = []
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2()))
         blocked.append(question.blocked)
-        return Answer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
+        return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
 
     trial = Trial(nav, eyes, fleet, NO_READINGS)
     trial.run(20.0, lambda: any(command.forward > 0.0 for command in trial.commands))
@@ -340,12 +340,14 @@ def test_only_driven_edges_are_driven_without_rangers(home, body):
     nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1e9), body)
     blocked: list[tuple[tuple[NodeId, NodeId], ...]] = []
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2()))
         blocked.append(question.blocked)
         start, last = straight(bare(A), bare(B))
-        return Answer(question.number, RouteAnswer((start, replace(last, kind=EdgeKind.MERGED)), "a way"))
+        return ServerAnswer(
+            question.number, RouteAnswer((start, replace(last, kind=EdgeKind.MERGED)), "a way")
+        )
 
     trial = Trial(nav, eyes, fleet, FREE if body is BODY else NO_READINGS)
     trial.run(8.0, lambda: len(blocked) == 3 or any(c.forward > 0.0 for c in trial.commands))
@@ -359,12 +361,14 @@ def test_a_fleet_that_insists_on_an_undriven_edge_is_asked_seldom_and_the_goal_g
     eyes = Eyes(home, Pose2(2.5, 2.0))
     ways: list[Question] = []
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2()))
         ways.append(question)
         start, last = straight(bare(A), bare(B))
-        return Answer(question.number, RouteAnswer((start, replace(last, kind=EdgeKind.MERGED)), "a way"))
+        return ServerAnswer(
+            question.number, RouteAnswer((start, replace(last, kind=EdgeKind.MERGED)), "a way")
+        )
 
     nav = navigator(eyes, NOWHERE, B, NavigatorSettings(patience=30.0), BARE)
     Trial(nav, eyes, fleet, NO_READINGS).run(40.0)

@@ -7,10 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.mission import Answer, Question, WhereAmI, WhichWay
+from mapweave.agent.mission import Question, ServerAnswer, WhereAmI, WhichWay
 from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.navigation.portal_crossing import PortalCrossing
-from mapweave.agent.navigation.stage import Stage
+from mapweave.agent.navigation.stage import NavigationStage
 from mapweave.agent.observation import Command
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -39,18 +39,18 @@ class Lift:
         self.trial = Trial(nav, self.eyes, self.fleet)
         self.crossing = nav.crossing
 
-    def fleet(self, question: Question) -> Answer:
+    def fleet(self, question: Question) -> ServerAnswer:
         """Knows its way; knows the robot upstairs alone, and there only on a floor that may be meant."""
         if isinstance(question, WhereAmI):
             up = self.eyes.world is self.upstairs and self.seen_upstairs
             return found(question, *([here(B, LANDING.inverse() @ self.eyes.pose)] if up else []))
         assert isinstance(question, WhichWay)
         if question.start == B:
-            return Answer(question.number, RouteAnswer(straight(bare(B), bare(C)), "a way"))
+            return ServerAnswer(question.number, RouteAnswer(straight(bare(B), bare(C)), "a way"))
         way = onboard_route(self.own_map, question.start, self.entry).legs
         # The robot's images show nothing, so that it parks by what it knows of the nodes around.
         legs = tuple(replace(leg, node=bare(leg.node.id)) for leg in way)
-        return Answer(question.number, RouteAnswer(legs, "to the lift", self.portal))
+        return ServerAnswer(question.number, RouteAnswer(legs, "to the lift", self.portal))
 
     def run_until_it_asks(self, times: int = 1) -> None:
         def asks() -> bool:
@@ -74,7 +74,7 @@ def test_it_parks_asks_and_goes_on_from_where_it_sees_that_it_is(lift: Lift) -> 
     nav = lift.trial.navigator
     lift.run_until_it_asks()
     assert lift.eyes.pose.distance(TOUR[1]) < 0.05, "it is parked as at a goal"
-    assert nav.stage == Stage.PORTAL and not nav.arrived
+    assert nav.stage == NavigationStage.PORTAL and not nav.arrived
     assert nav.detail == (
         "at lift 'east lift' (key: desk): take me to floor 2, then say `mapweave portal done r0`"
     )
@@ -83,13 +83,13 @@ def test_it_parks_asks_and_goes_on_from_where_it_sees_that_it_is(lift: Lift) -> 
     assert {*lift.trial.commands[begun:]} == {Command()}, "it stands, for longer than drives may take"
     lift.carry()
     lift.trial.run(1.0, lambda: nav.given_up)
-    assert nav.stage == Stage.PORTAL, "what it sees meanwhile is no reason to leave"
+    assert nav.stage == NavigationStage.PORTAL, "what it sees meanwhile is no reason to leave"
     lift.crossing.taken_through()
     lift.trial.run(30.0, lambda: nav.progress == 1.0 or nav.tally.edges > 1)
     looks = [question for question in lift.trial.asked if isinstance(question, WhereAmI)]
     assert looks[-1].near == B, "it knows on which floor it is"
     assert nav.fix is not None and nav.fix.node == B and lift.crossing.wait is None
-    assert nav.stage not in (Stage.PORTAL, Stage.LOST) and nav.legs > 0
+    assert nav.stage not in (NavigationStage.PORTAL, NavigationStage.LOST) and nav.legs > 0
 
 
 def test_said_too_early_it_finds_itself_on_its_own_floor_says_so_and_asks_again(lift: Lift) -> None:
@@ -147,10 +147,10 @@ def test_a_robot_that_gets_lost_is_looked_for_on_its_floor_first(home: World) ->
     eyes, known = Eyes(home, Pose2(0.5, 2.0)), [True]
     nav = navigator(eyes, HybridMap(), C)
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhichWay):
             legs = straight(bare(B), bare(C), step=9.0)
-            return Answer(question.number, RouteAnswer(legs, "a way"))
+            return ServerAnswer(question.number, RouteAnswer(legs, "a way"))
         return found(question, *([here(B, Pose2())] if known[0] else []))
 
     trial = Trial(nav, eyes, fleet)

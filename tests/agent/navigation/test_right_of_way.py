@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from mapweave.agent.localization.fix import Fix
-from mapweave.agent.mission import Answer, MayIDrive, Question, WhereAmI, WhichWay
+from mapweave.agent.mission import MayIDrive, Question, ServerAnswer, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.navigation.goal_patience import YIELDED
 from mapweave.agent.navigation.right_of_way import Passage, RightOfWay
-from mapweave.agent.navigation.stage import Stage
+from mapweave.agent.navigation.stage import NavigationStage
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import NavigatorSettings
@@ -47,12 +47,12 @@ def trial_to(home, goal=B) -> Trial:
     """A robot at A, whose fleet knows the way to any node: straight ahead."""
     eyes = Eyes(home, Pose2(1.0, 2.0))
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2()))
         if {A, B} in [set(pair) for pair in question.blocked]:
-            return Answer(question.number, RouteAnswer((), "blocked"))
-        return Answer(question.number, RouteAnswer(straight(bare(A), bare(question.goal)), "a way"))
+            return ServerAnswer(question.number, RouteAnswer((), "blocked"))
+        return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(question.goal)), "a way"))
 
     return Trial(navigator(eyes, NOWHERE, goal, BLIND), eyes, fleet)
 
@@ -61,15 +61,15 @@ def test_a_robot_whose_way_is_held_stands_and_says_so_and_then_drives_on(home):
     trial, free = trial_to(home), [False]
     asked: list[MayIDrive] = []
 
-    def traffic(question: MayIDrive) -> Answer:
+    def traffic(question: MayIDrive) -> ServerAnswer:
         asked.append(question)
         granted = len(question.route) if free[0] else 0
         words = "" if free[0] else "r7 drives there"
-        return Answer(question.number, ReserveAnswer(granted, "" if free[0] else "r7", None, words))
+        return ServerAnswer(question.number, ReserveAnswer(granted, "" if free[0] else "r7", None, words))
 
     trial.traffic = traffic
     trial.run(10.0)
-    assert trial.navigator.stage == Stage.YIELDING and trial.navigator.detail == "r7 drives there"
+    assert trial.navigator.stage == NavigationStage.YIELDING and trial.navigator.detail == "r7 drives there"
     assert not any(command.forward for command in trial.commands)
     assert 6 <= len(asked) <= 10, "it asks every second"
     assert asked[-1].route[-1] == B and asked[-1].start == A
@@ -82,7 +82,7 @@ def test_a_robot_that_is_held_on_its_way_knows_where_it_stopped(home):
     """Before, it forgot what it had driven in the last tick before it stopped: 26 mm each time."""
     trial = trial_to(home)
     for granted in (2, 0, 2, 0):
-        trial.traffic = lambda question, n=granted: Answer(
+        trial.traffic = lambda question, n=granted: ServerAnswer(
             question.number, ReserveAnswer(n, "" if n else "r7", None, "r7 drives there")
         )
         trial.run(2.5)
@@ -94,7 +94,7 @@ def test_a_robot_that_is_held_on_its_way_knows_where_it_stopped(home):
 
 def test_a_robot_that_waits_too_long_looks_for_another_way(home):
     trial = trial_to(home)
-    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(0, "r7", None, ""))
+    trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(0, "r7", None, ""))
     trial.run(YIELDED + 8.0)
     assert [question.blocked for question in trial.asked if not isinstance(question, WhereAmI)][:2] == [
         (),
@@ -112,7 +112,7 @@ def test_a_robot_that_a_person_drives_meanwhile_has_not_waited():
     def tick() -> None:
         held = ReserveAnswer(0, "r7", None, "r7 stands there", occupied=True)
         observation = Observation(0, Odometry(0.0, 0.0), None, FREE)
-        motion.take_in(observation, tuple(Answer(question.number, held) for question in asked))
+        motion.take_in(observation, tuple(ServerAnswer(question.number, held) for question in asked))
 
     def waits(seconds: float) -> set[Passage]:
         out = set()
@@ -133,9 +133,9 @@ def test_a_robot_whose_goal_is_taken_waits_and_then_gives_up(home):
     """Before, it manoeuvred beside the parked robot for 300 s, with "no progress, though nothing is near"."""
     trial = trial_to(home)
     taken = ReserveAnswer(0, "r7", None, f"r7 stands at {B}", occupied=True)
-    trial.traffic = lambda question: Answer(question.number, taken)
+    trial.traffic = lambda question: ServerAnswer(question.number, taken)
     trial.run(YIELDED - 5.0)
-    assert trial.navigator.stage == Stage.YIELDING and trial.navigator.detail == f"r7 stands at {B}"
+    assert trial.navigator.stage == NavigationStage.YIELDING and trial.navigator.detail == f"r7 stands at {B}"
     trial.run(10.0)
     assert trial.navigator.given_up and trial.navigator.detail == f"r7 stands at {B}"
     assert not any(command.forward for command in trial.commands)
@@ -145,14 +145,16 @@ def test_a_robot_steps_aside_and_asks_for_its_way_again(home):
     trial = trial_to(home)
     free = ReserveAnswer(2, "", None, "")
 
-    def traffic(question: MayIDrive) -> Answer:
-        return Answer(question.number, free if question.route[-1] == C else ReserveAnswer(0, "r7", C, ""))
+    def traffic(question: MayIDrive) -> ServerAnswer:
+        return ServerAnswer(
+            question.number, free if question.route[-1] == C else ReserveAnswer(0, "r7", C, "")
+        )
 
     trial.traffic = traffic
     trial.run(4.0)
     goals = [question.goal for question in trial.asked if not isinstance(question, WhereAmI)]
-    assert goals[:2] == [B, C] and trial.navigator.stage == Stage.ASIDE
-    trial.traffic = lambda question: Answer(question.number, free)
+    assert goals[:2] == [B, C] and trial.navigator.stage == NavigationStage.ASIDE
+    trial.traffic = lambda question: ServerAnswer(question.number, free)
     trial.run(20.0, lambda: len(trial.asked) > 3)
     assert trial.asked[-1].goal == B
 
@@ -161,9 +163,9 @@ def test_a_robot_in_the_way_is_named(home):
     trial = trial_to(home)
     r7 = RobotBeside(0.2, "r7", 0.5, 0.0, 0.14)
     trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: r7)
-    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
+    trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(2, "", None, ""))
     trial.held = True
-    trial.run(60.0, lambda: trial.navigator.stage == Stage.BLOCKED)
+    trial.run(60.0, lambda: trial.navigator.stage == NavigationStage.BLOCKED)
     assert trial.navigator.detail == f"between {A} and {B}: no progress; r7 is 0.2 m off"
 
 
@@ -179,18 +181,18 @@ def test_two_robots_head_on_in_a_corridor(home, router, reserved):  # noqa: F811
         facing = Pose2(0.0, 0.0, 0.0 if goal > start else math.pi)
         eyes = Eyes(home, poses[node(start)] @ facing)
 
-        def fleet(question: Question) -> Answer:
+        def fleet(question: Question) -> ServerAnswer:
             if isinstance(question, WhereAmI):
                 return found(question, here(node(start), poses[node(start)].inverse() @ eyes.pose))
-            return Answer(
+            return ServerAnswer(
                 question.number,
                 router.route(question.start, question.goal, question.blocked, (), question.start_from_robot),
             )
 
-        def traffic(question: MayIDrive) -> Answer:
+        def traffic(question: MayIDrive) -> ServerAnswer:
             request = ReserveRequest(name, question.start, question.start_from_robot, question.route)
             now = len(trial.commands) * BODY.tick
-            return Answer(question.number, reservations.ask(request, router, now) if reserved else None)
+            return ServerAnswer(question.number, reservations.ask(request, router, now) if reserved else None)
 
         trial = Trial(navigator(eyes, NOWHERE, node(goal), BLIND), eyes, fleet)
         trial.traffic = traffic
@@ -213,7 +215,7 @@ def test_two_robots_head_on_in_a_corridor(home, router, reserved):  # noqa: F811
         assert all(map(there, robots, goals)), "both are where they wanted to be"
         assert min(gaps) > 2 * BODY.radius, "and have not touched"
         said = {stage for trial in robots for stage, _ in trial.said}
-        assert Stage.ASIDE in said and Stage.YIELDING in said
+        assert NavigationStage.ASIDE in said and NavigationStage.YIELDING in said
     else:
         assert min(gaps) < 2 * BODY.radius, "without reservations they drive into each other"
 
@@ -228,16 +230,16 @@ def test_a_parked_robot_makes_room_in_a_corridor_and_the_other_passes(home, rout
     def robot(name: str, start: int, goal: int) -> Trial:
         eyes = Eyes(home, poses[node(start)])
 
-        def fleet(question: Question) -> Answer:
+        def fleet(question: Question) -> ServerAnswer:
             if isinstance(question, WhereAmI):
                 return found(question, here(node(start), poses[node(start)].inverse() @ eyes.pose))
             ends = question.start, question.goal
             answer = router.route(*ends, question.blocked, (), question.start_from_robot)
-            return Answer(question.number, answer)
+            return ServerAnswer(question.number, answer)
 
-        def traffic(question: MayIDrive) -> Answer:
+        def traffic(question: MayIDrive) -> ServerAnswer:
             request = ReserveRequest(name, question.start, question.start_from_robot, question.route)
-            return Answer(question.number, reservations.ask(request, router, clock[0]))
+            return ServerAnswer(question.number, reservations.ask(request, router, clock[0]))
 
         trial = Trial(navigator(eyes, NOWHERE, node(goal), BLIND), eyes, fleet)
         trial.traffic = traffic
@@ -271,17 +273,17 @@ def test_a_parked_robot_makes_room_in_a_corridor_and_the_other_passes(home, rout
 def test_a_robot_whose_way_is_closed_asks_for_another_one_at_once(home):
     trial = trial_to(home)
     closed = ReserveAnswer(0, "", None, "the way ahead is closed by anna: wet floor", closed=True)
-    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(1, "", None, ""))
+    trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(1, "", None, ""))
     trial.run(3.0)
     before = len([question for question in trial.asked if not isinstance(question, WhereAmI)])
     assert before == 1 and trial.commands[-1].forward > 0.0, "it is on its way"
-    trial.traffic = lambda question: Answer(question.number, closed)
+    trial.traffic = lambda question: ServerAnswer(question.number, closed)
     trial.run(3.0, lambda: len(trial.asked) > 2)
     ways = [question for question in trial.asked if not isinstance(question, WhereAmI)]
     assert len(ways) == 2 and ways[-1].goal == B and ways[-1].blocked == (), "closed is not blocked"
     assert any("closed by anna" in detail for _, detail in trial.said)
     trial.run(0.5)
-    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(1, "", None, ""))
+    trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(1, "", None, ""))
     trial.run(3.0)
     assert any(command.forward or command.turn for command in trial.commands[-10:]), "and goes on by it"
 
@@ -291,12 +293,12 @@ def test_a_robot_passes_what_it_must_in_order_and_then_seeks_its_goal(home):
     goal = NodeId("s", 1, 7)
     poses[goal] = 0.5
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         x = eyes.pose.x - 1.0
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2(x)))
         step = poses[question.goal] - poses[question.start]
-        return Answer(
+        return ServerAnswer(
             question.number, RouteAnswer(straight(bare(question.start), bare(question.goal), step=step), "")
         )
 
@@ -312,11 +314,11 @@ def test_a_robot_that_goes_to_and_fro_gives_up_neither_for_time_nor_for_way(home
     """Before, it gave up once its stops took more way than 50 m, or its patience: it drove no new edge."""
     eyes, poses = Eyes(home, Pose2(1.0, 2.0)), {A: 0.0, B: 1.0}
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
             return found(question, here(A, Pose2(eyes.pose.x - 1.0)))
         step = poses[question.goal] - poses[question.start]
-        return Answer(
+        return ServerAnswer(
             question.number, RouteAnswer(straight(bare(question.start), bare(question.goal), step=step), "")
         )
 
@@ -332,7 +334,7 @@ def test_a_robot_that_stands_in_the_only_way_is_named_and_the_goal_given_up(home
     reach = BODY.radius + 0.14
     r7 = RobotBeside(0.2, "r7", reach + 0.2, 0.0, 0.14)
     trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: r7)
-    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
+    trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(2, "", None, ""))
     trial.held = True
     trial.run(70.0, lambda: trial.navigator.given_up)
     seconds = len(trial.commands) * BODY.tick
@@ -350,16 +352,16 @@ def test_a_robot_that_has_left_the_way_again_ends_no_goal(home):
     trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: around[0] if around else None)
     plain = trial.fleet
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhichWay) and question.obstacles:
-            return Answer(question.number, RouteAnswer((), "blocked"))
+            return ServerAnswer(question.number, RouteAnswer((), "blocked"))
         return plain(question)
 
     trial.fleet = fleet
-    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
+    trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(2, "", None, ""))
     trial.held = True
-    trial.run(60.0, lambda: trial.navigator.stage == Stage.BLOCKED)
-    assert trial.navigator.stage == Stage.BLOCKED
+    trial.run(60.0, lambda: trial.navigator.stage == NavigationStage.BLOCKED)
+    assert trial.navigator.stage == NavigationStage.BLOCKED
     around.clear()
     trial.run(60.0)
     assert not trial.navigator.given_up
@@ -369,14 +371,14 @@ def test_the_reason_of_a_longer_way_is_said_all_along_it(home):
     trial = trial_to(home)
     plain = trial.fleet
 
-    def fleet(question: Question) -> Answer:
+    def fleet(question: Question) -> ServerAnswer:
         answer = plain(question)
         if isinstance(answer.content, RouteAnswer):
             return replace(answer, content=replace(answer.content, detour="r7 stands on a shorter way"))
         return answer
 
     trial.fleet = fleet
-    trial.traffic = lambda question: Answer(question.number, ReserveAnswer(2, "", None, ""))
+    trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(2, "", None, ""))
     trial.run(8.0)
     driving = [detail for stage, detail in trial.said if stage == "driving along the route"]
     assert len(driving) > 5 and all(detail.endswith("r7 stands on a shorter way") for detail in driving)

@@ -6,8 +6,8 @@ from collections.abc import Sequence
 
 import pytest
 
-from mapweave.agent.mission import Answer, MayIDrive, Question, WhereAmI
-from mapweave.agent.navigation.stage import Stage
+from mapweave.agent.mission import MayIDrive, Question, ServerAnswer, WhereAmI
+from mapweave.agent.navigation.stage import NavigationStage
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveRequest
@@ -42,17 +42,17 @@ class Corridor:
         facing = Pose2(0.0, 0.0, 0.0 if poses[node(goal)].x >= poses[node(start)].x else 3.1415)
         eyes = Eyes(self._home, poses[node(start)] @ facing)
 
-        def fleet(question: Question) -> Answer:
+        def fleet(question: Question) -> ServerAnswer:
             if isinstance(question, WhereAmI):
                 return found(question, here(node(start), poses[node(start)].inverse() @ eyes.pose))
             ends = question.start, question.goal
             answer = self._router.route(*ends, question.blocked, (), question.start_from_robot)
-            return Answer(question.number, answer)
+            return ServerAnswer(question.number, answer)
 
-        def traffic(question: MayIDrive) -> Answer:
+        def traffic(question: MayIDrive) -> ServerAnswer:
             request = ReserveRequest(name, question.start, question.start_from_robot, question.route)
             answer = self._reservations.ask(request, self._router, self._ticks * BODY.tick)
-            return Answer(question.number, answer)
+            return ServerAnswer(question.number, answer)
 
         trial = Trial(navigator(eyes, NOWHERE, node(goal), BLIND), eyes, fleet)
         trial.traffic = traffic
@@ -66,7 +66,7 @@ class Corridor:
 
     def yielding(self) -> set[str]:
         """Robots that say that they wait for another one."""
-        return {name for name, one in self.robots.items() if one.navigator.stage is Stage.YIELDING}
+        return {name for name, one in self.robots.items() if one.navigator.stage is NavigationStage.YIELDING}
 
     def tick(self) -> None:
         """One tick of all who are there."""

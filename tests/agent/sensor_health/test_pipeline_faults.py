@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 
 from mapweave.agent.mapping_monitor import MappingMonitor
-from mapweave.agent.mission import Answer, Explore, GoTo
+from mapweave.agent.mission import Explore, GoTo, ServerAnswer
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Command, Observation, Odometry
-from mapweave.agent.pipeline import Pipeline, Step
+from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.runner import Runner
-from mapweave.agent.sensor_health.sensor_monitor import FIRST_TRIAL, TRIAL_SIDE, Fault
+from mapweave.agent.sensor_health.sensor_monitor import FIRST_TRIAL, TRIAL_SIDE, SensorFault
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
@@ -42,14 +42,14 @@ class Frozen:
 
 def run(
     walls, pipeline: Pipeline, pose: Pose2, tick: int, ticks: int, broken: Break
-) -> tuple[Pose2, list[Step]]:
+) -> tuple[Pose2, list[TickResult]]:
     """Go on from a pose and a tick. No server answers."""
-    steps: list[Step] = []
-    moved, answers = Odometry(0.0, 0.0), tuple[Answer, ...]()
+    steps: list[TickResult] = []
+    moved, answers = Odometry(0.0, 0.0), tuple[ServerAnswer, ...]()
     for k in range(tick, tick + ticks):
         seen = Observation(HOUR_NS + k * 100_000_000, moved, walls.render(pose), rangers(pose))
         steps.append(pipeline.step(broken(seen), answers))
-        answers = tuple(Answer(question.number, None, "no answer") for question in steps[-1].questions)
+        answers = tuple(ServerAnswer(question.number, None, "no answer") for question in steps[-1].questions)
         command = steps[-1].command
         moved = Odometry(command.forward * BODY.tick, command.turn * BODY.tick)
         pose = pose @ moved.motion()
@@ -95,14 +95,14 @@ def test_a_robot_whose_encoders_fail_keeps_what_it_has_done_of_its_mission(walls
     assert steps[-1].status.portal == PortalWait(portal, done=True)
 
 
-def drive(how: str, seed: int) -> tuple[Pipeline, dict[int, Pose2], list[Step], Simulation]:
+def drive(how: str, seed: int) -> tuple[Pipeline, dict[int, Pose2], list[TickResult], Simulation]:
     """Exploring an office; a sensor fails from 20 s to 30 s."""
     with Simulation(make_world("office", seed, rooms=1), ["r0"], seed) as simulation:
         description, frozen = simulation.describe("r0"), Frozen()
         half = description.axle / 2
         pipeline = Pipeline(MapId("r0", 1), description)
         pipeline.set_mission(Explore())
-        command, truth, steps = Command(), dict[int, Pose2](), list[Step]()
+        command, truth, steps = Command(), dict[int, Pose2](), list[TickResult]()
         for tick in range(450):
             simulation.advance({"r0": command})
             seen = simulation.observe("r0")
@@ -141,12 +141,12 @@ def test_a_simulated_robot_keeps_its_map_sound(how):
 class Scripted:
     """A pipeline whose faults are given, and the rest of a robot that does nothing."""
 
-    def __init__(self, *faults: Fault | None) -> None:
+    def __init__(self, *faults: SensorFault | None) -> None:
         self.faults = list(faults)
         self.map = HybridMap()
 
-    def step(self, *_: object) -> Step:
-        return Step(Command(), (), (), Status("idle", "", 0, 0, Pose2(), False), self.faults.pop(0))
+    def step(self, *_: object) -> TickResult:
+        return TickResult(Command(), (), (), Status("idle", "", 0, 0, Pose2(), False), self.faults.pop(0))
 
     def server_in_reach(self) -> bool:
         return False
@@ -164,7 +164,7 @@ class Scripted:
 
 
 def test_the_log_has_one_line_when_a_sensor_fails_and_one_when_it_is_back():
-    frozen, dead = Fault("camera", "it is frozen"), Fault("encoders", "they do not count")
+    frozen, dead = SensorFault("camera", "it is frozen"), SensorFault("encoders", "they do not count")
     robot, lines = Scripted(None, frozen, frozen, dead, None, None), list[str]()
     parts = MissionControl("r0"), MappingMonitor(BODY)
     runner = Runner(robot, robot, robot, *parts, print_line=lines.append)  # type: ignore[arg-type]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.servo.field_of_view import FieldOfView
 from mapweave.agent.servo.lattice_planner import FARTHEST, lattice_plan
-from mapweave.agent.servo.plan import Plan, Price, Surroundings
+from mapweave.agent.servo.plan import Price, ServoPlan, Surroundings
 from mapweave.agent.servo.planner import thorough_plan
 from mapweave.agent.servo.two_leg_planner import two_leg_plan
 from mapweave.hybridmap.camera import Camera
@@ -24,7 +24,7 @@ Seen = Callable[[Camera, Pose2, Array], NDArray[np.bool_]]
 Draw = tuple[Callable[..., Array], Callable[..., Pose2]]
 
 
-def check(plan: Plan, start: Pose2, points: Array, camera: Camera, seen: Seen, walls: Array) -> None:
+def check(plan: ServoPlan, start: Pose2, points: Array, camera: Camera, seen: Seen, walls: Array) -> None:
     """Everything that a plan promises, leg by leg."""
     x, y, heading = start.x, start.y, start.heading
     for leg in plan.legs:

@@ -7,20 +7,20 @@ import sys
 import time
 from multiprocessing.connection import Connection
 
-from mapweave.mapserver.cluster.frames import MOST_FRAME, Reply, Request
+from mapweave.mapserver.cluster.frames import MOST_FRAME, GatewayReply, GatewayRequest
 
 
 def main() -> None:
     connection = Connection(int(sys.argv[1]))
     if sys.argv[2] == "nowhere":
-        connection.send_bytes(Reply(0, words="nothing listens at nowhere").packed())
+        connection.send_bytes(GatewayReply(0, words="nothing listens at nowhere").packed())
         return
     if sys.argv[2] == "slow":
         time.sleep(2.0)
-    connection.send_bytes(Reply(int(sys.argv[3])).packed())
+    connection.send_bytes(GatewayReply(int(sys.argv[3])).packed())
     while True:
         try:
-            number, target, request = Request.read(connection.recv_bytes())
+            number, target, request = GatewayRequest.read(connection.recv_bytes())
         except EOFError:
             return
         if request == b"die":
@@ -30,9 +30,9 @@ def main() -> None:
         elif request == b"too long":
             connection.send_bytes(bytes(MOST_FRAME + 1))
         elif request == b"fail":
-            connection.send_bytes(Reply(number, words="it failed").packed())
+            connection.send_bytes(GatewayReply(number, words="it failed").packed())
         elif request != b"silence":
-            connection.send_bytes(Reply(number, b"%d %s" % (target, request)).packed())
+            connection.send_bytes(GatewayReply(number, b"%d %s" % (target, request)).packed())
 
 
 if __name__ == "__main__":

@@ -21,11 +21,10 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.landmark_tables import SYMBOLS
 from mapweave.hybridmap.limits import MAX_LANDMARKS, MAX_NUMBER
 from mapweave.hybridmap.node import CODE_BYTES, Landmarks, Node
-from mapweave.mapserver.cluster.frames import Reply, Request
+from mapweave.mapserver.cluster.frames import GatewayReply, GatewayRequest
 from mapweave.mapserver.cluster.messages import (
     MOST_BYTES,
     Ask,
-    Change,
     ComparedNodes,
     Comparison,
     ComparisonAnswer,
@@ -37,6 +36,7 @@ from mapweave.mapserver.cluster.messages import (
     OverlapsAnswer,
     Question,
     Reset,
+    ShardChange,
     ShardRequest,
     State,
     answer_message,
@@ -83,8 +83,8 @@ def test_nodes_arrive_bit_by_bit() -> None:
     empty = replace(NODES[2], landmarks=Landmarks.empty())
     for nodes in (NODES, [NODES[0], other_camera, empty, NODES[3]], [empty], []):
         gone = (NODES[4].id, NODES[0].id)[: len(nodes)]
-        read = decoded(encoded(Change(STATE, ComparedNodes.of(nodes), Ids.of(gone))), ShardRequest)
-        assert isinstance(read, Change) and (read.state, read.gone.nodes) == (STATE, gone)
+        read = decoded(encoded(ShardChange(STATE, ComparedNodes.of(nodes), Ids.of(gone))), ShardRequest)
+        assert isinstance(read, ShardChange) and (read.state, read.gone.nodes) == (STATE, gone)
         for one, node in zip(read.nodes.nodes, nodes, strict=True):
             assert (one.id, one.camera) == (node.id, node.camera)
             assert same_landmarks(one.landmarks, node.landmarks)
@@ -139,7 +139,7 @@ def large(name: str, count: int) -> Node:
 def test_the_longest_messages_that_there_may_be_are_taken() -> None:
     node = large("a", MAX_LANDMARKS)
     some = [replace(node, id=NodeId(f"{k:032}", MAX_NUMBER, MAX_NUMBER)) for k in range(AT_ONCE)]
-    change = encoded(Change(STATE, ComparedNodes.of(some), Ids.of(one.id for one in some)))
+    change = encoded(ShardChange(STATE, ComparedNodes.of(some), Ids.of(one.id for one in some)))
     assert len(decoded(change, ShardRequest).nodes.nodes[-1].landmarks) == MOST_LANDMARKS
     question = Nearest(node.landmarks.codes)
     votes = PlaceIndexSettings().votes
@@ -244,7 +244,7 @@ def test_codes_that_are_none_are_refused() -> None:
 
 def test_columns_of_nodes_that_do_not_belong_together_are_refused() -> None:
     nodes = ComparedNodes.of(NODES[:3])
-    change = Change(STATE, nodes, Ids.of([]))
+    change = ShardChange(STATE, nodes, Ids.of([]))
     for ends, words in (
         (nodes.ends + 1, "do not belong together"),
         (nodes.ends[::-1].copy(), "a number that is not from 0"),
@@ -262,7 +262,7 @@ def test_columns_of_nodes_that_do_not_belong_together_are_refused() -> None:
 
 
 SAMPLES: list[tuple[bytes, Callable[[bytes], object]]] = [
-    (encoded(Change(STATE, ComparedNodes.of(NODES[:2]), Ids.of([NODES[0].id]))), SERVER.call),
+    (encoded(ShardChange(STATE, ComparedNodes.of(NODES[:2]), Ids.of([NODES[0].id]))), SERVER.call),
     (encoded(Ask(State(SERVER._state.incarnation, 0), encoded(NEAREST))), SERVER.call),
     (encoded(NEAREST), lambda data: SHARD.answer(decoded(data, Question))),
     (encoded(OVERLAPS), lambda data: SHARD.answer(decoded(data, Question))),
@@ -274,8 +274,8 @@ SAMPLES: list[tuple[bytes, Callable[[bytes], object]]] = [
         lambda data: decoded(data, ComparisonAnswer).verdicts_on(PAIRS[:4]),
     ),
     (encoded(Comparison.of(PAIRS[:2])), lambda data: decoded(data, Comparison).node_pairs()),
-    (Request(7, 2, b"abc").packed(), Request.read),
-    (Reply(7, words="it failed").packed(), Reply.read),
+    (GatewayRequest(7, 2, b"abc").packed(), GatewayRequest.read),
+    (GatewayReply(7, words="it failed").packed(), GatewayReply.read),
 ]  # fmt: skip
 
 
@@ -298,10 +298,14 @@ def test_a_damaged_message_is_taken_or_refused(
 
 
 def test_frames_arrive_as_they_were_sent() -> None:
-    for request in (Request(2**40, -1, b""), Request(1, 3, b"\0\1")):
-        assert Request.read(request.packed()) == request
-    for reply in (Reply(2**40), Reply(0, b"\0\1"), Reply(1, words="nothing listens at ü")):
-        assert Reply.read(reply.packed()) == reply
-    for read in (Request.read, Reply.read):
+    for request in (GatewayRequest(2**40, -1, b""), GatewayRequest(1, 3, b"\0\1")):
+        assert GatewayRequest.read(request.packed()) == request
+    for reply in (
+        GatewayReply(2**40),
+        GatewayReply(0, b"\0\1"),
+        GatewayReply(1, words="nothing listens at ü"),
+    ):
+        assert GatewayReply.read(reply.packed()) == reply
+    for read in (GatewayRequest.read, GatewayReply.read):
         with pytest.raises(InvalidMessage, match="at least"):
             read(b"short")

@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.merge.pose_graph.links import Link
-from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from synthetic.fleet import LINK_SIGMAS, FleetSettings, map_of, walk_of
 
@@ -30,4 +30,4 @@ def large_map(robots: int, nodes: int, links: int) -> MergedMap:
         for a, b in sorted((min(pair), max(pair)) for pair in pairs[:links])
     )
     graph = PoseGraph(ids[0], ids, means, sparse.identity(3 * len(ids), format="csc"))
-    return MergedMap(maps, joined, (), (frozenset(ids),), Poses([graph]), (graph,))
+    return MergedMap(maps, joined, (), (frozenset(ids),), NodePoses([graph]), (graph,))

@@ -16,14 +16,14 @@ from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.mapserver.http import serving, web
 from mapweave.mapserver.http.body import MOST_BYTES
-from mapweave.mapserver.http.serving import Limits
+from mapweave.mapserver.http.serving import ConnectionTimeouts
 from mapweave.mapserver.http.web import Questions, Web, parse_address
 from mapweave.wire.log_messages import Scalar
 from tests.mapserver.http.client import ask, post, raw
 from tests.mapserver.stub_services import StubServices
 from tests.waiting import eventually
 
-NEVER = Limits(head=600.0, whole=600.0)
+NEVER = ConnectionTimeouts(head=600.0, whole=600.0)
 """What holds up others does so for longer than any test waits."""
 
 
@@ -83,7 +83,7 @@ def test_a_byte_now_and_then_takes_no_longer_than_anything_else(services: StubSe
 
 def test_a_head_that_never_ends_is_dropped(services: StubServices) -> None:
     with (
-        Web(("127.0.0.1", 0), services, limits=Limits(head=0.5)) as served,
+        Web(("127.0.0.1", 0), services, limits=ConnectionTimeouts(head=0.5)) as served,
         socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow,
     ):
         slow.sendall(b"GET /status HTTP/1.1\r\nHost: localhost\r\nX: ")
@@ -93,7 +93,7 @@ def test_a_head_that_never_ends_is_dropped(services: StubServices) -> None:
 def test_a_client_that_reads_nothing_is_dropped(services: StubServices) -> None:
     services.events = (MapEvent(10**18, MapEventKind.CONSTRAINED, "no" * 2000),) * 3000
     with (
-        Web(("127.0.0.1", 0), services, limits=Limits(stall=0.5)) as served,
+        Web(("127.0.0.1", 0), services, limits=ConnectionTimeouts(stall=0.5)) as served,
         socket.socket() as slow,
     ):
         slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)

@@ -26,10 +26,10 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.superseded import Superseded
-from mapweave.mapserver.http.live import MOST_VIEWERS, Live
-from mapweave.mapserver.http.login import Access
+from mapweave.mapserver.http.live import MOST_VIEWERS, LiveUpdates
+from mapweave.mapserver.http.login import RequestAuthorization
 from mapweave.mapserver.http.row_table import RowTable
-from mapweave.mapserver.http.serving import Limits
+from mapweave.mapserver.http.serving import ConnectionTimeouts
 from mapweave.mapserver.http.web import Web
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -221,7 +221,7 @@ def test_pages_of_other_sites_do_not_watch(served: Web, headers: dict[str, str])
 
 
 def test_who_takes_nothing_or_says_too_much_is_dropped(services: StubServices) -> None:
-    with Web(("127.0.0.1", 0), services, limits=Limits(head=0.5, whole=0.5, stall=0.5)) as served:
+    with Web(("127.0.0.1", 0), services, limits=ConnectionTimeouts(head=0.5, whole=0.5, stall=0.5)) as served:
         services.holds["summary"] = "x" * 20_000_000
         with socket.socket() as slow:
             slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
@@ -292,7 +292,7 @@ def test_a_slow_viewer_gets_the_newest_state(services: StubServices, monkeypatch
         return {"summary": str(looks)}
 
     async def watch() -> None:
-        live, slow = Live(services, Access(None, 1.0)), SlowSocket()
+        live, slow = LiveUpdates(services, RequestAuthorization(None, 1.0)), SlowSocket()
         serving = asyncio.create_task(live.serve(slow))  # type: ignore[arg-type]
         for _ in range(3):
             slow.free.release()

@@ -29,7 +29,7 @@ from mapweave.identities.logins import Logins
 from mapweave.identities.tokens import TOKENS
 from mapweave.mapserver.http import sessions
 from mapweave.mapserver.http.rates import MOST_PEOPLE, QUESTIONS, Rates
-from mapweave.mapserver.http.serving import MAX_WAITING, Limits
+from mapweave.mapserver.http.serving import MAX_WAITING, ConnectionTimeouts
 from mapweave.mapserver.http.tls import load, server_context
 from mapweave.mapserver.http.web import Questions, Web
 from mapweave.mapserver.quotas import BURST
@@ -303,7 +303,9 @@ def test_who_logs_in_over_https_sees_the_certificate_of_the_authority(
     trusting = ssl.create_default_context(cafile=str(folder.path / "authority.pem"))
     # As Python does from 3.13 on.
     trusting.verify_flags |= ssl.VERIFY_X509_STRICT
-    with Web(("0.0.0.0", 0), services, limits=Limits(head=0.5), logins=Logins(folder.path), tls=tls) as web:
+    with Web(
+        ("0.0.0.0", 0), services, limits=ConnectionTimeouts(head=0.5), logins=Logins(folder.path), tls=tls
+    ) as web:
         address = f"https://127.0.0.1:{web.port}/status"
         asked = urllib.request.Request(address, headers={"Authorization": f"Bearer {token}"})
         assert json.load(urllib.request.urlopen(asked, context=trusting, timeout=20))["nodes"] == 12
@@ -327,7 +329,11 @@ def test_handshakes_that_are_never_begun_make_room(services: StubServices, tmp_p
     more = 60
     with (
         Web(
-            ("127.0.0.1", 0), services, limits=Limits(head=120.0), logins=Logins(folder.path), tls=tls
+            ("127.0.0.1", 0),
+            services,
+            limits=ConnectionTimeouts(head=120.0),
+            logins=Logins(folder.path),
+            tls=tls,
         ) as web,
         ExitStack() as opened,
     ):

@@ -13,7 +13,7 @@ import pytest
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.mapserver.log.entry import Applied
 from mapweave.mapserver.log.postgres_store import PostgresStore
-from mapweave.mapserver.log.store import Run
+from mapweave.mapserver.log.store import LogChanges
 from synthetic.postgres_server import ROLE, PostgresServer, binaries
 from tests.mapserver.log.test_store import MAP, entry
 from tests.postgres import started
@@ -49,7 +49,7 @@ def test_nothing_acknowledged_is_lost_with_the_primary(
         def write() -> None:
             nonlocal acknowledged
             while not stopping.is_set():
-                (result,) = store.apply_all([Run(MAP, 5, [entry(acknowledged + 1)])])
+                (result,) = store.apply_all([LogChanges(MAP, 5, [entry(acknowledged + 1)])])
                 if isinstance(result, Applied):
                     acknowledged = result.watermark
                 else:

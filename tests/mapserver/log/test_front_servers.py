@@ -23,11 +23,11 @@ from mapweave.mapserver.log import group_commit, postgres_follower
 from mapweave.mapserver.log.entry import Applied
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.postgres_store import PostgresStore
-from mapweave.mapserver.log.store import Run
+from mapweave.mapserver.log.store import LogChanges
 from mapweave.mapserver.server import MapServer
 from mapweave.opened_map import open_map
 from mapweave.wire.codec import encode_change
-from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
+from mapweave.wire.memory import MemoryBus, MemoryHub, MessageFaults
 from synthetic.postgres_server import PostgresServer
 from tests.mapserver.log.acknowledged_fleet import AGENT, KEYS, ROBOTS, SERVER, life
 from tests.mapserver.log.test_store import MAP, entry
@@ -100,7 +100,7 @@ def test_all_servers_pass_on_everything_once_and_in_order(
     for journal in journals:
         map_id = journal.open_map(1)
         bus = MemoryBus(hub)
-        hub.disturb(Faults(drop=0.2, double=0.2, delay=0.2), rng, bus)
+        hub.disturb(MessageFaults(drop=0.2, double=0.2, delay=0.2), rng, bus)
         robot = Replicator(bus, KEYS, journal, map_id, ("s0", "s1"), AGENT)
         robots.append(robot)
         for stamp, body in enumerate(life(map_id, rng, 16)):
@@ -261,11 +261,11 @@ def test_a_server_that_freezes_while_it_writes_does_not_hold_up_others(
     monkeypatch.setattr(postgres_follower, "POLL", 0.2)
     frozen, other = PostgresStore(address, "s0"), PostgresStore(address, "s1")
     with pytest.raises(InvalidFile), frozen._transaction():
-        frozen._begin([Run(MAP, 5, [entry(1)])])
+        frozen._begin([LogChanges(MAP, 5, [entry(1)])])
         other.follow(lambda news: None)
-        (result,) = other.apply_all([Run(MAP, 5, [entry(1)])])
+        (result,) = other.apply_all([LogChanges(MAP, 5, [entry(1)])])
         assert isinstance(result, Applied), result
-    (late,) = frozen.apply_all([Run(MAP, 5, [entry(1), entry(2)])])
+    (late,) = frozen.apply_all([LogChanges(MAP, 5, [entry(1), entry(2)])])
     assert isinstance(late, Applied) and (late.before, late.watermark) == (1, 2)
     other.close()
     frozen.close()

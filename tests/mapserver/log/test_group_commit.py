@@ -14,11 +14,11 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.errors import InvalidFile, MapweaveError
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.agent_log import AgentLog, PullSettings
-from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.entry import Applied, ReceivedChange
 from mapweave.mapserver.log.group_commit import GroupCommit, NextRun
 from mapweave.mapserver.log.intake import Intakes
 from mapweave.mapserver.log.sqlite_store import SqliteStore
-from mapweave.mapserver.log.store import Run
+from mapweave.mapserver.log.store import LogChanges
 from mapweave.mapserver.quotas import Quotas
 from mapweave.wire.memory import MemoryHub
 from tests.mapserver.played import LOG_ID, HandAgent, Server, message
@@ -32,7 +32,7 @@ def group(store: SqliteStore) -> GroupCommit:
 
 
 def run(map_id: MapId, sequences: list[int], covered: int | None = None, log_id: int = LOG_ID) -> NextRun:
-    entries = [Entry.read(map_id, sequence, message(sequence, map_id)) for sequence in sequences]
+    entries = [ReceivedChange.read(map_id, sequence, message(sequence, map_id)) for sequence in sequences]
     return NextRun(AgentLog(map_id, log_id, PullSettings()), entries, covered)
 
 
@@ -125,7 +125,7 @@ def test_nothing_of_a_failed_group_is_acknowledged_and_all_of_it_comes_later(
             agent.serve(3)
         apply_all, broken = server.store.apply_all, [True]
 
-        def fail(runs: list[Run]) -> list[Applied | MapweaveError]:
+        def fail(runs: list[LogChanges]) -> list[Applied | MapweaveError]:
             if broken:
                 return [InvalidFile("s0.sqlite: map store cannot be used (disk I/O error)") for _ in runs]
             return apply_all(runs)
@@ -148,7 +148,7 @@ def test_changes_that_wait_are_committed_together(hub: MemoryHub, tmp_path: Path
         agents = [HandAgent(hub, map_id) for map_id in MAPS]
         apply_all, groups = server.store.apply_all, list[int]()
 
-        def slow_disk(runs: list[Run]) -> list[Applied | MapweaveError]:
+        def slow_disk(runs: list[LogChanges]) -> list[Applied | MapweaveError]:
             groups.append(len(runs))
             if len(groups) == 1:
                 for agent in agents[1:]:

@@ -12,7 +12,7 @@ import pytest
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.agent_log import AgentLog, PullSettings
-from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.entry import Applied, ReceivedChange
 from mapweave.mapserver.log.inbox import MOST
 from mapweave.mapserver.log.ingest_settings import IngestSettings
 from mapweave.wire.bus import Sample
@@ -236,9 +236,9 @@ def test_the_pause_doubles_and_a_sign_of_life_ends_it() -> None:
 def test_memory_for_changes_ahead_is_bounded() -> None:
     agent_log = AgentLog(MAP, 1, PullSettings(ahead=10))
     for sequence in range(2, 100):
-        agent_log.offer(Entry(sequence, b"", "x"))
+        agent_log.offer(ReceivedChange(sequence, b"", "x"))
     assert len(agent_log.ahead) == 10
-    agent_log.offer(Entry(1, b"", "x"))
+    agent_log.offer(ReceivedChange(1, b"", "x"))
     assert [entry.sequence for entry in agent_log.next_run(0)] == list(range(1, 12))
     agent_log.settled(Applied((), (), 5))
     assert min(agent_log.ahead) == 6

@@ -22,7 +22,7 @@ from mapweave.mapserver.log.ingest_settings import IngestSettings
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
-from mapweave.wire.memory import Faults, MemoryBus, MemoryHub
+from mapweave.wire.memory import MemoryBus, MemoryHub, MessageFaults
 from tests.wire.conftest import sample_edge
 
 KEYS = Keys("fleet")
@@ -92,9 +92,9 @@ shares = st.sampled_from([0.0, 0.2, 0.6])
 
 @pytest.mark.slow
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
-@given(steps, st.builds(Faults, shares, shares, shares, st.integers(1, 30)), st.integers(0, 2**32 - 1))
+@given(steps, st.builds(MessageFaults, shares, shares, shares, st.integers(1, 30)), st.integers(0, 2**32 - 1))
 def test_the_store_becomes_the_journals(
-    tmp_path_factory: pytest.TempPathFactory, steps: list[str], faults: Faults, seed: int
+    tmp_path_factory: pytest.TempPathFactory, steps: list[str], faults: MessageFaults, seed: int
 ) -> None:
     folder = tmp_path_factory.mktemp("faults")
     hub = MemoryHub()

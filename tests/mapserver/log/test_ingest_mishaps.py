@@ -12,7 +12,7 @@ import pytest
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import InvalidFile, MapweaveError
 from mapweave.hybridmap.ids import MapId
-from mapweave.mapserver.log.store import Run
+from mapweave.mapserver.log.store import LogChanges
 from mapweave.wire.bus import Request
 from mapweave.wire.codec import MAX_CHANGE_BYTES
 from mapweave.wire.log_messages import LogAnswer, LogRequest, Mark, Refusal
@@ -153,7 +153,7 @@ def test_a_disk_that_is_full_for_a_while(
 ) -> None:
     agent.serve(3)
 
-    def full(runs: list[Run]) -> list[MapweaveError]:
+    def full(runs: list[LogChanges]) -> list[MapweaveError]:
         return [InvalidFile("s0.sqlite: map store cannot be used (database or disk is full)") for _ in runs]
 
     with monkeypatch.context() as patched, caplog.at_level(logging.ERROR):

@@ -16,7 +16,7 @@ from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log import ingest, intake, kept_bytes, known_logs, pull_schedule, pulled
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.intake import ADVICE
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import PRUNING_MARK
@@ -331,7 +331,7 @@ def test_a_beacon_beyond_all_logs_moves_only_its_own(
 def test_undecodable_changes_fill_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mapweave.mapserver.log.sql_store.MOST_REFUSED_KEPT", 5)
     store = SqliteStore(tmp_path / "s0.sqlite")
-    entries = [Entry.read(MAP, sequence, b"\xc1" * 100_000) for sequence in range(1, 51)]
+    entries = [ReceivedChange.read(MAP, sequence, b"\xc1" * 100_000) for sequence in range(1, 51)]
     store.apply(MAP, LOG_ID, entries)
     assert store.refused() == store.watermark(MAP) == 50
     assert store.refusals(MAP, 1)[0].reason

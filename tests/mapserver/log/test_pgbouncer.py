@@ -7,7 +7,7 @@ import pytest
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.mapserver.log.entry import Applied
 from mapweave.mapserver.log.postgres_store import PostgresStore
-from mapweave.mapserver.log.store import EVERYTHING, News, Run
+from mapweave.mapserver.log.store import EVERYTHING, LogChanges, News
 from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
 from synthetic.postgres_server import PostgresServer
 from tests.mapserver.log.test_store import MAP, entry
@@ -94,7 +94,7 @@ def test_a_pooler_that_begins_to_pool_transactions_is_noticed(postgres: Postgres
             nonlocal acknowledged
             for store in stores:
                 assert not all(one.leads for one in stores)
-                (result,) = store.apply_all([Run(MAP, 5, [entry(acknowledged + 1)])])
+                (result,) = store.apply_all([LogChanges(MAP, 5, [entry(acknowledged + 1)])])
                 if isinstance(result, Applied):
                     acknowledged = result.watermark
                 else:

@@ -20,7 +20,7 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.mapserver.log import postgres_name
 from mapweave.mapserver.log.entry import Applied
 from mapweave.mapserver.log.postgres_store import PostgresStore
-from mapweave.mapserver.log.store import Run
+from mapweave.mapserver.log.store import LogChanges
 from synthetic.postgres_server import ROLE, PostgresServer
 from tests.mapserver.log.test_store import MAP, entry
 from tests.pgbouncer import pooled
@@ -168,7 +168,7 @@ def first_applied(store: PostgresStore, sequence: int) -> int:
     results: list[Applied] = []
 
     def taken() -> bool:
-        (result,) = store.apply_all([Run(MAP, 5, [entry(sequence)])])
+        (result,) = store.apply_all([LogChanges(MAP, 5, [entry(sequence)])])
         results.extend([result] if isinstance(result, Applied) else [])
         return bool(results)
 
@@ -191,15 +191,15 @@ def test_a_server_whose_name_another_has_taken_meanwhile_acknowledges_nothing_mo
         with pytest.raises(InvalidFile, match="took this name"):
             displaced.watermark(MAP)
     for _ in range(3):
-        (result,) = displaced.apply_all([Run(MAP, 5, [entry(2)])])
+        (result,) = displaced.apply_all([LogChanges(MAP, 5, [entry(2)])])
         assert isinstance(result, InvalidFile)
-    eventually(lambda: displaced.apply_all([Run(MAP, 5, [entry(2)])]) and displaced.displaced)
+    eventually(lambda: displaced.apply_all([LogChanges(MAP, 5, [entry(2)])]) and displaced.displaced)
     assert f"(process {process.pid} on " in displaced.displaced and "\n" not in displaced.displaced
     end(process)
     monkeypatch.undo()
     # For good: the name may be another's by then.
     for _ in range(3):
-        (result,) = displaced.apply_all([Run(MAP, 5, [entry(2)])])
+        (result,) = displaced.apply_all([LogChanges(MAP, 5, [entry(2)])])
         assert str(result) == displaced.displaced
     with pytest.raises(InvalidFile, match="took this name"):
         displaced.watermark(MAP)

@@ -22,10 +22,10 @@ from mapweave.cli import main
 from mapweave.hybridmap.change import Change, ChangeBody, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue, MapweaveError
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
-from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.entry import Applied, ReceivedChange
 from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.postgres_store import PostgresStore
-from mapweave.mapserver.log.store import Run, Store
+from mapweave.mapserver.log.store import LogChanges, Store
 from mapweave.wire.codec import encode_body, encode_change
 from synthetic.postgres_server import PostgresServer, binaries
 from tests.mapserver.log.test_store import MAP, OTHER, broken, edge_put, entry, node_put
@@ -39,22 +39,24 @@ BODIES: list[ChangeBody] = [
 FOREIGN: list[ChangeBody] = [node_put(1, 2, OTHER), NodeRetired(NodeId(*OTHER, 1))]
 
 
-def entries(map_id: MapId, first: int, picks: list[int]) -> list[Entry]:
+def entries(map_id: MapId, first: int, picks: list[int]) -> list[ReceivedChange]:
     """Changes from a place in a log on; some are broken."""
     bodies = BODIES if map_id == MAP else FOREIGN
     made = []
     for sequence, pick in enumerate(picks, first):
         if pick >= len(bodies):
-            made.append(Entry.read(map_id, sequence, b"\xc1\0\xff"))
+            made.append(ReceivedChange.read(map_id, sequence, b"\xc1\0\xff"))
         else:
             made.append(
-                Entry.read(map_id, sequence, encode_change(Change(map_id, sequence, 7, bodies[pick])))
+                ReceivedChange.read(
+                    map_id, sequence, encode_change(Change(map_id, sequence, 7, bodies[pick]))
+                )
             )
     return made
 
 
 RUNS = st.builds(
-    lambda map_id, log_id, first, picks, gap: Run(
+    lambda map_id, log_id, first, picks, gap: LogChanges(
         map_id, log_id, entries(map_id, first, picks), None if gap is None else first + len(picks) + gap
     ),
     st.sampled_from([MAP, OTHER]), st.sampled_from([5, 5, 5, 2**64 - 1]), st.integers(1, 12),
@@ -101,7 +103,7 @@ def test_both_stores_give_the_same_for_the_same(
             self.stores = [open_store(self.folder / "s"), open_store(address)]
 
         @rule(runs=st.lists(RUNS, max_size=3))
-        def apply(self, runs: list[Run]) -> None:
+        def apply(self, runs: list[LogChanges]) -> None:
             one, other = ([*map(seen, store.apply_all(runs))] for store in self.stores)
             assert one == other
 
@@ -175,7 +177,9 @@ def test_two_servers_share_a_store(postgres: PostgresServer) -> None:
 
     def write(store: PostgresStore, maps: list[MapId]) -> None:
         for first in range(1, 16):
-            done.append(store.apply_all([Run(m, 5, entries(m, first, [0, 1]), first + 1) for m in maps]))
+            done.append(
+                store.apply_all([LogChanges(m, 5, entries(m, first, [0, 1]), first + 1) for m in maps])
+            )
             store.add_constraint(b"%d" % first)
 
     # In opposite orders: neither may wait for the other for ever.
@@ -206,11 +210,13 @@ def test_it_goes_on_when_postgresql_is_back(caplog: pytest.LogCaptureFixture) ->
         assert "\n" not in str(away.value) and "the map store cannot be used" in str(away.value)
         with pytest.raises(InvalidFile, match="the map store cannot be used"):
             store.watermark(MAP)
-        assert [str(one) for one in store.apply_all([Run(MAP, 5, [entry(2)])] * 2)], "each has its error"
+        assert [str(one) for one in store.apply_all([LogChanges(MAP, 5, [entry(2)])] * 2)], (
+            "each has its error"
+        )
         server.start()
 
         def taken() -> bool:
-            (result,) = store.apply_all([Run(MAP, 5, [entry(1), entry(2)])])
+            (result,) = store.apply_all([LogChanges(MAP, 5, [entry(1), entry(2)])])
             return isinstance(result, Applied)
 
         eventually(taken)
@@ -235,7 +241,7 @@ def test_a_commit_that_no_standby_confirms_is_none(postgres: PostgresServer) -> 
             def write() -> None:
                 # The setting is in force a little later.
                 while all(isinstance(result, Applied) for result in results):
-                    results.extend(store.apply_all([Run(MAP, 5, [entry(2 + len(results))])]))
+                    results.extend(store.apply_all([LogChanges(MAP, 5, [entry(2 + len(results))])]))
 
             writer = threading.Thread(target=write)
             writer.start()
@@ -248,7 +254,7 @@ def test_a_commit_that_no_standby_confirms_is_none(postgres: PostgresServer) -> 
         finally:
             people.execute("ALTER SYSTEM RESET synchronous_standby_names")
             people.execute("SELECT pg_reload_conf()")
-    again = Run(MAP, 5, [entry(1 + len(results))])
+    again = LogChanges(MAP, 5, [entry(1 + len(results))])
     eventually(lambda: isinstance(store.apply_all([again])[0], Applied))
     store.close()
 
@@ -325,7 +331,7 @@ def test_a_store_that_was_restored_in_part_is_refused(postgres: PostgresServer, 
 
 def test_texts_that_postgresql_does_not_take(postgres: PostgresServer) -> None:
     store = PostgresStore(postgres.database())
-    refused = Entry(1, b"", "a reason with \0 and \udcff")
+    refused = ReceivedChange(1, b"", "a reason with \0 and \udcff")
     assert store.apply(MAP, 5, [refused, broken(2)]).watermark == 2
     assert store.refusals(MAP)[0].reason == "a reason with \ufffd and ?"
     store.close()

@@ -20,13 +20,13 @@ from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log import sql_store, sqlite_store
-from mapweave.mapserver.log.entry import Applied, Entry
+from mapweave.mapserver.log.entry import Applied, ReceivedChange
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.sql_sizes import SqlSizes
 from mapweave.mapserver.log.sqlite_store import SqliteStore
-from mapweave.mapserver.log.store import ROW_BYTES, Run, Store
+from mapweave.mapserver.log.store import ROW_BYTES, LogChanges, Store
 from mapweave.wire.codec import encode_body, encode_change
 from mapweave.wire.log_messages import Refusal
 from synthetic.postgres_server import PostgresServer
@@ -50,13 +50,13 @@ def edge_put(number: int, a: int, b: int, shared: list[tuple[int, int]] | None =
     return EdgePut(Edge(NodeId(*MAP, number), *ends, HERE, EdgeKind.LOOP, pairs))
 
 
-def entry(sequence: int, body: ChangeBody | None = None) -> Entry:
+def entry(sequence: int, body: ChangeBody | None = None) -> ReceivedChange:
     change = Change(MAP, sequence, 7, body or NodeRetired(NodeId(*MAP, sequence)))
-    return Entry.read(MAP, sequence, encode_change(change))
+    return ReceivedChange.read(MAP, sequence, encode_change(change))
 
 
-def broken(sequence: int) -> Entry:
-    return Entry.read(MAP, sequence, b"\xc1garbage")
+def broken(sequence: int) -> ReceivedChange:
+    return ReceivedChange.read(MAP, sequence, b"\xc1garbage")
 
 
 @pytest.fixture(params=["sqlite", "postgres"])
@@ -138,7 +138,7 @@ def test_only_the_newest_refusals_are_given(store: Store) -> None:
 )
 def test_a_change_must_match_its_log(claimed: MapId, sequence: int) -> None:
     message = encode_change(Change(MAP, 1, 0, NodeRetired(NodeId(*MAP, 1))))
-    read = Entry.read(claimed, sequence, message)
+    read = ReceivedChange.read(claimed, sequence, message)
     assert isinstance(read.change, str)
     assert "came as" in read.change
 
@@ -152,13 +152,13 @@ def test_another_log_of_the_same_name_is_refused(store: Store) -> None:
 
 def test_many_logs_in_one_transaction(store: Store) -> None:
     store.apply(MAP, 5, [entry(1)])
-    foreign = Entry.read(OTHER, 1, encode_change(Change(OTHER, 1, 0, node_put(1, 10, OTHER))))
+    foreign = ReceivedChange.read(OTHER, 1, encode_change(Change(OTHER, 1, 0, node_put(1, 10, OTHER))))
     taken, other, mine, again = store.apply_all(
         [
-            Run(MAP, 6, [entry(2)]),
-            Run(OTHER, 7, [foreign]),
-            Run(MAP, 5, [entry(1), entry(2)]),
-            Run(MAP, 5, [entry(2), broken(3), entry(9)]),
+            LogChanges(MAP, 6, [entry(2)]),
+            LogChanges(OTHER, 7, [foreign]),
+            LogChanges(MAP, 5, [entry(1), entry(2)]),
+            LogChanges(MAP, 5, [entry(2), broken(3), entry(9)]),
         ]
     )
     assert isinstance(taken, InvalidValue) and "another log goes by the name r0.1" in str(taken)
@@ -231,7 +231,9 @@ def test_a_transaction_that_fails_leaves_nothing(store: Store) -> None:
     with pytest.raises(InvalidFile, match="disk is full"):
         store.apply(MAP, 5, [entry(2), broken(3), entry(4)])
     third = MapId("r2", 1)
-    results = store.apply_all([Run(OTHER, 9, [], 4), Run(MAP, 5, [entry(4)], 4), Run(third, 9, [], 4)])
+    results = store.apply_all(
+        [LogChanges(OTHER, 9, [], 4), LogChanges(MAP, 5, [entry(4)], 4), LogChanges(third, 9, [], 4)]
+    )
     assert [(type(one), "disk is full" in str(one)) for one in results] == [(InvalidFile, True)] * 3
     assert (store.watermark(MAP), store.refused(), sequences(store)) == (1, 0, [1])
     assert store.maps() == [MAP], "nothing of the other runs either"
@@ -255,7 +257,9 @@ def test_what_is_pruned_is_gone_and_is_not_taken_again(
     ]
     log = [entry(k + 1, body) for k, body in enumerate(bodies)]
     store.apply(MAP, 5, log)
-    store.apply(OTHER, 6, [Entry.read(OTHER, 1, encode_change(Change(OTHER, 1, 7, node_put(1, 4, OTHER))))])
+    store.apply(
+        OTHER, 6, [ReceivedChange.read(OTHER, 1, encode_change(Change(OTHER, 1, 7, node_put(1, 4, OTHER))))]
+    )
     edges = [EdgeId(*MAP, k) for k in (11, 12)]
     with monkeypatch.context() as patch, pytest.raises(InvalidFile, match="full"):
         patch.setattr(store, "_put", refuse)
@@ -341,7 +345,7 @@ def test_the_wire_bytes_of_the_maps(store: Store) -> None:
     assert store.traffic(OTHER).node_puts == 0
     assert store.traffic() == traffic
     second = encode_change(Change(OTHER, 1, 0, node_put(1, 10, OTHER)))
-    store.apply(OTHER, 5, [Entry.read(OTHER, 1, second)])
+    store.apply(OTHER, 5, [ReceivedChange.read(OTHER, 1, second)])
     assert store.traffic().nodes == 3
     assert store.traffic().payload_bytes == sum(sizes) + len(second)
 
@@ -376,7 +380,9 @@ def test_what_later_changes_supersede_is_compacted(place: Path | str) -> None:
     store = open_store(place)
     log = [entry(sequence, body) for sequence, body in enumerate(bodies, 1)]
     store.apply(MAP, 5, log)
-    store.apply(OTHER, 5, [Entry.read(OTHER, 1, encode_change(Change(OTHER, 1, 7, node_put(1, 4, OTHER))))])
+    store.apply(
+        OTHER, 5, [ReceivedChange.read(OTHER, 1, encode_change(Change(OTHER, 1, 7, node_put(1, 4, OTHER))))]
+    )
     before, size = contents(store), store.stored_bytes(MAP, 0, 14)
     assert size == sum(len(one.message) + ROW_BYTES for one in log)
     assert store.stored_bytes(MAP, 3, 13) == sum(len(one.message) + ROW_BYTES for one in log[3:13])
@@ -444,8 +450,8 @@ def test_what_is_remembered_of_nodes_is_what_the_rows_say(
         for count, (kind, map_id, number) in enumerate(steps, 1):
             put = node_put(number, count, map_id)
             last = store.watermark(map_id)
-            coming = Entry.read(map_id, last + 1, encode_change(Change(map_id, last + 1, 7, put)))
-            run = Run(map_id, log_ids[map_id], [coming])
+            coming = ReceivedChange.read(map_id, last + 1, encode_change(Change(map_id, last + 1, 7, put)))
+            run = LogChanges(map_id, log_ids[map_id], [coming])
             if kind <= 1:
                 assert not isinstance(store.apply_all([run])[0], MapweaveError)
             elif kind == 2:

@@ -20,9 +20,9 @@ from mapweave.merge.outlier_rejection import wrong_geometry
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdict
 from mapweave.scenarios.liar import lies
-from mapweave.scenarios.liar.lies import Setting, bodies
+from mapweave.scenarios.liar.lies import LieInputs, bodies
 from mapweave.wire.codec import decode_change
-from synthetic.wrong_geometry import ODD, SCENES, Fault, draw_fleet
+from synthetic.wrong_geometry import ODD, SCENES, OdometryFault, draw_fleet
 from tests.quick import first_quick
 
 SEED = 3
@@ -41,12 +41,12 @@ def compare(pairs: Sequence[tuple[Node, Node]]) -> Iterator[Verdict]:
 @cache
 def record(way: str) -> Record:
     """Three robots and one that lies; each puts a node again, and gives one up."""
-    fleet = draw_fleet(SEED, SCENES["room"], Fault.NONE, stops=1, views=5)
+    fleet = draw_fleet(SEED, SCENES["room"], OdometryFault.NONE, stops=1, views=5)
     sound = {map_id: content for map_id, content in fleet.maps.items() if map_id != ODD}
     rng = np.random.default_rng(SEED)
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lies, "EPOCHS", 8)
-        lie = lies.EVERY[way](Setting(ODD, fleet.maps[ODD], sound, rng))
+        lie = lies.EVERY[way](LieInputs(ODD, fleet.maps[ODD], sound, rng))
     logs = {map_id: bodies(content) for map_id, content in sound.items()}
     logs |= {map_id: [decode_change(message).body for message in log] for map_id, log in lie.logs.items()}
     out: dict[MapId, list[ChangeBody]] = {}

@@ -20,14 +20,14 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.pruned_node import PrunedNode, PrunedNodes
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.map_files import map_file_of, merged_of
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.pruning import DAY_NS, PrunePlan, Pruning
 from mapweave.mapserver.merging.pruning_record import PruningRecord
-from mapweave.mapserver.places import Places
+from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.routes import Router
 from mapweave.merge.pose_graph.marginalization import is_marginal
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -76,7 +76,7 @@ class Server:
 
     def take(self, changes: list[Change]) -> None:
         map_id = changes[0].map
-        entries = [Entry.read(map_id, one.sequence, encode_change(one)) for one in changes]
+        entries = [ReceivedChange.read(map_id, one.sequence, encode_change(one)) for one in changes]
         for change in self.store.apply(map_id, 5, entries).changes:
             self.merger.on_change(change)
 
@@ -155,7 +155,7 @@ def test_words_name_what_replaces_it(pruned: tuple[MergedMap, MergedMap, Server]
     by = before.superseded[node].by
     with pytest.raises(InvalidValue, match=f"{node} left the map on 2023-11-29 .* UTC: {by} replaces it"):
         after.check(node)
-    found = Places(Router(after), Annotations()).resolve(str(node))
+    found = PlaceResolver(Router(after), Annotations()).resolve(str(node))
     assert found.node == by and str(node) in found.note
 
 

@@ -15,7 +15,7 @@ import pytest
 from mapweave.agent.replication.merged_poses import MergedPoses
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.ids import NodeId
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.store import PRUNING, PRUNING_MARK, News, Store
 from mapweave.mapserver.merge_worker import MergeWorker
@@ -74,7 +74,7 @@ class Front(Server):
 
 def send(store: Store, changes: list[Change]) -> None:
     map_id = changes[0].map
-    store.apply(map_id, 5, [Entry.read(map_id, one.sequence, encode_change(one)) for one in changes])
+    store.apply(map_id, 5, [ReceivedChange.read(map_id, one.sequence, encode_change(one)) for one in changes])
 
 
 def ends(put: EdgePut) -> tuple[NodeId, NodeId]:
@@ -198,7 +198,7 @@ def test_what_postgresql_has_lost_again_returns(
     ]
     for change in put:
         list(leader.store.restore(change.map, change.sequence, change.sequence, [
-            Entry.read(change.map, change.sequence, encode_change(change))
+            ReceivedChange.read(change.map, change.sequence, encode_change(change))
         ]))  # fmt: skip
     for name, value in record.items():
         assert value is not None

@@ -16,8 +16,8 @@ from synthetic.wrong_geometry import (
     ODD,
     SCENES,
     AnswerOutcome,
-    Fault,
-    Fleet,
+    FaultyFleet,
+    OdometryFault,
     draw_fleet,
     judged,
     lost_views,
@@ -27,7 +27,7 @@ from synthetic.wrong_geometry import (
 SEED, QUESTIONS = 21, 16
 
 
-def answer_outcomes(merger: Merger, fleet: Fleet, scene: str) -> Counter[AnswerOutcome]:
+def answer_outcomes(merger: Merger, fleet: FaultyFleet, scene: str) -> Counter[AnswerOutcome]:
     """Answers to robots that are lost in the house."""
     answers = Answers.of(merger, merger.merged(), merger.node)
     views = lost_views(fleet, SCENES[scene], QUESTIONS, SEED)
@@ -36,7 +36,7 @@ def answer_outcomes(merger: Merger, fleet: Fleet, scene: str) -> Counter[AnswerO
 
 @pytest.mark.slow
 def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
-    fleet = draw_fleet(SEED, SCENES["room"], Fault.SLIP, stops=2)
+    fleet = draw_fleet(SEED, SCENES["room"], OdometryFault.SLIP, stops=2)
     alone = answer_outcomes(merged_fleet(fleet, frozenset({ODD})), fleet, "room")
     merger, history = merged_fleet(fleet), MapHistory()
     merged = merger.merged()
@@ -66,7 +66,7 @@ def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
 @pytest.mark.slow
 def test_a_correct_map_of_a_similar_room_is_not_wrong() -> None:
     """The fourth robot knows the twin of a room that the others know, and it is sound."""
-    fleet = draw_fleet(SEED, SCENES["twins"], Fault.NONE, stops=2)
+    fleet = draw_fleet(SEED, SCENES["twins"], OdometryFault.NONE, stops=2)
     merger = merged_fleet(fleet)
     assert not merger.merged().wrong
     assert not answer_outcomes(merger, fleet, "twins")[AnswerOutcome.WRONG]

@@ -17,7 +17,7 @@ from mapweave.mapserver.merge_worker import PREPARED_AT_ONCE, MergeWorker
 from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.relocalization.aliased_landmarks import between
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegionSettings
-from mapweave.mapserver.relocalization.candidates import Candidates
+from mapweave.mapserver.relocalization.candidates import RetrievedNodes
 from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch
 from mapweave.mapserver.relocalization.relocalizer import RelocalizationSettings, Relocalizer
 from mapweave.mapserver.relocalization.view_registration import Registration
@@ -25,7 +25,7 @@ from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.mapserver.retrieval.ranking import Ranked
 from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule, Schedule
 from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
 from mapweave.registration.recognition import RecognitionSettings, recognise
 from synthetic.world import room, take_node, take_view
@@ -63,7 +63,7 @@ def joined(nodes: Sequence[Node]) -> MergedMap:
     first, *others = nodes
     start = first.map_from_robot.mean
     ways = [PoseGaussian.from_sigmas(start.inverse() @ one.map_from_robot.mean, 0.01, 0.01) for one in others]
-    measured = [Measurement(first.id, one.id, way) for one, way in zip(others, ways, strict=True)]
+    measured = [RelativePose(first.id, one.id, way) for one, way in zip(others, ways, strict=True)]
     graph = solve_graph(first.id, start, measured)
     poses = {node: Placement(0, pose) for node, pose in graph.poses().items()}
     return MergedMap({}, (), (), (frozenset(poses),), poses, (graph,))
@@ -189,7 +189,7 @@ def concluded(
     service: Relocalizer, recognised: NodeMatch, ranked: list[tuple[NodeId, float]]
 ) -> RelocalizeAnswer:
     matches = service.registration.refined(VIEW, [recognised])
-    return service.conclude(Registration(Candidates(VIEW, ranked), matches))
+    return service.conclude(Registration(RetrievedNodes(VIEW, ranked), matches))
 
 
 def test_maps_that_are_not_merged_have_their_own_frames() -> None:

@@ -13,13 +13,20 @@ from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.scenarios.recording import Fix, Lost, Moment, Recording, RobotRecord, Trajectory
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.scenarios.recording import (
+    Lost,
+    RecordedLocalization,
+    RobotRecord,
+    TrialEvent,
+    TrialRecording,
+    TrialTrajectory,
+)
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 from mapweave.storage.map_file import MapFile
 
 TICK_NS = 100_000_000
 span = Rectangle.spanning
-PLAN = FloorPlan(
+PLAN = BuildingPlan(
     rooms=(
         span(0, 0, 12, 2, "corridor"), span(0, 2.2, 5.9, 6, "room 0"), span(6.1, 2.2, 12, 6, "room 1"),
         span(2, 2, 3, 2.2, "door 0"), span(9, 2, 10, 2.2, "door 1"),
@@ -44,11 +51,11 @@ class Staged:
     """
 
     noise: float
-    truth: dict[str, Trajectory] = field(default_factory=dict)
+    truth: dict[str, TrialTrajectory] = field(default_factory=dict)
     nodes: dict[NodeId, tuple[int, Pose2, int]] = field(default_factory=dict)
     edges: list[Edge] = field(default_factory=list)
     lost: list[Lost] = field(default_factory=list)
-    moments: list[Moment] = field(default_factory=list)
+    moments: list[TrialEvent] = field(default_factory=list)
 
     def pose(self, robot: str, tick: int) -> Pose2:
         """Where a robot truly was."""
@@ -76,7 +83,7 @@ class Staged:
         """The true `a_from_b`."""
         return self.true_pose(a).inverse() @ self.true_pose(b)
 
-    def recording(self, seed: int = 3, sim_s: float = 60.0, wall_s: float = 15.0) -> Recording:
+    def recording(self, seed: int = 3, sim_s: float = 60.0, wall_s: float = 15.0) -> TrialRecording:
         """All of it."""
         rng = np.random.default_rng(5)
         robots = {}
@@ -84,7 +91,7 @@ class Staged:
             map_from_world = Pose2(1.0 + k, -2.0, 0.7 * k).inverse()
             poses = np.array([(map_from_world @ Pose2.from_vector(p)).vector for p in truth.poses[10:400]])
             poses += rng.normal(0.0, 1.0, poses.shape) * [self.noise, self.noise, self.noise]
-            estimates = {MapId(name, 1): Trajectory(truth.stamps_ns[10:400], poses)}
+            estimates = {MapId(name, 1): TrialTrajectory(truth.stamps_ns[10:400], poses)}
             robots[name] = RobotRecord(truth, estimates, k, 1000 * (k + 1), 5000 * (k + 1), 0, f"{k:064x}")
         changes = [
             NodePut(Node(n, stamp, PoseGaussian.from_sigmas(p, 0.1, 0.1), CAMERA, Landmarks.empty()))
@@ -92,7 +99,7 @@ class Staged:
         ] + [EdgePut(edge) for edge in self.edges]
         placements = {n: (c, PoseGaussian.from_sigmas(p, 0.1, 0.1)) for n, (c, p, _) in self.nodes.items()}
         merged = MapFile("merged", "a merged map", tuple(changes), placements)
-        return Recording(
+        return TrialRecording(
             "staged", seed, robots, PLAN, merged, tuple(self.lost), tuple(self.moments), (), sim_s, wall_s,
             {"render": 4.0, "physics": 2.0},
         )  # fmt: skip
@@ -101,13 +108,13 @@ class Staged:
 CAMERA = Camera(width=320, height=240, fx=277.0, fy=277.0, cx=159.5, cy=119.5, mount_height=0.3)
 
 
-def drive(centre: tuple[float, float], phase: float, ticks: int = 600) -> Trajectory:
+def drive(centre: tuple[float, float], phase: float, ticks: int = 600) -> TrialTrajectory:
     """Rounds of a corridor-sized oval, a new one every 30 s, with a slow turn of the whole."""
     t = np.arange(ticks) / 10.0
     angle = phase + t * math.tau / 30.0
     x, y = centre[0] + 1.6 * np.cos(angle), centre[1] + 0.7 * np.sin(angle)
     heading = np.arctan2(np.gradient(y), np.gradient(x))
-    return Trajectory(np.arange(ticks, dtype=np.int64) * TICK_NS, np.stack([x, y, heading], axis=1))
+    return TrialTrajectory(np.arange(ticks, dtype=np.int64) * TICK_NS, np.stack([x, y, heading], axis=1))
 
 
 def stage() -> Staged:
@@ -150,15 +157,15 @@ def stage_events(staged: Staged) -> Staged:
             420 * TICK_NS,
             put,
             goal,
-            Fix(450 * TICK_NS, known, answer),
+            RecordedLocalization(450 * TICK_NS, known, answer),
             580 * TICK_NS,
             None,
             4,
         )
     )
     staged.moments += [
-        Moment(200 * TICK_NS, "the network of r2 is cut | for a while"),
-        Moment(420 * TICK_NS, "r1 is put down at (7.50, 3.00)"),
+        TrialEvent(200 * TICK_NS, "the network of r2 is cut | for a while"),
+        TrialEvent(420 * TICK_NS, "r1 is put down at (7.50, 3.00)"),
     ]
     return staged
 

@@ -9,16 +9,16 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.scenarios.coverage import REACH, explored_share, longest_loop
-from mapweave.scenarios.recording import Trajectory
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.scenarios.recording import TrialTrajectory
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 
-HALL = FloorPlan((Rectangle.spanning(0, 0, 8, 4, "hall"),), ())
-HALVES = FloorPlan(
+HALL = BuildingPlan((Rectangle.spanning(0, 0, 8, 4, "hall"),), ())
+HALVES = BuildingPlan(
     (Rectangle.spanning(0, 0, 8, 4, "hall"),), (Rectangle.spanning(3.9, 0.0, 4.1, 4.0, "wall"),)
 )
 
 
-def brute(plan: FloorPlan, places: np.ndarray) -> float:
+def brute(plan: BuildingPlan, places: np.ndarray) -> float:
     """Every tenth of a metre, and every node, one by one; walls by walking along the line."""
     near = total = 0
     for x in np.arange(0.05, 8, 0.1):
@@ -39,7 +39,7 @@ def test_nothing_and_everything():
     assert explored_share(HALL, np.zeros((0, 2))) == 0.0
     grid = np.stack(np.meshgrid(np.arange(0.5, 8, 1.0), np.arange(0.5, 4, 1.0)), axis=-1).reshape(-1, 2)
     assert explored_share(HALL, grid) == 1.0
-    solid = FloorPlan(HALL.rooms, (Rectangle.spanning(0, 0, 8, 4),))
+    solid = BuildingPlan(HALL.rooms, (Rectangle.spanning(0, 0, 8, 4),))
     assert explored_share(solid, grid) is None
 
 
@@ -59,7 +59,7 @@ def test_a_wall_hides():
     assert explored_share(HALVES, both) < 0.75 * explored_share(HALL, both)
 
 
-def square_drive() -> Trajectory:
+def square_drive() -> TrialTrajectory:
     """Once around a square of 5 m, 0.1 m a tick, and back at the start."""
     side = np.arange(0, 5, 0.1)
     zero, full = np.zeros_like(side), np.full_like(side, 5.0)
@@ -68,7 +68,7 @@ def square_drive() -> Trajectory:
     )
     xy = np.vstack([xy, [0.0, 0.0]])
     stamps = np.arange(len(xy), dtype=np.int64) * 100_000_000
-    return Trajectory(stamps, np.column_stack([xy, np.zeros(len(xy))]))
+    return TrialTrajectory(stamps, np.column_stack([xy, np.zeros(len(xy))]))
 
 
 def test_the_odometry_of_a_loop_is_that_of_the_drive():

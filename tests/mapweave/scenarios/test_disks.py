@@ -11,7 +11,7 @@ from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.mapserver.log.entry import Entry
+from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.scenarios.disks import map_hash, read_disks
@@ -56,7 +56,7 @@ def disks(tmp_path):
 
 
 def fill(store: Store, log_id: int, entries):
-    store.apply(MAP, log_id, [Entry.read(MAP, sequence, message) for sequence, message in entries])
+    store.apply(MAP, log_id, [ReceivedChange.read(MAP, sequence, message) for sequence, message in entries])
 
 
 def test_everything_is_there(disks):

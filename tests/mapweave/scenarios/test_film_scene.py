@@ -15,10 +15,10 @@ from mapweave.drawing.map_picture import COLOURS, colours_of
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.film_frame import ACTOR, FLOOR, NO_IMAGE, PAPER, SOLID, FilmFrame, lay_out
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 from mapweave.sim.snapshot import Snapshot
 
-PLAN = FloorPlan(
+PLAN = BuildingPlan(
     (Rectangle.spanning(0, 0, 8, 4, "hall"),),
     (
         Rectangle.spanning(-0.2, -0.2, 8.2, 0), Rectangle.spanning(-0.2, 4, 8.2, 4.2),

@@ -21,10 +21,10 @@ from mapweave.scenarios.kidnap_planning import (
     NothingToShow,
     plan_kidnapping,
 )
-from mapweave.sim.floorplan import FloorPlan, Rectangle
+from mapweave.sim.floorplan import BuildingPlan, Rectangle
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
-PLAN = FloorPlan(
+PLAN = BuildingPlan(
     (
         Rectangle.spanning(0, 2, 4, 6, "room 0"),
         Rectangle.spanning(4, 2, 8, 6, "room 1"),
@@ -147,7 +147,7 @@ def test_nodes_without_truth_play_no_part():
 
 def test_a_goal_that_the_others_cut_off_is_none():
     """r0 is in the only gap between the two halves of a hall: no robot is sent through it."""
-    hall = FloorPlan(
+    hall = BuildingPlan(
         (
             Rectangle.spanning(0, 0, 4, 4, "room 0"),
             Rectangle.spanning(4, 0, 8, 4, "room 1"),
@@ -166,7 +166,9 @@ def test_a_goal_that_the_others_cut_off_is_none():
 
 def test_a_goal_whose_only_mapped_way_is_blocked_is_not_chosen():
     """There is room to drive around a robot on the way, but it is not mapped."""
-    hall = FloorPlan((Rectangle.spanning(0, 0, 4, 6, "room 0"), Rectangle.spanning(4, 0, 8, 6, "room 1")), ())
+    hall = BuildingPlan(
+        (Rectangle.spanning(0, 0, 4, 6, "room 0"), Rectangle.spanning(4, 0, 8, 6, "room 1")), ()
+    )
     merged, components, truth = a_map({"r0": [(1, 3)], "r1": [(5, 3), (7, 3)]})
     aside = {"r0": Pose2(1, 1), "r1": Pose2(7, 1)}
     assert plan_kidnapping(merged, components, truth, hall, ("r0",), aside, 3).goal.agent == "r0"

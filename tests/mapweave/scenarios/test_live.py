@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.errors import SettingsError
-from mapweave.scenarios.live import Live
+from mapweave.scenarios.live import LiveFilm
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.waiting import eventually
 
@@ -32,15 +32,15 @@ def level(jpeg: bytes) -> float:
 
 @pytest.fixture
 def live():
-    with Live(0, "twins <b>") as live:
+    with LiveFilm(0, "twins <b>") as live:
         yield live
 
 
-def connect(live: Live) -> http.client.HTTPConnection:
+def connect(live: LiveFilm) -> http.client.HTTPConnection:
     return http.client.HTTPConnection(urlsplit(live.url).netloc, timeout=10)
 
 
-def get(live: Live, path: str) -> tuple[int, str, bytes]:
+def get(live: LiveFilm, path: str) -> tuple[int, str, bytes]:
     connection = connect(live)
     connection.request("GET", path)
     answer = connection.getresponse()
@@ -62,7 +62,7 @@ def next_part(answer: http.client.HTTPResponse) -> bytes | None:
     return answer.read(int(headers["Content-Length"]))
 
 
-def watch(live: Live) -> http.client.HTTPResponse:
+def watch(live: LiveFilm) -> http.client.HTTPResponse:
     connection = connect(live)
     connection.request("GET", "/stream")
     answer = connection.getresponse()
@@ -143,20 +143,20 @@ def test_a_port_in_use_is_reported_in_one_line(live):
     port = urlsplit(live.url).port
     for bad, words in ((port, "the port is taken"), (70000, "must be 0-65535")):
         with pytest.raises(SettingsError) as refusal:
-            Live(bad)
+            LiveFilm(bad)
         assert f"cannot use port {bad}" in str(refusal.value)
         assert words in str(refusal.value)
         assert "\n" not in str(refusal.value)
 
 
 def test_closing_frees_the_port_and_ends_the_threads():
-    live = Live(0)
+    live = LiveFilm(0)
     live.show(frame(1))
     viewer = watch(live)
     next_part(viewer)
     live.close()
     assert next_part(viewer) is None
-    with Live(urlsplit(live.url).port) as again:
+    with LiveFilm(urlsplit(live.url).port) as again:
         assert again.url == live.url
     eventually(lambda: not any(t.name == "live" for t in threading.enumerate()))
 
@@ -186,7 +186,7 @@ def test_without_the_http_extra_its_name_is_printed(monkeypatch):
     monkeypatch.setitem(sys.modules, "uvicorn", None)
     monkeypatch.setitem(sys.modules, "starlette", None)
     with pytest.raises(SettingsError, match=re.escape("pip install 'mapweave[server]'")) as refusal:
-        Live(0)
+        LiveFilm(0)
     assert "\n" not in str(refusal.value)
 
 

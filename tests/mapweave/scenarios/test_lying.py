@@ -13,12 +13,12 @@ from mapweave.hybridmap.errors import SettingsError
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.mapserver.log.entry import Entry
-from mapweave.scenarios.actions import Lie, parse_action
+from mapweave.mapserver.log.entry import ReceivedChange
+from mapweave.scenarios.actions import TryLies, parse_action
 from mapweave.scenarios.figures import kinds
-from mapweave.scenarios.liar.lies import EVERY, UNDECIDABLE, WAYS, Setting, bodies, honest
+from mapweave.scenarios.liar.lies import EVERY, UNDECIDABLE, WAYS, LieInputs, bodies, honest
 from mapweave.scenarios.liar.served import accusing
-from mapweave.scenarios.liar.trial import Outcome, row
+from mapweave.scenarios.liar.trial import ContainmentOutcome, row
 from mapweave.scenarios.lying import Lies
 from synthetic.world import room, take_map
 
@@ -31,7 +31,7 @@ REFUSED = {
 
 
 @pytest.fixture(scope="module")
-def setting() -> Setting:
+def setting() -> LieInputs:
     """Maps of three robots; the one that lies has closed a loop, too."""
     rng = np.random.default_rng(1)
     world = room(0.0, 0.0, 6.0, 5.0, 400, rng)
@@ -45,10 +45,10 @@ def setting() -> Setting:
         edges[0].id._replace(number=1000), ends[0].id, ends[1].id,
         PoseGaussian.from_sigmas(tour[0].inverse() @ tour[-1], 0.1, 0.1), EdgeKind.LOOP, shared,
     )  # fmt: skip
-    return Setting(LIAR, (nodes, [loop, *edges]), maps, rng)
+    return LieInputs(LIAR, (nodes, [loop, *edges]), maps, rng)
 
 
-def test_a_map_is_sent_in_the_order_of_its_drive(setting: Setting) -> None:
+def test_a_map_is_sent_in_the_order_of_its_drive(setting: LieInputs) -> None:
     sent = bodies(setting.own)
     known = set()
     for body in sent:
@@ -62,11 +62,11 @@ def test_a_map_is_sent_in_the_order_of_its_drive(setting: Setting) -> None:
 
 
 @pytest.mark.parametrize("name", ["honest", *EVERY])
-def test_each_way_is_of_legal_messages_and_differs_from_the_truth(name: str, setting: Setting) -> None:
+def test_each_way_is_of_legal_messages_and_differs_from_the_truth(name: str, setting: LieInputs) -> None:
     way = {**EVERY, "honest": honest}[name]
     sent = way(setting)
     read = [
-        Entry.read(map_id, k, message)
+        ReceivedChange.read(map_id, k, message)
         for map_id, log in sent.logs.items()
         for k, message in enumerate(log, start=1)
     ]
@@ -79,7 +79,7 @@ def test_each_way_is_of_legal_messages_and_differs_from_the_truth(name: str, set
 
 def test_an_event_names_its_ways() -> None:
     action = parse_action("lie", {"robot": "r3", "ways": ["copied places"], "queries": 3}, "event 1")
-    assert action == Lie("r3", ("copied places",), 3)
+    assert action == TryLies("r3", ("copied places",), 3)
     for table, reason in (
         ({"robot": "r3", "ways": ["politely"]}, "no way 'politely'; known are node at 1e9 m"),
         ({"robot": "r3", "queries": 0}, "queries must be 1 to 1000"),
@@ -89,9 +89,9 @@ def test_an_event_names_its_ways() -> None:
 
 
 def test_the_figures_count_the_ways_that_can_be_found_out() -> None:
-    good = Outcome(True, "map r3.1 is implausible", True, 0.01, 0, 0, True, 1.0)
-    bad = Outcome(False, "map r3.1 is implausible", False, 0.2, 3, 1, True, 1.0)
-    hidden = Outcome(False, "", False, 9.0, 12, 0, True, 1.0)
+    good = ContainmentOutcome(True, "map r3.1 is implausible", True, 0.01, 0, 0, True, 1.0)
+    bad = ContainmentOutcome(False, "map r3.1 is implausible", False, 0.2, 3, 1, True, 1.0)
+    hidden = ContainmentOutcome(False, "", False, 9.0, 12, 0, True, 1.0)
     first, second, *_ = WAYS
     lies = Lies("r3", {first: good, second: bad, next(iter(UNDECIDABLE)): hidden})
     figures = lies.figures()

@@ -12,7 +12,7 @@ import pytest
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.scenarios import process_fleet
-from mapweave.scenarios.fleet import Stage
+from mapweave.scenarios.fleet import TrialStage
 from mapweave.scenarios.process_fleet import ProcessFleet
 from mapweave.scenarios.scenario import load_scenario, scenario_path
 
@@ -40,7 +40,9 @@ def test_first_agents_may_compile_for_longer_than_others_take(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, looks: int
 ) -> None:
     """On a busy computer the first run ended after a minute, without a word until then."""
-    fleet = ProcessFleet(Stage(load_scenario(scenario_path("agent-killed")), 1, tmp_path, AgentSettings()))
+    fleet = ProcessFleet(
+        TrialStage(load_scenario(scenario_path("agent-killed")), 1, tmp_path, AgentSettings())
+    )
     fleet.end()
     slow = Slow(looks)
     connected = SimpleNamespace(connected=lambda: True)

@@ -19,7 +19,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.scenarios import report_folder
 from mapweave.scenarios.error_plot import _labels
 from mapweave.scenarios.expectations import check, parse_expectations
-from mapweave.scenarios.recording import Moment
+from mapweave.scenarios.recording import TrialEvent
 from mapweave.scenarios.report_folder import write_folder
 from mapweave.scenarios.score import score
 from mapweave.storage.map_file import read_map_file
@@ -126,7 +126,7 @@ def test_pictures_show_their_content(written):
 
 
 def test_moments_that_are_near_share_a_label():
-    moments = [Moment(int(s * 1e9), "") for s in (0.0, 50.0, 50.1, 51.9, 60.0, 100.0)]
+    moments = [TrialEvent(int(s * 1e9), "") for s in (0.0, 50.0, 50.1, 51.9, 60.0, 100.0)]
     assert _labels(moments) == [(0.0, "1"), (50.0, "2-4"), (60.0, "5"), (100.0, "6")]
     assert _labels([]) == []
 

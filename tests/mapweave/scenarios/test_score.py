@@ -20,14 +20,14 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2
-from mapweave.scenarios.recording import Fix, Lost, Trajectory
+from mapweave.scenarios.recording import Lost, RecordedLocalization, TrialTrajectory
 from mapweave.scenarios.score import fleet_hash, pose_at, score
 from mapweave.scenarios.trajectories import score_trajectory
 
 TICK_NS = 100_000_000
 
 
-def for_evo(trajectory: Trajectory) -> PoseTrajectory3D:
+def for_evo(trajectory: TrialTrajectory) -> PoseTrajectory3D:
     """By positions and quaternions, as a TUM file has them."""
     half, zero = trajectory.poses[:, 2] / 2, np.zeros(len(trajectory.poses))
     return PoseTrajectory3D(
@@ -37,7 +37,7 @@ def for_evo(trajectory: Trajectory) -> PoseTrajectory3D:
     )
 
 
-def wandering(seed: int, noise: float = 0.02) -> tuple[Trajectory, Trajectory]:
+def wandering(seed: int, noise: float = 0.02) -> tuple[TrialTrajectory, TrialTrajectory]:
     """A trajectory of 50 s and a robot's estimate of a part of it, in its own frame."""
     rng = np.random.default_rng(seed)
     steps = np.column_stack([np.full(500, 0.03), np.zeros(500), rng.normal(0, 0.05, 500)])
@@ -45,13 +45,13 @@ def wandering(seed: int, noise: float = 0.02) -> tuple[Trajectory, Trajectory]:
     for step in steps:
         pose = pose @ Pose2.from_vector(step)
         poses.append(pose.vector)
-    truth = Trajectory(np.arange(500, dtype=np.int64) * TICK_NS, np.array(poses))
+    truth = TrialTrajectory(np.arange(500, dtype=np.int64) * TICK_NS, np.array(poses))
     frame = Pose2(*rng.uniform(-9, 9, 2), rng.uniform(-3, 3))
     known = np.sort(rng.choice(np.arange(20, 480), 300, replace=False))
     estimated = [
         (frame @ Pose2.from_vector(v) @ Pose2(*rng.normal(0, noise, 3))).vector for v in truth.poses[known]
     ]
-    return truth, Trajectory(truth.stamps_ns[known], np.array(estimated))
+    return truth, TrialTrajectory(truth.stamps_ns[known], np.array(estimated))
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -113,10 +113,10 @@ def test_errors_over_time_make_up_the_ate():
 @pytest.mark.parametrize("ticks", [1, 2, 100])
 def test_straight_and_short_ways_have_a_score_where_evo_alone_has_none(ticks):
     x = np.linspace(0, 0.5, ticks)
-    truth = Trajectory(
+    truth = TrialTrajectory(
         np.arange(ticks, dtype=np.int64) * TICK_NS, np.column_stack([x, x, np.full(ticks, math.pi / 4)])
     )
-    estimate = Trajectory(
+    estimate = TrialTrajectory(
         truth.stamps_ns, np.array([(Pose2(3, 4, 2) @ Pose2.from_vector(v)).vector for v in truth.poses])
     )
     outcome = score_trajectory(truth, estimate)
@@ -128,7 +128,7 @@ def test_straight_and_short_ways_have_a_score_where_evo_alone_has_none(ticks):
 def test_times_outside_the_truth():
     truth, estimate = wandering(0)
     with pytest.raises(InvalidValue, match="knows no time"):
-        score_trajectory(truth, Trajectory(estimate.stamps_ns + 10**12, estimate.poses))
+        score_trajectory(truth, TrialTrajectory(estimate.stamps_ns + 10**12, estimate.poses))
 
 
 def test_a_good_trial_has_the_figures_that_it_was_made_of(eventful):
@@ -167,7 +167,7 @@ def test_the_merged_map_scores_as_evo_scores_it(staged):
     outcome = np.array([p.vector for _, p, _ in staged.nodes.values()])
     stamps = np.arange(len(true)) * TICK_NS
     result = ape(
-        for_evo(Trajectory(stamps, true)), for_evo(Trajectory(stamps, outcome)),
+        for_evo(TrialTrajectory(stamps, true)), for_evo(TrialTrajectory(stamps, outcome)),
         metrics.PoseRelation.translation_part, align=True,
     )  # fmt: skip
     assert figures.merged_ate_m == pytest.approx(result.stats["rmse"], rel=1e-6)
@@ -245,7 +245,7 @@ def test_a_robot_without_answers(eventful):
 
 
 def test_an_answer_in_terms_of_an_unknown_place_does_not_count(eventful):
-    eventful.lost[0].fix = Fix(450 * TICK_NS, NodeId("r2", 1, 999), Pose2())
+    eventful.lost[0].fix = RecordedLocalization(450 * TICK_NS, NodeId("r2", 1, 999), Pose2())
     figures = score(eventful.recording())
     assert figures.found is False
     assert figures.found_error_m is None
@@ -294,12 +294,12 @@ def test_an_empty_trial_is_scored_without_dividing_by_nothing(staged):
 def test_a_robot_with_several_maps_counts_by_its_worst(staged):
     recording = staged.recording()
     truth, estimate = recording.robots["r0"].truth, next(iter(recording.robots["r0"].estimates.values()))
-    bad = Trajectory(
+    bad = TrialTrajectory(
         estimate.stamps_ns, estimate.poses + np.random.default_rng(0).normal(0, 0.3, estimate.poses.shape)
     )
     record = replace(
         recording.robots["r0"],
-        estimates={1: estimate, 2: bad, 3: Trajectory(bad.stamps_ns[:0], bad.poses[:0])},
+        estimates={1: estimate, 2: bad, 3: TrialTrajectory(bad.stamps_ns[:0], bad.poses[:0])},
     )
     figures = score(replace(recording, robots={**recording.robots, "r0": record}))
     assert figures.trajectory_ate_m == score_trajectory(truth, bad).ate_m
@@ -326,7 +326,7 @@ def test_the_truth_is_taken_at_the_tick(staged):
         with pytest.raises(InvalidValue, match="not simulated"):
             pose_at(truth, stamp)
     with pytest.raises(InvalidValue, match="not simulated"):
-        pose_at(Trajectory(truth.stamps_ns[:0], truth.poses[:0]), 0)
+        pose_at(TrialTrajectory(truth.stamps_ns[:0], truth.poses[:0]), 0)
 
 
 def test_a_node_of_a_stranger_is_refused(staged):

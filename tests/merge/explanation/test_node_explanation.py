@@ -31,7 +31,7 @@ from mapweave.merge.outlier_rejection.link_probability import (
 )
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, Measurement
+from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, RelativePose
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import ConsistencySettings
@@ -104,7 +104,7 @@ def without(merged: MergedMap, left_out: Link | None) -> PoseGaussian:
     assert left_out is not None
     measurements = [m for fragment in fragments_of(merged.maps) for m in fragment.measurements]
     measurements += [
-        Measurement(*link.pair, link.a_from_b, robust=True) for link in merged.links if link is not left_out
+        RelativePose(*link.pair, link.a_from_b, robust=True) for link in merged.links if link is not left_out
     ]
     graph = solve_graph(left_out.a, Pose2(), measurements)
     result = graph.relative([left_out.a], [left_out.b])
@@ -133,12 +133,12 @@ def test_what_is_left_of_a_residual_is_foretold_without_solving(merged: MergedMa
     rng = np.random.default_rng(5)
     for link in links[::3]:
         wrong = link.a_from_b.mean @ Pose2.from_vector(rng.normal(0.0, [0.2, 0.2, 0.1]))
-        rest = own + [Measurement(*x.pair, x.a_from_b, robust=True) for x in links if x is not link]
+        rest = own + [RelativePose(*x.pair, x.a_from_b, robust=True) for x in links if x is not link]
         asked = Link(*link.pair, PoseGaussian(wrong, link.a_from_b.covariance), link.shared, link.evidence)
         (foretold,) = standpoints([asked], solve_graph(link.a, Pose2(), rest), kept=False)
         floored = asked.a_from_b.covariance + FLOOR
         solved = solve_graph(
-            link.a, Pose2(), [*rest, Measurement(*link.pair, PoseGaussian(wrong, floored), robust=True)]
+            link.a, Pose2(), [*rest, RelativePose(*link.pair, PoseGaussian(wrong, floored), robust=True)]
         )
         off = (wrong.inverse() @ Pose2.from_vector(solved.relative([link.a], [link.b]).means[0])).vector
         floored += np.diag(LEAST_SIGMAS**2)
@@ -152,7 +152,7 @@ def test_a_link_that_alone_joins_has_the_odds_of_all_links(merged: MergedMap) ->
         link.a,
         Pose2(),
         [m for f in fragments_of(merged.maps) for m in f.measurements]
-        + [Measurement(*link.pair, link.a_from_b, robust=True)],
+        + [RelativePose(*link.pair, link.a_from_b, robust=True)],
     )
     (result,) = standpoints([link], graph, kept=True)
     assert result.alone and result.log_factor == 0.0

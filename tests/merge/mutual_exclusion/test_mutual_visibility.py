@@ -21,7 +21,7 @@ from mapweave.merge.mutual_exclusion.quadrature import quadrature_points
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.mutual_exclusion.visibility_intervals import VisibilityInterval
 from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
@@ -131,8 +131,8 @@ def chain(share: float = 1.0, n: int = 8) -> PoseGraph:
     a, b = ([NodeId(agent, 1, k) for k in range(n)] for agent in "ab")
     step = PoseGaussian(Pose2(0.5, 0.0, 0.3), share * np.diag([0.005, 0.005, 0.005]) ** 2)
     across = PoseGaussian(Pose2(0.3, 1.0, 2.0), share * np.diag([0.05, 0.03, 0.04]) ** 2)
-    way = [Measurement(x[k], x[k + 1], step) for x in (a, b) for k in range(n - 1)]
-    return solve_graph(a[0], Pose2(), [*way, Measurement(a[0], b[0], across)])
+    way = [RelativePose(x[k], x[k + 1], step) for x in (a, b) for k in range(n - 1)]
+    return solve_graph(a[0], Pose2(), [*way, RelativePose(a[0], b[0], across)])
 
 
 @pytest.mark.slow

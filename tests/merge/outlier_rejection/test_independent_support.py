@@ -17,7 +17,7 @@ from mapweave.merge.outlier_rejection.independent_support import (
     support_of,
 )
 from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
 from synthetic.fleet import FleetSettings, draw_fleet
@@ -32,7 +32,7 @@ def along(agent: str, places: list[tuple[float, float]]) -> Fragment:
     steps = []
     for k in range(len(places) - 1):
         (x, y), (u, v) = places[k], places[k + 1]
-        steps.append(Measurement(ids[k], ids[k + 1], PoseGaussian(Pose2(u - x, v - y), 1e-6 * np.eye(3))))
+        steps.append(RelativePose(ids[k], ids[k + 1], PoseGaussian(Pose2(u - x, v - y), 1e-6 * np.eye(3))))
     return Fragment(ids[0], solve_graph(ids[0], Pose2(*places[0]), steps), tuple(steps))
 
 

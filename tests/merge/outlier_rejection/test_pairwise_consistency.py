@@ -15,7 +15,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.outlier_rejection.max_clique import best_clique, independent_links
 from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances2, sort_links
 from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.settings import ConsistencySettings
@@ -28,7 +28,7 @@ def fragment(agent: str, tour: list[Pose2], rng: np.random.Generator, sigma: flo
         noise = Pose2.from_vector(rng.normal(0, [sigma, sigma, sigma / 2]))
         mean = tour[k].inverse() @ tour[k + 1] @ noise
         covariance = np.diag([sigma**2, sigma**2, sigma**2 / 4])
-        steps.append(Measurement(ids[k], ids[k + 1], PoseGaussian(mean, covariance)))
+        steps.append(RelativePose(ids[k], ids[k + 1], PoseGaussian(mean, covariance)))
     return Fragment(ids[0], solve_graph(ids[0], Pose2(), steps), tuple(steps))
 
 

@@ -10,7 +10,7 @@ import pytest
 
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
-from mapweave.merge.pose_graph.factors import Factors, Measurement
+from mapweave.merge.pose_graph.factors import Factors, RelativePose
 
 NODES = 6
 
@@ -26,7 +26,7 @@ def vector(motion: Array) -> Array:
     return np.array([motion[0, 2], motion[1, 2], math.atan2(motion[1, 0], motion[0, 0])])
 
 
-def drawn(seed: int) -> tuple[Array, list[Measurement]]:
+def drawn(seed: int) -> tuple[Array, list[RelativePose]]:
     """(N, 3) poses, and measurements between them that are nearly right."""
     rng = np.random.default_rng(seed)
     means = rng.normal(0.0, 1.0, (NODES, 3))
@@ -37,15 +37,15 @@ def drawn(seed: int) -> tuple[Array, list[Measurement]]:
             off = matrix(rng.normal(0.0, 1e-5, 3))
             between = vector(np.linalg.inv(matrix(means[a])) @ matrix(means[b]) @ off)
             text = PoseGaussian(Pose2.from_vector(between), root @ root.T + 0.01 * np.eye(3))
-            measurements.append(Measurement(NodeId("a", 1, a), NodeId("a", 1, b), text, bool((a + b) % 2)))
+            measurements.append(RelativePose(NodeId("a", 1, a), NodeId("a", 1, b), text, bool((a + b) % 2)))
     return means, measurements
 
 
-def factors_of(measurements: list[Measurement]) -> Factors:
+def factors_of(measurements: list[RelativePose]) -> Factors:
     return Factors.of(measurements, [m.a.number for m in measurements], [m.b.number for m in measurements])
 
 
-def residual(m: Measurement, a: Array, b: Array) -> Array:
+def residual(m: RelativePose, a: Array, b: Array) -> Array:
     measured = matrix(m.a_from_b.mean.vector)
     return vector(np.linalg.inv(measured) @ np.linalg.inv(matrix(a)) @ matrix(b))
 
@@ -76,7 +76,7 @@ def test_neighbours_are_found_ring_by_ring() -> None:
     """Along a chain of ten nodes, from its middle."""
     step = PoseGaussian(Pose2(1.0, 0.0, 0.0), np.eye(3))
     ids = [NodeId("a", 1, k) for k in range(10)]
-    chain = factors_of([Measurement(a, b, step) for a, b in pairwise(ids)])
+    chain = factors_of([RelativePose(a, b, step) for a, b in pairwise(ids)])
     assert sorted(chain.around(np.array([5]), 1, 10)) == [5]
     assert sorted(chain.around(np.array([5]), 4, 10)) == [3, 4, 5, 6, 7]
     assert sorted(chain.around(np.array([0]), 99, 10)) == list(range(10))

@@ -9,7 +9,7 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.merge.pose_graph import marginalization
 from mapweave.merge.pose_graph.component import Component, solve_graph
-from mapweave.merge.pose_graph.factors import Measurement
+from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.marginalization import LINKS, fused, is_marginal, marginal_links
 
@@ -18,7 +18,7 @@ def node(k: int) -> NodeId:
     return NodeId("r0", 1 + k // 5, k)
 
 
-def drawn(rng: np.random.Generator, count: int, more: int) -> tuple[list[Measurement], list[Pose2]]:
+def drawn(rng: np.random.Generator, count: int, more: int) -> tuple[list[RelativePose], list[Pose2]]:
     """A way through a hall, and further measurements between nodes of it, with noise."""
     truth = [Pose2(*rng.uniform([0, 0, -3], [4, 4, 3])) for _ in range(count)]
     pairs = [(k, k + 1) for k in range(count - 1)]
@@ -31,15 +31,15 @@ def drawn(rng: np.random.Generator, count: int, more: int) -> tuple[list[Measure
         sigmas = rng.uniform(0.005, 0.02, 3)
         off = Pose2.from_vector(rng.normal(0.0, sigmas))
         pose = PoseGaussian(truth[a].inverse() @ truth[b] @ off, np.diag(sigmas**2))
-        measured.append(Measurement(node(a), node(b), pose))
+        measured.append(RelativePose(node(a), node(b), pose))
     return measured, truth
 
 
-def as_measurements(links: list[Link]) -> list[Measurement]:
+def as_measurements(links: list[Link]) -> list[RelativePose]:
     return [link.measurement for link in links]
 
 
-def without(measured: list[Measurement], removed: set[NodeId]) -> list[Measurement]:
+def without(measured: list[RelativePose], removed: set[NodeId]) -> list[RelativePose]:
     return [m for m in measured if removed.isdisjoint((m.a, m.b))]
 
 
@@ -139,7 +139,7 @@ def test_a_verified_link_and_a_marginal_one_count_both() -> None:
     both = fused(marginal, verified.turned())
     assert both is not None and is_marginal(both) and both.weight == 30 and both.shared.tolist() == [[1, 2]]
     solved = solve_graph(
-        node(0), Pose2(), [Measurement(node(0), node(7), near), Measurement(node(0), node(7), far)]
+        node(0), Pose2(), [RelativePose(node(0), node(7), near), RelativePose(node(0), node(7), far)]
     )
     assert both.a_from_b.mean.distance(solved.pose(node(7))) < 1e-6
     assert both.a_from_b.covariance == pytest.approx(solved.poses()[node(7)].covariance, rel=0.05, abs=2e-6)

@@ -8,12 +8,12 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.pose_graph import solved_graph
 from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, Measurement
+from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, RelativePose
 
 IDS = [NodeId("a", 1, k) for k in range(8)]
 
 
-def random_graph(seed: int, loops: int = 4) -> tuple[list[Pose2], list[Measurement]]:
+def random_graph(seed: int, loops: int = 4) -> tuple[list[Pose2], list[RelativePose]]:
     rng = np.random.default_rng(seed)
     true = [Pose2(*rng.uniform([-5, -5, -3], [5, 5, 3])) for _ in IDS]
     pairs = [(k, k + 1) for k in range(7)] + [tuple(rng.choice(8, 2, replace=False)) for _ in range(loops)]
@@ -21,7 +21,7 @@ def random_graph(seed: int, loops: int = 4) -> tuple[list[Pose2], list[Measureme
     for i, j in pairs:
         sigmas = rng.uniform([0.02, 0.02, 0.01], [0.1, 0.1, 0.05])
         mean = true[i].inverse() @ true[j] @ Pose2.from_vector(rng.normal(0, sigmas))
-        measurements.append(Measurement(IDS[i], IDS[j], PoseGaussian(mean, np.diag(sigmas**2))))
+        measurements.append(RelativePose(IDS[i], IDS[j], PoseGaussian(mean, np.diag(sigmas**2))))
     return true, measurements
 
 
@@ -32,7 +32,7 @@ def logarithm(pose: Pose2) -> np.ndarray:
     return np.array([along * pose.x + half * pose.y, along * pose.y - half * pose.x, pose.heading])
 
 
-def scipy_optimum(true: list[Pose2], measurements: list[Measurement]) -> tuple[np.ndarray, np.ndarray]:
+def scipy_optimum(true: list[Pose2], measurements: list[RelativePose]) -> tuple[np.ndarray, np.ndarray]:
     """(8, 3) poses, and (8, 3, 3) covariances in the moving frames, with the first node held."""
 
     def residuals(x: np.ndarray) -> np.ndarray:
@@ -112,7 +112,7 @@ def test_covariances_are_calibrated() -> None:
 
 def test_order_does_not_matter_and_unconnected_nodes_are_left_out() -> None:
     true, measurements = random_graph(8)
-    apart = Measurement(NodeId("z", 1, 1), NodeId("z", 1, 2), measurements[0].a_from_b)
+    apart = RelativePose(NodeId("z", 1, 1), NodeId("z", 1, 2), measurements[0].a_from_b)
     first = solve_graph(IDS[0], true[0], [*measurements, apart])
     second = solve_graph(IDS[0], true[0], [apart, *measurements[::-1]])
     assert first.nodes == second.nodes == tuple(IDS)
@@ -143,7 +143,7 @@ def test_a_nearly_singular_covariance_still_makes_a_graph(seed: int) -> None:
         axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         covariance = axes * [1e4, 1e4 * rng.integers(0, 2), -3e-3 * rng.integers(0, 2)] @ axes.T
         step = PoseGaussian(Pose2(*rng.uniform(-5, 5, 3)), covariance)
-        measurements.append(Measurement(IDS[k], IDS[k + 1], step))
+        measurements.append(RelativePose(IDS[k], IDS[k + 1], step))
         assert np.linalg.eigvalsh(measurements[-1].covariance)[0] > 0.0
     graph = solve_graph(IDS[0], Pose2(), [*measurements, measurements[0]])
     assert all(np.isfinite(pose.covariance).all() for pose in graph.poses().values())

@@ -13,8 +13,8 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.pose_graph.component import Component, solve_graph
-from mapweave.merge.pose_graph.factors import Measurement
-from mapweave.merge.pose_graph.merged_map import MergedMap, Poses
+from mapweave.merge.pose_graph.factors import RelativePose
+from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.pose_graph.staged_optimization import StagedOptimization
 from synthetic.world import room, take_map
 
@@ -26,13 +26,13 @@ def nodes_of(agent: str, count: int) -> list[NodeId]:
     return [NodeId(agent, 1, k + 1) for k in range(count)]
 
 
-def measured(a: NodeId, b: NodeId, truth: dict[NodeId, Pose2], rng: np.random.Generator) -> Measurement:
+def measured(a: NodeId, b: NodeId, truth: dict[NodeId, Pose2], rng: np.random.Generator) -> RelativePose:
     way = truth[a].inverse() @ truth[b]
     noise = rng.normal(0.0, [SIGMAS[0], SIGMAS[0], SIGMAS[1]])
-    return Measurement(a, b, PoseGaussian.from_sigmas(way @ Pose2.from_vector(noise), *SIGMAS))
+    return RelativePose(a, b, PoseGaussian.from_sigmas(way @ Pose2.from_vector(noise), *SIGMAS))
 
 
-def drawn(seed: int, names: tuple[str, str, str], links: tuple[tuple[int, int], ...]) -> list[Measurement]:
+def drawn(seed: int, names: tuple[str, str, str], links: tuple[tuple[int, int], ...]) -> list[RelativePose]:
     """Drives of three robots, each from node to node, and links between those of the robots of each pair."""
     rng = np.random.default_rng(seed)
     drives = [nodes_of(name, 6) for name in names]
@@ -45,7 +45,7 @@ def drawn(seed: int, names: tuple[str, str, str], links: tuple[tuple[int, int], 
     return out
 
 
-def solved(measurements: list[Measurement]) -> Component:
+def solved(measurements: list[RelativePose]) -> Component:
     anchor = min(node for m in measurements for node in (m.a, m.b))
     return solve_graph(anchor, Pose2(), measurements)
 
@@ -59,7 +59,7 @@ def map_with(node_id: NodeId, pose: Pose2) -> HybridMap:
 
 
 def merged_map(graph: Component) -> MergedMap:
-    return MergedMap({}, (), (), (frozenset(graph.nodes),), Poses((graph,)), (graph,))
+    return MergedMap({}, (), (), (frozenset(graph.nodes),), NodePoses((graph,)), (graph,))
 
 
 @pytest.mark.parametrize(
