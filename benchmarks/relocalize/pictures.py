@@ -45,7 +45,7 @@ VERSION = 1
 
 
 @dataclass(frozen=True, eq=False)
-class TestPicture:
+class RenderedPicture:
     """What is in one picture.
 
     Attributes:
@@ -147,7 +147,7 @@ class Photographer:
             picture = np.asarray(cv2.LUT(picture, np.rint(curve).astype(np.uint8)), np.uint8)
         return picture
 
-    def take(self, wish: Wish) -> TestPicture:
+    def take(self, wish: Wish) -> RenderedPicture:
         """Take one."""
         keypoints, descriptors = self._eyes.describe(self.image(wish))
         pixels = self._lens.undistort(np.array([k.pt for k in keypoints], dtype=np.float64).reshape(-1, 2))
@@ -157,7 +157,7 @@ class Photographer:
             seen = self._surfaces.see(wish.place, self.camera, pixels)
             flat = self._surfaces.flat(wish.place, self.camera, pixels)
             depths = np.where(flat & np.isfinite(seen.depths), seen.depths, np.nan)
-        return TestPicture(
+        return RenderedPicture(
             wish.place, self.camera, pixels.astype(np.float32), sift, depths.astype(np.float32)
         )
 
@@ -187,7 +187,7 @@ def taken(
     photographer: Callable[[], Photographer],
     wishes: Sequence[Wish],
     progress: Callable[[], None] = lambda: None,
-) -> list[TestPicture]:
+) -> list[RenderedPicture]:
     """Pictures from the folder, or else from a photographer.
 
     Args:
@@ -217,7 +217,7 @@ def taken(
     return made
 
 
-def _pack(pictures: Sequence[TestPicture]) -> dict[str, Any]:
+def _pack(pictures: Sequence[RenderedPicture]) -> dict[str, Any]:
     return {
         "counts": np.array([len(one) for one in pictures], np.int64),
         "camera": np.array(astuple(pictures[0].camera) if pictures else ()),
@@ -227,7 +227,7 @@ def _pack(pictures: Sequence[TestPicture]) -> dict[str, Any]:
     }
 
 
-def _unpack(wishes: Sequence[Wish], kept: Any) -> list[TestPicture]:
+def _unpack(wishes: Sequence[Wish], kept: Any) -> list[RenderedPicture]:
     """The pictures; ValueError if what is kept is not of these wishes."""
     ends = np.cumsum(kept["counts"])
     if not len(wishes):
@@ -236,7 +236,7 @@ def _unpack(wishes: Sequence[Wish], kept: Any) -> list[TestPicture]:
     camera = Camera(int(width), int(height), *rest)
     parts = [np.split(kept[name], ends[:-1]) for name in ("pixels", "sift", "depths")]
     return [
-        TestPicture(wish.place, camera, pixels, sift, depths)
+        RenderedPicture(wish.place, camera, pixels, sift, depths)
         for wish, pixels, sift, depths in zip(wishes, *parts, strict=True)
     ]
 

@@ -10,7 +10,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.relocalize.pictures import Photographer, TestPicture, Wish, taken
+from benchmarks.relocalize.pictures import Photographer, RenderedPicture, Wish, taken
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
@@ -163,7 +163,7 @@ def spread_out(points: Array, count: int, rng: np.random.Generator) -> Array:
 
 def photographed(
     site: Site, wishes: Sequence[Wish], progress: Progress, camera: str = "webcam"
-) -> list[TestPicture]:
+) -> list[RenderedPicture]:
     """Pictures of a building as it was built."""
     name = f"{site} {camera}"
     return taken(name, lambda: Photographer(site.world, (site.seed, 1), camera), wishes, progress)
@@ -188,7 +188,7 @@ def mapped(sites: Sequence[Site], count: int, seed: int, progress: Progress) -> 
     return places
 
 
-def placed(picture: TestPicture, node_id: NodeId, site: int, rng: np.random.Generator) -> TruePlace:
+def placed(picture: RenderedPicture, node_id: NodeId, site: int, rng: np.random.Generator) -> TruePlace:
     """A node of a picture: depths as uncertain as a robot's, and wrong by about as much as they say."""
     true = picture.depths.astype(np.float64)
     known = np.flatnonzero(np.isfinite(true) & (rng.random(len(true)) < SEEN_AGAIN))

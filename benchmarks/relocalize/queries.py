@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from benchmarks.relocalize.pictures import Photographer, TestPicture, ViewDisturbance, Wish, taken
+from benchmarks.relocalize.pictures import Photographer, RenderedPicture, ViewDisturbance, Wish, taken
 from benchmarks.relocalize.places import CLEARANCE, Progress, Site, TruePlace, photographed, unknown_sites
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.world import World
@@ -32,7 +32,7 @@ class Query:
     """
 
     kind: str
-    picture: TestPicture
+    picture: RenderedPicture
     site: int
 
 

@@ -13,7 +13,7 @@ from benchmarks.relocalize import pictures as relocalize_pictures
 from benchmarks.relocalize.distractors import Differences, Distractors
 from benchmarks.relocalize.exhaustive import Exhaustive, asked_of, lost
 from benchmarks.relocalize.peer import Vocabulary, WordIndex
-from benchmarks.relocalize.pictures import Photographer, TestPicture, ViewDisturbance, Wish, taken
+from benchmarks.relocalize.pictures import Photographer, RenderedPicture, ViewDisturbance, Wish, taken
 from benchmarks.relocalize.places import TruePlace, placed, spread_out, twin_lookouts
 from benchmarks.relocalize.queries import Query, beside
 from benchmarks.relocalize.score import ScoredAnswer, ask, figures, judged, spent
@@ -31,11 +31,11 @@ from mapweave.sim.worlds.catalog import make_world
 from synthetic.world import CAMERA, room, take_map, take_view
 
 
-def picture_of(sift: np.ndarray) -> TestPicture:
+def picture_of(sift: np.ndarray) -> RenderedPicture:
     n = len(sift)
     rng = np.random.default_rng(0)
     pixels = rng.uniform(0, 240, (n, 2)).astype(np.float32)
-    return TestPicture(Pose2(), CAMERA, pixels, sift, rng.uniform(1, 4, n).astype(np.float32))
+    return RenderedPicture(Pose2(), CAMERA, pixels, sift, rng.uniform(1, 4, n).astype(np.float32))
 
 
 def nodes_of(seed: int, count: int) -> list[Node]:
@@ -187,7 +187,7 @@ def test_answers_are_judged_by_the_truth() -> None:
     truth = {node.id: place}
     here = place.world_from_node @ Pose2(0.2, 0.1, 0.1)
     sift = np.zeros((0, 128), np.uint8)
-    picture = TestPicture(here, CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
+    picture = RenderedPicture(here, CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
 
     def scored(pose: Pose2, site: int, kind: str = "near") -> dict[str, float]:
         estimated = PoseGaussian.from_sigmas(pose, 0.1, 0.05)
@@ -227,7 +227,7 @@ def test_the_fit_finds_the_weights_that_made_the_data() -> None:
 
 def test_the_benchmarks_own_work_is_not_timed() -> None:
     sift = np.zeros((0, 128), np.uint8)
-    picture = TestPicture(Pose2(), CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
+    picture = RenderedPicture(Pose2(), CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
     making = np.zeros(2)
 
     def answer(_: View) -> RelocalizeAnswer:
