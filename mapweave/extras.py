@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import shlex
+import shutil
+import sys
 from collections.abc import Sequence
 from importlib.util import find_spec
+from pathlib import Path
 
 from mapweave.hybridmap.errors import MapweaveError
 
@@ -44,9 +48,22 @@ class MissingExtra(MapweaveError):
         """
         *first, last = (f'"{extra}"' for extra in extras)
         names = f"{', '.join(first)} and {last}" if first else last
-        super().__init__(
-            f"needs the extra{'s' * (len(extras) > 1)} {names}: pip install 'mapweave[{','.join(extras)}]'"
-        )
+        super().__init__(f"needs the extra{'s' * (len(extras) > 1)} {names}: {how_to_install(*extras)}")
+
+
+def pip() -> str:
+    """What to type for the pip of the environment that runs this.
+
+    Where this environment is not activated, a shell finds no `pip`, or that of the system, which installs
+    elsewhere or refuses to (PEP 668).
+    """
+    here, found = Path(sys.executable).parent, shutil.which("pip")
+    return "pip" if found and Path(found).parent == here else f"{shlex.quote(sys.executable)} -m pip"
+
+
+def how_to_install(*extras: str) -> str:
+    """The command that installs extras, each by its name."""
+    return f"{pip()} install 'mapweave[{','.join(extras)}]'"
 
 
 def need(*extras: str) -> None:

@@ -22,7 +22,7 @@ def add_to(commands: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Print one line per driver."""
     from mapweave.agent.drivers.registry import listing
-    from mapweave.extras import extra_of
+    from mapweave.extras import extra_of, how_to_install
 
     robots = listing()
     if arguments.json:
@@ -39,7 +39,7 @@ def run(arguments: argparse.Namespace) -> int:
             extra = extra_of(robot.missing)
             line = f"needs the library {robot.missing}"
             if extra is not None:
-                line = f"needs the extra {extra!r}: pip install 'mapweave[{extra}]'"
+                line = f"needs the extra {extra!r}: {how_to_install(extra)}"
         elif robot.error:
             line = f"cannot be loaded: {robot.error}"
         print(f"{robot.name:<{width}}  {line}")

@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.util import find_spec
 
 from mapweave.doctor.finding import Finding, good, skipped, wrong
-from mapweave.extras import MODULES
+from mapweave.extras import MODULES, pip
 
 IMPORTED_AS = {"eclipse-zenoh": "zenoh", "opencv-python-headless": "cv2", "pyserial": "serial"}
 """Modules whose names differ from those of their packages."""
@@ -25,7 +25,7 @@ def examine() -> Iterator[Finding]:
         yield good("mapweave", f"version {version('mapweave')}")
         needed = [line for line in requires("mapweave") or [] if ";" not in line]
     except PackageNotFoundError:
-        yield wrong("mapweave", "is not installed", "pip install mapweave")
+        yield wrong("mapweave", "is not installed", f"in a checkout: {pip()} install .")
         return
     missing = list(filter(None, map(_fault, needed)))
     if not missing:
@@ -55,7 +55,7 @@ def _fault(requirement: str) -> Finding | None:
     """What is wrong with a library, for example `numpy>=2.0`."""
     name, _, least = requirement.partition(">=")
     module = IMPORTED_AS.get(name, name)
-    advice = f"pip install --upgrade '{requirement}'"
+    advice = f"{pip()} install --upgrade '{requirement}'"
     try:
         importlib.import_module(module)
         there = version(name)

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 
 import cv2
 
+from mapweave.extras import how_to_install
 from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.scenarios.film_frame import Frame
 
@@ -50,7 +51,7 @@ class LiveFilm:
             from mapweave.mapserver.http.serving import ConnectionTimeouts, HttpThread
         except ModuleNotFoundError as error:
             raise SettingsError(
-                f"the live view needs {error.name}: install the extra, pip install 'mapweave[server]'"
+                f"the live view needs {error.name}: install the extra, {how_to_install('server')}"
             ) from None
         self._encoding = threading.Lock()
         self._latest: tuple[int, Frame] | None = None

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import re
+import shlex
 import subprocess
 import sys
 import tomllib
@@ -156,13 +158,23 @@ def filled(merged: MergedMap, recording: Path, closed: str, tmp_path: Path) -> d
 Outcome = tuple[int | None, str, str]
 
 
-def outcomes(without: Iterable[str], lines: Iterable[str]) -> list[Outcome]:
-    """What becomes of commands in a process that lacks the libraries of some extras."""
+ACTIVATED = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("PATH", "")])
+"""The search path of a shell that has activated this environment."""
+
+
+def outcomes(without: Iterable[str], lines: Iterable[str], path: str = ACTIVATED) -> list[Outcome]:
+    """What becomes of commands in a process that lacks the libraries of some extras.
+
+    Args:
+        without: the extras.
+        lines: commands with their arguments.
+        path: where the process looks for programs.
+    """
     missing = sorted({module for extra in without for module in MODULES[extra]})
     ran = subprocess.run(
         [sys.executable, "-m", "tests.mapweave.without_libraries", *missing],
         input=json.dumps([line.split() for line in lines]),
-        capture_output=True, text=True, check=True, cwd=ROOT, timeout=120,
+        capture_output=True, text=True, check=True, cwd=ROOT, timeout=120, env=os.environ | {"PATH": path},
     )  # fmt: skip
     return [(status, out, err) for status, out, err in json.loads(ran.stdout)]
 
@@ -205,6 +217,23 @@ def test_a_trial_names_only_what_is_missing(tmp_path: Path) -> None:
     words = 'mapweave sim run needs the extras "eval" and "viz": pip install \'mapweave[eval,viz]\'\n'
     assert outcome == (MISSING_EXTRA, "", words)
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("path", ["", "other"])
+def test_the_pip_that_is_named_is_that_of_this_environment(tmp_path: Path, path: str) -> None:
+    """Where the environment is not activated: there is no `pip`, or another one."""
+    other = tmp_path / "other" / "pip"
+    other.parent.mkdir()
+    other.write_text("#!/bin/sh\nexit 1\n")
+    other.chmod(0o755)
+    (outcome,) = outcomes(["server"], ["server"], str(tmp_path / path))
+    said = outcome[2].removeprefix('mapweave server needs the extra "server": ').rstrip("\n")
+    program, *words = shlex.split(said)
+    assert words == ["-m", "pip", "install", "mapweave[server]"]
+    where = subprocess.run(
+        [program, "-c", "import pip; print(pip.__file__)"], capture_output=True, text=True, check=True
+    )
+    assert Path(sys.prefix).resolve() in Path(where.stdout.strip()).resolve().parents
 
 
 def test_a_map_that_is_not_there_is_the_only_complaint(tmp_path: Path) -> None:
