@@ -28,6 +28,8 @@ if TYPE_CHECKING:
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
 
+SETTLED = 2.0
+"""s; a router that starts meanwhile has let its clients in by then."""
 LOST = 10.0
 """s; after which a router that was there counts as lost."""
 
@@ -274,9 +276,11 @@ def warn_without_router(bus: ZenohBus, name: str, settings: BusSettings, since: 
                 patience, since = LOST, time.monotonic()
             # A process that ends earlier has not waited long enough to know.
             elif time.monotonic() - since >= patience:
-                advice = not_let_in(settings) or (
-                    "start `mapweave server` or `mapweave router`, or give --connect"
-                )
+                advice = not_let_in(settings)
+                # What has begun to listen a moment ago lets this in a moment later.
+                if advice and bus.wait_connected(SETTLED):
+                    continue
+                advice = advice or "start `mapweave server` or `mapweave router`, or give --connect"
                 say(f"finds no router at {where}: {advice}; it goes on looking")
                 while not bus.connected() and not bus.closed:
                     time.sleep(LOOK)

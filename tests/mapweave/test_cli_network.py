@@ -234,6 +234,25 @@ def test_a_router_that_is_found_after_all_is_reported_once(closed, tmp_path):
             assert not [line for line in lines if "router" in line]
 
 
+def test_a_router_that_begins_to_listen_just_now_is_not_said_to_refuse(closed, capfd, monkeypatch):
+    """Programs started within a second of the server asked for a key, and were let in a moment later."""
+    settings, opened, judge = BusSettings(endpoints=(closed,)), [], connection.not_let_in
+
+    def opening(settings):
+        opened.append(ZenohBus(BusSettings(mode="router", listen=(closed,))))
+        return judge(settings)
+
+    monkeypatch.setattr(connection, "not_let_in", opening)
+    with closing(ZenohBus(settings)) as bus:
+        network.warn_without_router(bus, "r0", settings)
+        eventually(lambda: bus.connected())
+        # The thread looks again within this time.
+        time.sleep(2 * network.LOOK)
+        said = capfd.readouterr().err
+        opened[0].close()
+    assert "router" not in said
+
+
 def test_a_router_that_is_lost_for_long_is_reported(closed, capfd, monkeypatch):
     monkeypatch.setattr(network, "LOST", 3.0)
     settings, said = BusSettings(endpoints=(closed,)), []
