@@ -315,15 +315,20 @@ class ZenohBus:
             watched = next((one.key for one in self.owner.declared if isinstance(one, Watcher)), None)
         if watched is None:
             return True
+        end = time.monotonic() + UNANSWERED
+        pause = FIRST_LOOK
         try:
-            # A client itself answers with what it knows; only the router's word ends that before its time.
-            answers = session.liveliness().get(watched, timeout=UNANSWERED)
-            pause = FIRST_LOOK
+            # A client itself answers with what it knows; only the router's word ends that before its time,
+            # which is behind the last look. What is said does not matter, and there may be more of it than
+            # Zenoh's default channel holds: a full one blocks the thread that asks.
+            answers = session.liveliness().get(
+                watched, handler=zenoh.handlers.RingChannel(1), timeout=2 * UNANSWERED
+            )
             while not self._closed.wait(pause):
                 # A busy router leaves all of its clients waiting at once: looks must not make it busier.
                 pause = min(2 * pause, UNANSWERED / 10)
-                answer = answers.try_recv()
-                if answer is not None and answer.err is not None:
+                answers.try_recv()
+                if time.monotonic() >= end:
                     return False
         except zenoh.ZError:
             log.debug("the router has said who is alive under %s", watched)

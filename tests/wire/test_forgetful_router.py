@@ -153,6 +153,33 @@ def test_a_bus_is_closed_at_once_while_it_waits_for_a_sign_of_life(monkeypatch: 
         assert not closing.is_alive()
 
 
+@pytest.mark.parametrize("keys", [20, 300])
+def test_the_sign_of_life_takes_no_longer_with_many_who_are_alive(
+    monkeypatch: pytest.MonkeyPatch, keys: int
+) -> None:
+    """One answer was taken at each look: 18 s for twenty of them. And 300 were more than the channel held, so
+    that the client waited for ever.
+    """
+    with client_and_router(monkeypatch) as (client, router, _):
+        for k in range(keys):
+            router.announce(f"m/alive/r{k}")
+        seen: set[str] = set()
+        client.watch("m/alive/*", lambda key, there: seen.add(key))
+        eventually(lambda: len(seen) == keys)
+        answered: list[bool] = []
+
+        def ask() -> None:
+            with client.using_session() as session:
+                assert session is not None
+                answered.append(client._is_answered(session))
+
+        began = time.monotonic()
+        asking = threading.Thread(target=ask, daemon=True)
+        asking.start()
+        asking.join(30.0)
+        assert answered == [True] and time.monotonic() - began < 5.0
+
+
 class Silent:
     """A session whose router says nothing for as long as is waited for it; counts how often one looks."""
 
@@ -163,7 +190,7 @@ class Silent:
     def liveliness(self) -> Silent:
         return self
 
-    def get(self, key: str, timeout: float) -> Silent:
+    def get(self, key: str, handler: object, timeout: float) -> Silent:
         return self
 
     def try_recv(self) -> None:
