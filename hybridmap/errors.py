@@ -34,7 +34,7 @@ class DeviceError(MapweaveError):
 
 
 class NotConnected(MapweaveError):
-    """No router, or no answer."""
+    """There is no router, or no answer."""
 
 
 class Busy(MapweaveError):

@@ -195,7 +195,7 @@ class MapsExplanation:
 
 @dataclass(frozen=True, slots=True)
 class FleetExplanation:
-    """Of some two maps each, why they are one or are not.
+    """Why each pair of some maps is joined or is not.
 
     Attributes:
         maps: two each.
@@ -208,7 +208,7 @@ class FleetExplanation:
 
 @dataclass(frozen=True, slots=True)
 class Hop:
-    """From one node to another on a way, or what keeps robots from driving there.
+    """A step from one node to another on a way, or what keeps robots from driving there.
 
     Attributes:
         a: from here.

@@ -31,7 +31,7 @@ FEW = 4
 
 @dataclass(frozen=True, slots=True)
 class ManualConstraint:
-    """That something is so, or that it no longer is.
+    """A person's statement that something is so, or that it no longer is.
 
     Attributes:
         about: what: nodes or maps kept apart, nodes linked by hand, what is retired.

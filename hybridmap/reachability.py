@@ -30,7 +30,7 @@ RECOGNISED = (EdgeKind.LOOP, EdgeKind.MERGED)
 
 @dataclass(frozen=True, slots=True)
 class Reachability:
-    """Whether the servo could drive an edge.
+    """Whether the servo could drive an edge, and why.
 
     Attributes:
         drivable: whether routes may use it.

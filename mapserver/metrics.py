@@ -110,7 +110,7 @@ class Sources:
 
 
 class Metrics:
-    """Of one server. Thread-safe."""
+    """The Prometheus metrics of one server. Thread-safe."""
 
     def __init__(self) -> None:
         """Begin with nothing observed."""

@@ -18,7 +18,7 @@ SILENT = "the store does not answer"
 
 
 class PromptReading(Generic[T]):
-    """Of a store, which may wait for a disk or for a database that does not answer."""
+    """Reads a store that may wait for a disk or for a database that does not answer."""
 
     def __init__(self, read: Callable[[], T], executor: Executor, clock: Callable[[], float]) -> None:
         """Read for the first time, however long it takes.

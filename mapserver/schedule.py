@@ -249,7 +249,7 @@ class _Inline(Executor):
 
 
 class LockstepSchedule:
-    """No threads: jobs run when a question is asked, and the clock is that of the robots' messages.
+    """Without threads: jobs run when a question is asked, and the clock is that of the robots' messages.
 
     What a server answers then depends on what it was sent before, and not on how quick the machine is.
     """

@@ -50,7 +50,7 @@ class Moved:
 
 @dataclass(frozen=True)
 class MapDifference:
-    """From one map to another.
+    """What changed from one map to another.
 
     Attributes:
         added: nodes that are new, in order; so below.

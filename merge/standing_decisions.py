@@ -15,7 +15,7 @@ from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 @dataclass(frozen=True, eq=False)
 class StandingDecisions:
-    """Of links by their pairs: what was decided of each, and where that put the nodes.
+    """Standing decisions on links, by their pairs: what was decided of each, and where that put the nodes.
 
     A decision holds for the very link that it was made of, compared by identity: links are never changed,
     only replaced.

@@ -18,7 +18,7 @@ MOST_PIXELS = 800 * 600
 
 
 class ImageSize(NamedTuple):
-    """Of an image, px."""
+    """Width and height of an image, px."""
 
     width: int
     height: int

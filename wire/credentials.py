@@ -23,7 +23,7 @@ class Role(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Credentials:
-    """Of one identity. Either certificates, or a password.
+    """The credentials of one identity: either certificates, or a password.
 
     Attributes:
         name: of the identity: the certificate's common name, or the user name.

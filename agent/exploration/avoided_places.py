@@ -31,7 +31,7 @@ class _Avoided:
 
 
 class AvoidedPlaces:
-    """Of one robot. Times are seconds of its exploration."""
+    """Places that one robot keeps away from while it explores. Times are seconds of its exploration."""
 
     def __init__(self, spacing: float) -> None:
         """Every place may be tried.

@@ -23,7 +23,7 @@ NEAR = 1.0
 
 
 class CameraExploration(Explorer):
-    """The same exploration, with readings of the camera's occupancy grid in place of proximity sensors.
+    """Frontier exploration with readings of the camera's occupancy grid in place of proximity sensors.
 
     A turn on the spot shows no depths, so every place is looked around at with drives.
     """

@@ -11,7 +11,7 @@ from mapweave.hybridmap.pose import Pose2
 
 
 class RefutedPlaces:
-    """By node. The same node may be right when another view, from elsewhere, gives it.
+    """Nodes whose place was refuted. A node may be right when another view, from elsewhere, gives it.
 
     Attributes:
         count: answers that were refuted, of a node or a whole route.

@@ -31,7 +31,7 @@ LONGEST_ROUTE = 100.0
 
 
 class AnswerTrial:
-    """Of the way to one stop of a mission, or to its goal.
+    """Tries a server's answer on the way to one stop of a mission, or to its goal.
 
     Attributes:
         node: by which the robot is localized by the fleet's word alone; None if its own view bears it out.

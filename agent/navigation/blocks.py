@@ -28,7 +28,7 @@ class _Block(NamedTuple):
 
 
 class Blocks:
-    """In the order in which they were found."""
+    """The blocked edges, in the order in which they were found."""
 
     def __init__(self, settings: NavigatorSettings | None = None) -> None:
         """Start without blocks."""

@@ -12,7 +12,7 @@ YIELDED = 30.0
 
 
 class GoalPatience:
-    """Of one goal.
+    """How long a robot goes on trying to reach one goal.
 
     Attributes:
         trouble: what keeps the robot from its goal, in words.

@@ -22,7 +22,7 @@ OVERDUE = 3.0
 
 
 class Passage(StrEnum):
-    """Whether a robot may drive on."""
+    """The answer to a robot that asks to drive on."""
 
     FREE = "free"
     HELD = "held by another robot"
@@ -32,7 +32,7 @@ class Passage(StrEnum):
 
 
 class RightOfWay:
-    """Of one drive along a route.
+    """Asks for the right of way on one drive along a route.
 
     Attributes:
         holder: the robot that drives or stands where this one wants to; empty without one.

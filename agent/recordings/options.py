@@ -14,7 +14,7 @@ from mapweave.hybridmap.errors import DeviceError, InvalidValue
 
 @dataclass(frozen=True)
 class RecordingOptions:
-    """Of `mapweave replay` and `mapweave info`.
+    """The options of `mapweave replay` and `mapweave info` that say how a recording is read.
 
     Attributes:
         camera: a camera.toml, instead of what the recording says.

@@ -48,7 +48,7 @@ class ReplicationSettings:
 
 @dataclass(frozen=True, slots=True)
 class ReplicationStatus:
-    """For the status line.
+    """How far replication is, for the status line.
 
     Attributes:
         newest: sequence number of the newest committed change of the map that is being made.

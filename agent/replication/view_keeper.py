@@ -36,7 +36,7 @@ SUFFIX = ".jpg"
 
 
 class ViewKeeper:
-    """Of one robot, for all its maps."""
+    """Keeps the images of one robot's nodes, for all its maps."""
 
     def __init__(self, bus: Bus, keys: Keys, agent: str, folder: Path) -> None:
         """Begin to answer.

@@ -35,7 +35,7 @@ NEIGHBOURS = 9
 
 @dataclass(frozen=True)
 class ImageQuality:
-    """Of one image.
+    """How sharp and how well exposed one image is.
 
     Attributes:
         mean: grey level.

@@ -21,7 +21,7 @@ from mapweave.wire.codec import element_of, encode_body, encode_change
 
 @dataclass(frozen=True, slots=True)
 class Account:
-    """Of one robot, or summed over robots.
+    """What was sent and stored, of one robot or summed over robots.
 
     Attributes:
         sent: changes that the robot's journal had committed, by the robot's own log.

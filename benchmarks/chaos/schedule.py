@@ -43,7 +43,7 @@ LASTING = {
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One of them.
+    """One disturbance: what, to whom and when.
 
     Attributes:
         at: s from the start.

@@ -40,7 +40,7 @@ Belief = tuple[Array, Array]
 
 @dataclass(frozen=True)
 class Speed:
-    """Of one size of state.
+    """The times of both filters for one size of state.
 
     Attributes:
         full_ms: median step of our filter as robots run it.

@@ -92,7 +92,7 @@ class TimedJournal(Journal):
 
 
 class SlowTimedJournal(TimedJournal, SlowJournal):
-    """The same, on a slow disk."""
+    """A timed journal on a slow disk."""
 
 
 class AgentLink:

@@ -30,7 +30,7 @@ TIMEOUT = 5.0
 
 
 class Flooder:
-    """Its logs are real: what it publishes it also answers for."""
+    """A robot that floods the server. Its logs are real: what it publishes it also answers for."""
 
     def __init__(self, name: str, endpoint: str, rate: float, seed: int) -> None:
         """Connect.

@@ -27,7 +27,7 @@ TURNS = 5
 
 
 class HttpApplication:
-    """Of a server without maps."""
+    """The HTTP application of a server without maps."""
 
     def __init__(self) -> None:
         """Start it."""

@@ -53,7 +53,7 @@ class Differences:
 
 @dataclass(frozen=True, eq=False)
 class Distractors:
-    """As many places as are wanted; number k is always the same.
+    """Places that are nowhere, as many as are wanted; number k is always the same.
 
     Attributes:
         donors: places that a robot would make of real views.

@@ -85,7 +85,7 @@ class Ids:
 
 @dataclass(frozen=True, eq=False)
 class ComparedNodes:
-    """Of N nodes what comparing needs, see `mapweave.mapserver.retrieval.compared_landmarks.bounded`.
+    """What comparing needs of N nodes, see `mapweave.mapserver.retrieval.compared_landmarks.bounded`.
 
     Attributes:
         ids: of the nodes.

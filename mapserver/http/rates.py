@@ -20,7 +20,7 @@ MOST_PEOPLE = 4096
 
 
 class Rates:
-    """By person, and by address on a fleet without keys. Used by the server's thread alone."""
+    """Rates of requests by person; by address on a fleet without keys. Used by the server's thread alone."""
 
     def __init__(self, rate: float = QUESTIONS, clock: Callable[[], float] = time.monotonic) -> None:
         """Begin without any.

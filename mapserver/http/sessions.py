@@ -24,7 +24,7 @@ Clock = Callable[[], float]
 
 
 class Sessions:
-    """By the secret in a browser's cookie."""
+    """Sessions by the secret in a browser's cookie."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         """Begin with none.

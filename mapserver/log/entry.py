@@ -66,7 +66,7 @@ class Applied:
 
 
 class Position(NamedTuple):
-    """Of a log.
+    """How far a log has come.
 
     Attributes:
         log_id: which log it is.

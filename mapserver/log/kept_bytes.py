@@ -41,7 +41,7 @@ class _Kept:
 
 
 class KeptBytes:
-    """Of the maps of one robot."""
+    """How many bytes of one robot's maps the store keeps."""
 
     def __init__(self, agent: str, store: Store) -> None:
         """Read nothing yet.

@@ -28,7 +28,7 @@ class Lag(NamedTuple):
 
 
 class KnownLogs(Mapping[MapId, AgentLog]):
-    """By their maps. One thread changes them."""
+    """The logs that the server knows, by their maps. One thread changes them."""
 
     def __init__(self) -> None:
         """Start with none."""

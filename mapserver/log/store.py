@@ -76,7 +76,7 @@ CONSTRAINTS, ANNOTATIONS = "manual_constraint", "annotation"
 
 
 class Store(Protocol):
-    """Its methods may be called from any thread. What they return as done survives a loss of power.
+    """The record of all logs. Any thread may call it; what it returns as done survives a loss of power.
 
     Attributes:
         id: random, drawn when the store was made, see mapweave.wire.log_messages.Ack.

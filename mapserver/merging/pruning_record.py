@@ -24,7 +24,7 @@ MARK_BYTES = 16
 
 
 class PruningRecord:
-    """Of one store. Only the merging thread may call its methods."""
+    """What was pruned from one store. Only the merging thread may call its methods."""
 
     def __init__(
         self, store: Store, keep_days: float, named: Callable[[], Iterable[object]], base: Collection[MapId]

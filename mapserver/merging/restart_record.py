@@ -19,7 +19,7 @@ from mapweave.merge.pose_graph.candidates import Pair
 
 @dataclass(frozen=True)
 class RestartRecord:
-    """Of one merge.
+    """What a server needs to take up one merge after a restart.
 
     Attributes:
         recent: what was compared since the verification cache was saved, with the fingerprints of all nodes.

@@ -20,7 +20,7 @@ PRINT_BYTES = 16
 
 @dataclass(frozen=True, eq=False)
 class VerificationCache:
-    """Of some nodes.
+    """Results of verifying pairs of some nodes.
 
     Attributes:
         prints: of the nodes that were compared with all others that there were.

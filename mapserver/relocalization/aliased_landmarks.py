@@ -40,7 +40,7 @@ other, m and rad."""
 
 
 class AliasedLandmarks:
-    """Whether one node is recognised in another; remembered as long as both stay what they are."""
+    """Tells whether one node is recognised in another; remembered as long as both stay what they are."""
 
     def __init__(self, settings: RecognitionSettings) -> None:
         """Take when a place counts as recognised; a likeness may leave open where exactly it is seen from."""

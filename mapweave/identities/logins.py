@@ -31,7 +31,7 @@ class Login:
 
 
 class Logins:
-    """Of the members of one fleet. Thread-safe: nothing but whole values is replaced.
+    """Logins of the members of one fleet. Thread-safe: nothing but whole values is replaced.
 
     Attributes:
         hosts: names and addresses under which the fleet's server is reached.

@@ -69,7 +69,7 @@ class AgentSources:
 
 
 class AgentMetrics(Collector):
-    """Of one agent, from its start to its end. The loop calls `step`, and never waits for a scrape."""
+    """The metrics of one agent during its life. The loop calls `step`, and never waits for a scrape."""
 
     def __init__(self, robot: str) -> None:
         """Begin with nothing counted.

@@ -7,7 +7,7 @@ PATIENCE = 20.0
 
 
 class ServerWatch:
-    """Of one agent.
+    """Watches for one agent whether a server is alive.
 
     Attributes:
         arrivals: how often the map server has come in reach.

@@ -12,7 +12,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
 class MapStanding(NamedTuple):
-    """Of one map.
+    """How one map stands in the merge.
 
     Attributes:
         newest: its newest node; None without nodes.

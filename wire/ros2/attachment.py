@@ -19,7 +19,7 @@ NAMES = (b"sequence_number", b"source_timestamp", b"source_gid")
 
 
 class Attachment(NamedTuple):
-    """Of one message.
+    """The attachment of one message.
 
     Attributes:
         sequence: counts a publisher's messages, from 1.
