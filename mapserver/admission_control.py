@@ -15,6 +15,15 @@ from msgspec import Meta
 
 from mapweave.hybridmap.errors import Busy
 
+TOO_LATE = 1.25
+"""A question whose answer would take so many times `in_time` when its turn comes is refused then: the others
+behind it are answered in time. Chosen: above 1, or what is accepted at the limit is refused after it has
+waited."""
+FIRST_GUESS = 0.1
+"""How long a question is taken to take before any was answered, s. Chosen: several times what one takes (15
+ms at 1000 places); it is forgotten after about 1 / SMOOTHING answers."""
+SMOOTHING = 0.2
+"""Weight of the newest question in the mean time that one takes: the mean is that of the last ten or so."""
 LATENESS = 0.5
 """Tolerance of an appointment, s: a message takes time both ways."""
 MOST_BOOKED = 1024
@@ -31,17 +40,10 @@ class AdmissionSettings:
         workers: questions that are worked on at once; 0 for one a core, four at the most.
         in_time: a question that would have its answer later than this, as far as is known, is refused, unless
             a worker is free, s.
-        too_late: a question whose turn comes so late that its answer would take so many times as long is
-            refused as well: the others behind it are answered in time then.
-        first_guess: how long a question takes, before any was answered, s.
-        smoothing: weight of the newest question in the mean time that one takes.
     """
 
     workers: Annotated[int, Meta(ge=0, le=64)] = 0
     in_time: Annotated[float, Meta(gt=0.0)] = 0.7
-    too_late: Annotated[float, Meta(ge=1.0)] = 1.25
-    first_guess: Annotated[float, Meta(gt=0.0)] = 0.1
-    smoothing: Annotated[float, Meta(gt=0.0, le=1.0)] = 0.2
 
     @property
     def threads(self) -> int:
@@ -67,6 +69,7 @@ class AdmissionControl:
         settings: AdmissionSettings | None = None,
         clock: Callable[[], float] = time.monotonic,
         executor: Executor | None = None,
+        first_guess: float = FIRST_GUESS,
     ) -> None:
         """Start the workers.
 
@@ -74,6 +77,7 @@ class AdmissionControl:
             settings: how many, and what is too long.
             clock: the time, s.
             executor: does the work; threads of its own if not given. It is shut down with this.
+            first_guess: how long a question takes, before any was answered, s.
         """
         self._settings = settings or AdmissionSettings()
         self._clock = clock
@@ -81,7 +85,7 @@ class AdmissionControl:
         self._open = 0
         self._answered = 0
         self._refused = 0
-        self._seconds = self._settings.first_guess
+        self._seconds = first_guess
         self._appointment = -math.inf
         self._booked: dict[int, float] = {}
         self._asking: set[str] = set()
@@ -112,7 +116,7 @@ class AdmissionControl:
                 self._refused += 1
                 raise Busy(max(self._seconds, SHORTEST_PAUSE))
             s, now, wait = self._settings, self._clock(), self._wait()
-            latest = s.too_late * s.in_time
+            latest = TOO_LATE * s.in_time
             kept = self._keeps_appointment(ticket, now)
             allowed = latest if kept else s.in_time - self._expected(now)
             if wait > 0.0 and wait + self._seconds > allowed:
@@ -200,4 +204,4 @@ class AdmissionControl:
                 self._asking.discard(asker)
                 self._answered += 1
                 if usual:
-                    self._seconds += self._settings.smoothing * (self._clock() - began - self._seconds)
+                    self._seconds += SMOOTHING * (self._clock() - began - self._seconds)

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapweave.agent.ekf import localization_filter, mapping_filter
+from mapweave.agent.ekf import gating, localization_filter, mapping_filter, motion
 from mapweave.agent.exploration import behaviours, carried_mapping
 from mapweave.agent.mapping import initial_depth, keyframe_builder, mapper
 from mapweave.agent.observation import RobotDescription
@@ -31,7 +31,7 @@ NUMBERS = (
     ("σ = {:g} of its way", RobotDescription.__dataclass_fields__["wheel_noise"].default),
     ("σ₃ = {:g} (|u₁|", RobotDescription.__dataclass_fields__["side_slip"].default),
     ("σ_px is {:g} px", FILTER.pixel_sigma),
-    ("the {:g} % gate", 100 * FILTER.gate_probability),
+    ("the {:g} % gate", 100 * gating.GATE_PROBABILITY),
     ("the depth is {:g} times the camera's height", mapper.DEPTHS_PER_HEIGHT),
     ("w is {:g} of its value", initial_depth.PRIOR_SPREAD),
     ("at least {:g} over the camera's height", initial_depth.PRIOR_NEAR),
@@ -58,7 +58,7 @@ def test_counts_that_are_written_out() -> None:
     assert "until four features are left" in FLAT
     assert localization_filter.ITERATIONS == 4
     assert "at most four times" in FLAT
-    assert FILTER.wheel_floor == 1e-5
+    assert motion.WHEEL_FLOOR == 1e-5
     assert "(10⁻⁵ m)²" in PAGE
 
 

@@ -9,12 +9,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.arrays import among
-from mapweave.agent.ekf.gating import pixel_gate
+from mapweave.agent.ekf.gating import GATE_PROBABILITY, pixel_gate
 from mapweave.agent.ekf.inverse_depth import project_anchored, rays_of_points
 from mapweave.agent.ekf.iterated import LandmarkMeasurements, iterated_update
 from mapweave.agent.ekf.landmark_estimates import Ids, NodeLandmarks
 from mapweave.agent.ekf.localization_state import NEAREST_SCALE, LocalizationState, turning
-from mapweave.agent.ekf.motion import WheelNoise, move_pose
+from mapweave.agent.ekf.motion import WIDEST_SLOPE, WheelNoise, move_pose
 from mapweave.agent.ekf.update_report import Health, UpdateReport
 from mapweave.agent.observation import Odometry
 from mapweave.agent.settings import FilterSettings
@@ -95,7 +95,7 @@ class LocalizationFilter:
         self._side_slip = side_slip
         self.ids: Ids = np.zeros(0, np.int64)
         self._camera = camera
-        self._wheels = WheelNoise(axle, wheel_noise, self._settings.wheel_floor)
+        self._wheels = WheelNoise(axle, wheel_noise)
         self._focal = np.array([camera.fx, camera.fy])
         self._centre = np.array([camera.cx, camera.cy])
         self._state = LocalizationState.of_prior(prior)
@@ -139,7 +139,7 @@ class LocalizationFilter:
             return self._judge(UpdateReport.blind(len(ids), "no landmark of the node is in view"))
         slopes = (pixels[rows] - self._centre) / self._focal
         variances, linear = (self._settings.pixel_sigma / self._focal) ** 2, LINEAR_PX / self._camera.fx
-        gate = pixel_gate(self._settings.gate_probability)
+        gate = pixel_gate(GATE_PROBABILITY)
         measurement = LandmarkMeasurements(slots, slopes, variances, gate, ITERATIONS, linear)
         fit = iterated_update(self._state, start, measurement, mount)
         if fit is None:
@@ -276,7 +276,7 @@ class LocalizationFilter:
 
     def _anchorable(self, rays: Array) -> NDArray[np.bool_]:
         near = rays[:, 2] * NEAREST > 1.0
-        aside = ~(np.abs(rays[:, 0]) <= self._settings.widest_slope)
+        aside = ~(np.abs(rays[:, 0]) <= WIDEST_SLOPE)
         return np.asarray((rays[:, 2] > 0) & ~near & ~aside, np.bool_)
 
     def _keep(self, mask: NDArray[np.bool_]) -> None:

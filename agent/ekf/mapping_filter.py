@@ -15,7 +15,14 @@ from numpy.typing import NDArray
 from mapweave.agent.arrays import among
 from mapweave.agent.ekf.adaptive_odometry_noise import AdaptiveOdometryNoise
 from mapweave.agent.ekf.filter_health import FilterHealth
-from mapweave.agent.ekf.gating import MEDIAN, Judgement, pixel_gate, remove_outliers, select_inliers
+from mapweave.agent.ekf.gating import (
+    GATE_PROBABILITY,
+    MEDIAN,
+    Judgement,
+    pixel_gate,
+    remove_outliers,
+    select_inliers,
+)
 from mapweave.agent.ekf.innovations import Examined, innovation_covariance, whiten
 from mapweave.agent.ekf.landmark_estimates import Ids, LandmarkEstimates
 from mapweave.agent.ekf.mapping_state import (
@@ -25,8 +32,14 @@ from mapweave.agent.ekf.mapping_state import (
     MappingState,
     WheelStep,
 )
-from mapweave.agent.ekf.measurement_model import ImageMeasurement, Pinhole, slots_of
-from mapweave.agent.ekf.motion import WheelNoise, move_pose, transform_rays
+from mapweave.agent.ekf.measurement_model import (
+    RELINEARISATIONS,
+    SLIP_SIGMAS,
+    ImageMeasurement,
+    Pinhole,
+    slots_of,
+)
+from mapweave.agent.ekf.motion import WIDEST_SLOPE, WheelNoise, move_pose, transform_rays
 from mapweave.agent.ekf.pitch_correction import pitch_offset
 from mapweave.agent.ekf.pixel_noise import PixelNoise
 from mapweave.agent.ekf.update_report import Health, UpdateReport
@@ -83,21 +96,19 @@ class MappingFilter:
         self.ids: Ids = np.zeros(0, np.int64)
         self._camera = camera
         self._pinhole = Pinhole(camera)
-        self._wheels = AdaptiveOdometryNoise(
-            WheelNoise(axle, wheel_noise, self.settings.wheel_floor), side_slip
-        )
-        self._gate = pixel_gate(self.settings.gate_probability)
-        self._noise = PixelNoise(self.settings.pixel_sigma, self._pinhole.focal, self.settings.adaptation)
+        self._wheels = AdaptiveOdometryNoise(WheelNoise(axle, wheel_noise), side_slip)
+        self._gate = pixel_gate(GATE_PROBABILITY)
+        self._noise = PixelNoise(self.settings.pixel_sigma, self._pinhole.focal)
         self._settled = MappingState.at_anchor()
         self._step: WheelStep | None = None
         self._watch = FilterHealth(camera.fx)
 
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels; landmarks that come behind the camera or far aside are removed."""
-        state, mount, s = self.state, self._camera.mount_forward, self.settings
+        state, mount = self.state, self._camera.mount_forward
         pose_vector, _, _ = move_pose(state.pose_vector, odometry)
         rays, scale = transform_rays(state.rays, odometry, mount)
-        stays = (scale > 1e-3) & (rays[:, 2] * NEAREST <= 1.0) & (np.abs(rays[:, 0]) <= s.widest_slope)
+        stays = (scale > 1e-3) & (rays[:, 2] * NEAREST <= 1.0) & (np.abs(rays[:, 0]) <= WIDEST_SLOPE)
         root, aside = self._wheels.root(odometry), self._wheels.side_slip(odometry)
         taken = WheelStep(state, odometry, root, aside, mount, odometry, pose_vector, rays)
         if not stays.all():
@@ -150,20 +161,19 @@ class MappingFilter:
             ids: (N,) what is seen; ids that the filter does not hold are ignored.
             pixels: (N, 2) px, undistorted; rows with NaN are ignored.
         """
-        s = self.settings
         self._noise.begin_image()
         measurement = ImageMeasurement.of(self.ids, ids, pixels, self._pinhole)
         if not len(measurement.slots):
             self._watch.saw(Health.BLIND, "no landmark of the filter is in view")
             return UpdateReport.blind(len(ids), "no landmark of the filter is in view")
         by_wheels = self._step
-        self._step, innovations = measurement.compared(by_wheels, self._settled, self._noise.variances, s)
+        self._step, innovations = measurement.compared(by_wheels, self._settled, self._noise.variances)
         if not innovations.worst <= self._gate:
             nod = pitch_offset(innovations.innovations, self._spread(measurement.slots), measurement.slopes)
             if nod is not None:
                 measurement = measurement._replace(slopes=measurement.slopes - nod)
                 self._step, innovations = measurement.compared(
-                    by_wheels, self._settled, self._noise.variances, s
+                    by_wheels, self._settled, self._noise.variances
                 )
         judged = self._judge(measurement, innovations)
         nis, health, reason = math.nan, judged.health, judged.reason
@@ -293,12 +303,12 @@ class MappingFilter:
         if judged.agreeing < len(slots):
             slots, slopes = slots[judged.inliers], slopes[judged.inliers]
             residual = residual[judged.inliers]
-        for _ in range(self.settings.relinearisations):
+        for _ in range(RELINEARISATIONS):
             if self._step is None:
                 break
             at = self._step.at
             likely, surprise = self._step.in_hindsight(slots, residual, whitening)
-            if surprise > self.settings.slip_sigmas and not slip:
+            if surprise > SLIP_SIGMAS and not slip:
                 slip = f"the landmarks refute the wheels by {surprise:.0f} sigmas"
                 root = self._wheels.refuted(self._step.measured, surprise)
                 self._step = self._step.again(at=likely, wheel_root=root)

@@ -25,6 +25,13 @@ from mapweave.hybridmap.pose import Array
 
 STANDS = 1e-4
 """A wheel's way below this is none, m."""
+WIDEST_SLOPE = 4.0
+"""Landmarks further aside than this |a| are let go, or cannot be anchored at a node: 76 degrees off the axis.
+Chosen: a' grows without bound as D goes to 0 (above), so the linearisation fails before that."""
+WHEEL_FLOOR = 1e-5
+"""Standard deviation of a wheel's way in a step that has none, m. It keeps the covariance of a standing
+robot's step invertible, and is a tenth of `STANDS`. An encoder that is silent while the robot moves is
+refuted by its first image (docs/decisions/ekf-parametrisation.md)."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -34,18 +41,16 @@ class WheelNoise:
     Attributes:
         axle: distance between the wheels L, m.
         share: standard deviation of a wheel's way as a share of the way: sigma of the paper.
-        floor: standard deviation of a step that has no way at all, m: the encoders' resolution.
     """
 
     axle: float
     share: float
-    floor: float = 1e-5
 
     def root(self, odometry: Odometry) -> Array:
         """(2, 2) root R of the covariance R R^T of (u1 m, u2 rad) of one step, one column a wheel."""
         right, left = self.ways(odometry)
         return self._root(
-            math.hypot(self.share * right, self.floor), math.hypot(self.share * left, self.floor)
+            math.hypot(self.share * right, WHEEL_FLOOR), math.hypot(self.share * left, WHEEL_FLOOR)
         )
 
     def refuted_root(self, odometry: Odometry, factor: float, lost: float) -> Array:

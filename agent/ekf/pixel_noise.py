@@ -8,6 +8,9 @@ from mapweave.hybridmap.pose import Array
 
 MOST_EXCESS = 16.0
 """Largest ratio of the variance to the nominal variance."""
+ADAPTATION = 0.1
+"""Share of an image's excess that is taken over at once, 0 ... 1: what all pixels are worse by than any
+tracker knows (a floor that is not flat, shaking, blur) is learned within about 1 / ADAPTATION images."""
 
 
 class PixelNoise:
@@ -17,17 +20,15 @@ class PixelNoise:
         variances: (2,) of a measured slope, horizontal and vertical.
     """
 
-    def __init__(self, pixel_sigma: float, focal: Array, adaptation: float) -> None:
+    def __init__(self, pixel_sigma: float, focal: Array) -> None:
         """Begin with the nominal variances.
 
         Args:
             pixel_sigma: standard deviation of a tracked pixel, px.
             focal: (2,) px.
-            adaptation: share of an image's excess that is taken over at once, 0 ... 1.
         """
         self.variances: Array = np.square(pixel_sigma / focal)
         self._nominal = self.variances
-        self._adaptation = adaptation
         self._excess = self._next = 1.0
 
     def begin_image(self) -> None:
@@ -41,5 +42,5 @@ class PixelNoise:
 
         In logarithms, so that images twice as good and twice as bad as nominal cancel.
         """
-        learned = self._excess * min(excess, MOST_EXCESS) ** self._adaptation
+        learned = self._excess * min(excess, MOST_EXCESS) ** ADAPTATION
         self._next = min(max(learned, 1.0), MOST_EXCESS)

@@ -42,9 +42,9 @@ class NodeLocalizer:
     ) -> None:
         """Start from a recognition of the node in an image's features."""
         self.node = node
-        self._settings = s = settings or AgentSettings()
+        self._settings = settings or AgentSettings()
         self._description = description
-        self._tracks = NodeTracks(lens, image, features, recognition.pairs, s.tracker, STRIKES)
+        self._tracks = NodeTracks(lens, image, features, recognition.pairs, STRIKES)
         self._depths, self._depth_sigmas = np.full((2, len(node.landmarks)), np.nan)
         self._teaches = True
         self._filter = self._filter_at(recognition.node_from_robot, self._tracks.ids)

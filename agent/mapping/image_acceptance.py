@@ -10,7 +10,6 @@ from numpy.typing import NDArray
 from mapweave.agent.arrays import among, same_image
 from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector, relit
 from mapweave.agent.observation import Observation
-from mapweave.agent.settings import TrackingSettings
 from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.pose import Array, Pose2
 
@@ -18,6 +17,12 @@ DROPPED = 3
 """Images that may be missing, one after the other, before the robot should wait for the next."""
 STALE = (0.4, 0.5)
 """Once the wheels have moved this much, nothing can be said of an image before, m and rad."""
+PATIENCE = 30
+"""Images in a row that show other things than they should before the robot takes itself for carried off.
+Chosen: 3 s at 10 Hz, in which a person who walks by is gone."""
+BLANK_PATIENCE = 100
+"""The same for images that show nothing. Chosen: 10 s at 10 Hz, in which a light that was switched off by
+mistake is on again. A robot maps nothing in the meantime."""
 
 
 class ImageAcceptance:
@@ -34,11 +39,11 @@ class ImageAcceptance:
         missing: how many images in a row did not come, or came a second time.
     """
 
-    def __init__(self, detector: KidnapDetector, settings: TrackingSettings) -> None:
-        """Take what compares two images, and how long strange images may last."""
+    def __init__(self, detector: KidnapDetector) -> None:
+        """Take what compares two images."""
         self.moved = Pose2()
         self.strange = self.blank = self.missing = 0
-        self._detector, self._settings = detector, settings
+        self._detector = detector
         self._accepted: NDArray[np.uint8] | None = None
 
     @property
@@ -49,7 +54,7 @@ class ImageAcceptance:
     @property
     def carried_off(self) -> bool:
         """Whether images have shown something else for so long that the robot must be elsewhere."""
-        return self.strange >= self._settings.patience or self.blank >= self._settings.blank_patience
+        return self.strange >= PATIENCE or self.blank >= BLANK_PATIENCE
 
     def predict(self, motion: Pose2) -> None:
         """The wheels have moved."""

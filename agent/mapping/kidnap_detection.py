@@ -15,7 +15,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.arrays import lengths
-from mapweave.agent.settings import TrackerSettings
 from mapweave.agent.vision.image_quality import BLACK, LEAST_CORNERS, MOST_CLIPPED, WHITE, strongest_corners
 from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.camera import Camera
@@ -55,11 +54,10 @@ FEW_POINTS = 30
 class KidnapDetector:
     """Compares two images by the points that are tracked, or by corners where these are too few."""
 
-    def __init__(self, lens: Lens, camera: Camera, tracker: TrackerSettings) -> None:
-        """Take the camera and how its points are tracked."""
+    def __init__(self, lens: Lens, camera: Camera) -> None:
+        """Take the camera."""
         self._lens = lens
         self._camera = camera
-        self._tracker = tracker
 
     def compare(
         self,
@@ -114,7 +112,8 @@ class KidnapDetector:
         corners = strongest_corners(before)
         if len(corners) < least:
             return None
-        tracker = Tracker(self._lens, self._tracker)
+        # The points live for one step: nothing to hold them to.
+        tracker = Tracker(self._lens, anchored=False)
         tracker.track(before)
         tracker.add(np.arange(len(corners), dtype=np.int64), corners)
         expected = turned(self._camera, tracker.pixels, turn)

@@ -25,6 +25,13 @@ from mapweave.registration.recognition import RecognitionSettings
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
+LOOKS = 2
+"""Failed views in a row after which a robot is lost; in between it drives on by odometry
+(docs/decisions/routes.md)."""
+FURTHER = 1.0
+"""How far it drives on by odometry after a failed view, m. Chosen: odometry is off by a few percent of it,
+and to turn back to what the robot knows, and about again, takes longer."""
+
 FixSearch = Generator[Command, None, Fix | None]
 
 
@@ -98,10 +105,11 @@ class Positioning:
         """
         self.search, self._localization.detail = self._localization, detail
         yield from self._motion.stand(STILL)
-        fix, s = self._fix((yield from self._localization.look(LENIENT))), self._settings.navigation
-        if fix is None and before is not None and self.failed_views < s.looks:
+        fix = self._fix((yield from self._localization.look(LENIENT)))
+        blind = self._settings.navigation.blind_distance
+        if fix is None and before is not None and self.failed_views < LOOKS:
             self.failed_views += 1
-            return Fix(before.node, before.node_from_robot, None, max(s.blind_distance - s.further, 0.0))
+            return Fix(before.node, before.node_from_robot, None, max(blind - FURTHER, 0.0))
         self.failed_views = 0
         return fix
 

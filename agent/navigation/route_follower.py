@@ -57,6 +57,10 @@ HIDDEN = 2.0
 """After this time at the goal without its landmarks visible, or recognised, the robot is not there, s."""
 PATIENCE = 6.0
 """Time without getting on before an edge counts as blocked, s."""
+PARKING_PATIENCE = 30.0
+"""Time without getting nearer to the goal's pose after which the robot starts again, and after which the
+second time the goal is blocked, s (docs/decisions/routes.md). Chosen: parking goes back and forth, so it
+takes longer than an edge."""
 STALLED = 3.0
 """Time that the servo may take without getting nearer before the robot drives around, s."""
 STALLED_PARKING = 10.0
@@ -171,7 +175,7 @@ class RouteFollower:
             self.progress = RouteProgress.UNSURE
             return Command()
         self._progressed.take(distance, self._description.tick)
-        if self._progressed.stood > (s.parking_patience if parking else PATIENCE):
+        if self._progressed.stood > (PARKING_PATIENCE if parking else PATIENCE):
             self.progress = RouteProgress.BLOCKED
             return Command()
         return self._drive(target, distance, parking, observation)

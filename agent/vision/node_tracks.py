@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.arrays import among
-from mapweave.agent.settings import TrackerSettings
 from mapweave.agent.vision.rejection_counter import RejectionCounter
 from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.pose import Array
@@ -23,7 +22,6 @@ class NodeTracks:
         image: NDArray[np.uint8],
         features: Features,
         pairs: NDArray[np.integer],
-        settings: TrackerSettings,
         strikes: int,
     ) -> None:
         """Begin where a recognition has found the landmarks.
@@ -33,10 +31,9 @@ class NodeTracks:
             image: (H, W) grey.
             features: of the image.
             pairs: (N, 2) indices of landmarks, and of the features that show them.
-            settings: of the tracker.
             strikes: a track that is refused this often in a row is given up.
         """
-        self._tracker = Tracker(lens, settings)
+        self._tracker = Tracker(lens)
         self._tracker.track(image)
         self._strikes = RejectionCounter(strikes)
         self.renew(features, pairs)

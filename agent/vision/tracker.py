@@ -11,12 +11,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.arrays import lengths
-from mapweave.agent.settings import TrackerSettings
 from mapweave.agent.vision.template import TemplateMatcher, Templates
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 
+WINDOW_PX = 11
+"""Side of the patch that Lucas-Kanade matches, px. Chosen, smaller than OpenCV's 21: it must find the point
+again among its neighbours; where exactly it is, its first patch says (docs/decisions/tracking.md)."""
 LEVELS = 2
 """Pyramid levels above the image."""
 BACKWARD_PX = 0.8
@@ -43,10 +45,16 @@ class Tracker:
             alone.
     """
 
-    def __init__(self, lens: Lens, settings: TrackerSettings | None = None) -> None:
-        """Start with no points."""
+    def __init__(self, lens: Lens, anchored: bool = True) -> None:
+        """Start with no points.
+
+        Args:
+            lens: of the camera.
+            anchored: whether points are held to the patches in which they were first seen. What is tracked
+                over one frame only gains nothing by it.
+        """
         self._lens = lens
-        self._settings = settings or TrackerSettings()
+        self._anchored = anchored
         self._image: NDArray[np.uint8] | None = None
         self.ids: NDArray[np.int64] = np.zeros(0, np.int64)
         self.raw: Array = np.zeros((0, 2))
@@ -94,7 +102,6 @@ class Tracker:
             everything = self.ids
             self.clear()
             return everything
-        s = self._settings
         start = self.raw.astype(np.float32)[:, None]
         guess = start.copy()
         if expected is not None:
@@ -102,7 +109,7 @@ class Tracker:
             guess[known, 0] = self._lens.distort(expected[known])
         guess_given = guess.copy()
         criteria = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 20, 0.02)
-        window = (s.window_px, s.window_px)
+        window = (WINDOW_PX, WINDOW_PX)
         forward, found_forward, _ = cv2.calcOpticalFlowPyrLK(
             before, image, start, guess, winSize=window, maxLevel=LEVELS, criteria=criteria,
             flags=cv2.OPTFLOW_USE_INITIAL_FLOW, minEigThreshold=LEAST_TEXTURE / EIGENVALUE_UNIT,
@@ -123,7 +130,7 @@ class Tracker:
         self.raw = forward.astype(np.float64)
         self.keep(kept)
         self.ages = self.ages + 1
-        if s.anchored:
+        if self._anchored:
             match = self._matcher.match(self.templates, image, self.raw)
             self.raw, self.held, self._templates = match.raw, match.held, match.templates
         return lost
@@ -144,8 +151,8 @@ class Tracker:
         self.ids = np.concatenate([self.ids, ids])
         self.raw = np.concatenate([self.raw, raw])
         self.ages = np.concatenate([self.ages, np.zeros(len(ids), np.int64)])
-        self.held = np.concatenate([self.held, np.full(len(ids), self._settings.anchored)])
-        if self._settings.anchored:
+        self.held = np.concatenate([self.held, np.full(len(ids), self._anchored)])
+        if self._anchored:
             held = self.templates
             if templates is None:
                 self._uncut = self._image, raw
@@ -162,7 +169,7 @@ class Tracker:
             return
         self.ids, self.raw = self.ids[mask], self.raw[mask]
         self.ages, self.held = self.ages[mask], self.held[mask]
-        if self._settings.anchored:
+        if self._anchored:
             self._templates = self.templates.chosen(mask)
 
     def clear(self) -> None:

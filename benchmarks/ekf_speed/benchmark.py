@@ -9,19 +9,23 @@ refuse nothing); and FilterPy's on the same model. Each pays for its own model. 
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import time
+from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Protocol
+from unittest.mock import patch
 
 import numpy as np
 from rich.console import Console
 from rich.table import Table
 
 from benchmarks.command_line import command_line
+from mapweave.agent.ekf import mapping_filter, measurement_model, pixel_noise
 from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
 from mapweave.agent.observation import Odometry
@@ -61,6 +65,9 @@ class Speed:
 class Racer(Protocol):
     """A filter at the pace of the race."""
 
+    def rules(self) -> contextlib.AbstractContextManager[None]:
+        """By which it steps."""
+
     def step(self, odometry: Odometry, pixels: Array) -> None:
         """Predict and update."""
 
@@ -72,11 +79,22 @@ class Racer(Protocol):
 class Ours:
     """Our filter."""
 
-    def __init__(self, run: MappingRun, settings: FilterSettings) -> None:
-        """Start with all landmarks of the first image."""
-        self._filter = MappingFilter(run.camera, AXLE, WHEEL_NOISE, settings)
+    def __init__(self, run: MappingRun, plain: bool = False) -> None:
+        """Start with all landmarks of the first image.
+
+        Args:
+            run: what is seen.
+            plain: whether to do what a textbook's filter does, within `rules`.
+        """
+        self._plain = plain
+        with self.rules():
+            self._filter = MappingFilter(run.camera, AXLE, WHEEL_NOISE, FilterSettings(run.pixel_sigma))
         self._ids = np.arange(len(run.points))
         self._filter.add(self._ids, run.pixels[0])
+
+    def rules(self) -> contextlib.AbstractContextManager[None]:
+        """See Racer."""
+        return textbook() if self._plain else contextlib.nullcontext()
 
     def step(self, odometry: Odometry, pixels: Array) -> None:
         """See Racer."""
@@ -98,10 +116,13 @@ class Theirs:
         # It imports scipy.stats, which takes as long as a sixth of all that the tests import.
         from benchmarks.ekf_speed.filterpy_filter import FilterPyMapping
 
-        s = plain(run)
         self._filter = FilterPyMapping(
-            run.camera, AXLE, WHEEL_NOISE, run.pixels[0], s.pixel_sigma, PRIOR_DEPTH, PRIOR_SPREAD
+            run.camera, AXLE, WHEEL_NOISE, run.pixels[0], run.pixel_sigma, PRIOR_DEPTH, PRIOR_SPREAD
         )
+
+    def rules(self) -> contextlib.AbstractContextManager[None]:
+        """See Racer."""
+        return contextlib.nullcontext()
 
     def step(self, odometry: Odometry, pixels: Array) -> None:
         """See Racer."""
@@ -114,15 +135,17 @@ class Theirs:
         return self._filter.x, self._filter.P
 
 
-def plain(run: MappingRun) -> FilterSettings:
-    """Settings under which our filter does what a textbook's does."""
-    return FilterSettings(
-        pixel_sigma=run.pixel_sigma,
-        relinearisations=0,
-        gate_probability=_BELIEVE_ALL,
-        widest_slope=np.inf,
-        adaptation=0.0,
-    )
+@contextlib.contextmanager
+def textbook() -> Iterator[None]:
+    """While it lasts, our filter does what a textbook's does."""
+    with (
+        patch.multiple(
+            mapping_filter, RELINEARISATIONS=0, GATE_PROBABILITY=_BELIEVE_ALL, WIDEST_SLOPE=np.inf
+        ),
+        patch.object(measurement_model, "RELINEARISATIONS", 0),
+        patch.object(pixel_noise, "ADAPTATION", 0.0),
+    ):
+        yield
 
 
 def gap(ours: Belief, theirs: Belief) -> tuple[float, float]:
@@ -136,8 +159,7 @@ def gap(ours: Belief, theirs: Belief) -> tuple[float, float]:
 def race(seed: int, landmarks: int, steps: int = 200) -> Speed:
     """Let the three filters take turns on one run."""
     run = draw_run(np.random.default_rng(seed), "arc", steps=steps, landmarks=landmarks)
-    racers: list[Racer] = [Ours(run, FilterSettings(pixel_sigma=run.pixel_sigma)), Ours(run, plain(run))]
-    racers.append(Theirs(run))
+    racers: list[Racer] = [Ours(run), Ours(run, plain=True), Theirs(run)]
     size = 3 + 3 * landmarks
     # Beliefs are kept in places of their own: taken between the steps, they would leave cold memory to these.
     # With all its rules our filter may give a landmark up; what is compared are the two that do not.
@@ -157,12 +179,13 @@ def race(seed: int, landmarks: int, steps: int = 200) -> Speed:
 def _turn(racer: Racer, run: MappingRun, burst: range, kept: list[Belief]) -> list[float]:
     """How long each step of a burst takes, ms; what is believed after it is kept."""
     times = []
-    for k, (state, covariance) in zip(burst, kept, strict=False):
-        before = time.perf_counter()
-        racer.step(run.odometry[k], run.pixels[k + 1])
-        times.append(1e3 * (time.perf_counter() - before))
-        x, p = racer.belief
-        state[: len(x)], covariance[: len(x), : len(x)] = x, p
+    with racer.rules():
+        for k, (state, covariance) in zip(burst, kept, strict=False):
+            before = time.perf_counter()
+            racer.step(run.odometry[k], run.pixels[k + 1])
+            times.append(1e3 * (time.perf_counter() - before))
+            x, p = racer.belief
+            state[: len(x)], covariance[: len(x), : len(x)] = x, p
     return times
 
 

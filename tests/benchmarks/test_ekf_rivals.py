@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from benchmarks.ekf_speed import benchmark as ekf_speed
-from benchmarks.ekf_speed.benchmark import Ours, Theirs, gap, plain, race
-from mapweave.agent.settings import FilterSettings
+from benchmarks.ekf_speed.benchmark import Ours, Theirs, gap, race, textbook
 from mapweave.hybridmap.camera import Camera
 from synthetic.mapping_run import AXLE, SHAPES, WHEEL_NOISE, draw_run
 from tests.quick import first_quick
@@ -20,29 +19,31 @@ def test_same_estimates_over_a_whole_run(shape: str) -> None:
     """State and covariance to 1e-6 at each of 500 steps, landmarks coming into view and leaving it."""
     run = draw_run(np.random.default_rng([21, SHAPES.index(shape)]), shape, landmarks=12, camera=AHEAD)
     assert np.isnan(run.pixels).any()
-    own, theirs = Ours(run, plain(run)), Theirs(run)
-    for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
-        own.step(odometry, pixels)
-        theirs.step(odometry, pixels)
-        assert max(gap(own.belief, theirs.belief)) < 1e-6
+    own, theirs = Ours(run, plain=True), Theirs(run)
+    with textbook():
+        for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
+            own.step(odometry, pixels)
+            theirs.step(odometry, pixels)
+            assert max(gap(own.belief, theirs.belief)) < 1e-6
 
 
 def test_a_wrong_model_does_not_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     """What the agreement is worth: wheels of twice the noise are noticed."""
     run = draw_run(np.random.default_rng(22), "arc", steps=20, landmarks=12)
-    own = Ours(run, plain(run))
+    own = Ours(run, plain=True)
     monkeypatch.setattr(ekf_speed, "WHEEL_NOISE", 2 * WHEEL_NOISE)
     theirs = Theirs(run)
-    for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
-        own.step(odometry, pixels)
-        theirs.step(odometry, pixels)
+    with textbook():
+        for odometry, pixels in zip(run.odometry, run.pixels[1:], strict=True):
+            own.step(odometry, pixels)
+            theirs.step(odometry, pixels)
     assert min(gap(own.belief, theirs.belief)) > 1e-5
 
 
 def test_a_race_goes_on_when_our_filter_gives_a_landmark_up() -> None:
     """With its rules it does so in this run, at step 72."""
     run = draw_run(np.random.default_rng(8932), "arc", steps=200, landmarks=30)
-    own = Ours(run, FilterSettings(pixel_sigma=run.pixel_sigma))
+    own = Ours(run)
     for odometry, pixels in zip(run.odometry[:72], run.pixels[1:], strict=False):
         own.step(odometry, pixels)
     assert len(own.belief[0]) == 3 + 3 * 29

@@ -22,6 +22,7 @@ from mapweave.hybridmap.query import (
     RouteAnswer,
     RouteRequest,
 )
+from mapweave.mapserver import admission_control
 from mapweave.mapserver.admission_control import AdmissionSettings
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
@@ -40,6 +41,12 @@ from synthetic.world import take_node
 KEYS = Keys("fleet")
 
 
+@pytest.fixture(autouse=True)
+def never_too_late(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What was accepted is answered, however busy this machine is."""
+    monkeypatch.setattr(admission_control, "TOO_LATE", 1e3)
+
+
 class Served:
     """A map server with a mapped room, and a client."""
 
@@ -47,7 +54,7 @@ class Served:
         self.room = room
         hub = MemoryHub()
         self.bus, self.asker = MemoryBus(hub), MemoryBus(hub)
-        services = AdmissionSettings(workers=2, in_time=0.31, too_late=1e3, first_guess=0.1)
+        services = AdmissionSettings(workers=2, in_time=0.31)
         settings, schedule = ServerSettings(services), LockstepSchedule() if lockstep else LiveSchedule()
         self.server = MapServer(self.bus, KEYS, room.path, "s0", settings, schedule)
         self.nodes = sorted(room.truth)

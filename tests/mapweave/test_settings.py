@@ -50,8 +50,8 @@ def test_given_values_replace_the_defaults(tmp_path):
         seed = 7
         [agent.navigation]
         speed = 1
-        [agent.tracker]
-        window_px = 15
+        [agent.tracking]
+        filtered = 20
         """,
     )
     default = Settings()
@@ -62,7 +62,7 @@ def test_given_values_replace_the_defaults(tmp_path):
             agent,
             seed=7,
             navigation=dataclasses.replace(agent.navigation, speed=1.0),
-            tracker=dataclasses.replace(agent.tracker, window_px=15),
+            tracking=dataclasses.replace(agent.tracking, filtered=20),
         ),
     )
     assert given_settings == expected
@@ -119,8 +119,8 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
             "agent.navigation.speed: the number has too many digits",
         ),
         ("[agent.navigation]\nspeed = [1]", "agent.navigation.speed: expected float, got list"),
-        ("[agent.tracker]\nwindow_px = 2", "agent.tracker.window_px: expected int >= 3; it is 2"),
-        ("[agent.filter]\nadaptation = 1.5", "agent.filter.adaptation: expected float <= 1.0; it is 1.5"),
+        ("[agent.tracking]\nfiltered = 2", "agent.tracking.filtered: expected int >= 4; it is 2"),
+        ("[robot.camera]\ndelay = 5.5", "robot.camera.delay: expected float <= 5.0; it is 5.5"),
         ("[admission_control]\nworkers = 65", "admission_control.workers: expected int <= 64; it is 65"),
         ("[agent.landmarks]\nmost_bytes = 100", "robot.toml: most_bytes: a node needs 660 at least, not 100"),
         ("[merge]\nexclusions = 9.0", "merge: no setting 'exclusions'; did you mean 'exclusion'?"),

@@ -6,7 +6,6 @@ import cv2
 import numpy as np
 
 from mapweave.agent.observation import Command
-from mapweave.agent.settings import TrackerSettings
 from mapweave.agent.vision.tracker import Tracker
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import PanelSet, World
@@ -16,10 +15,12 @@ PATCH = np.array([(dx, dy) for dx in (-9, 0, 9) for dy in (-9, 0, 9)], float)
 """Around a point, px: all of it must be on one surface, or what is tracked is no point of a wall."""
 
 
-def test_tracks_follow_points_of_walls(office: World, caster, stand) -> None:
+def test_tracks_follow_points_of_walls(office: World, caster, stand, monkeypatch) -> None:
     """Lucas-Kanade over half a second of driving and turning, against projections of the true points."""
     panels = PanelSet.of(office.panels)
     errors = []
+    # Small windows: how a large patch grows on the way is Lucas-Kanade's trouble, not the picture's.
+    monkeypatch.setattr("mapweave.agent.vision.tracker.WINDOW_PX", 9)
     with Simulation(office, ["r0"], 2) as simulation:
         camera = simulation.describe("r0").camera
 
@@ -27,9 +28,8 @@ def test_tracks_follow_points_of_walls(office: World, caster, stand) -> None:
             return caster.cast(panels, camera, *stand(simulation.truth("r0")), pixels)
 
         for command in (Command(0.3, 0.0), Command(0.15, 0.4), Command(0.0, -0.5), Command(-0.2, 0.2)):
-            # Small windows: how a large patch grows on the way is Lucas-Kanade's trouble, not the picture's.
             description = simulation.describe("r0")
-            tracker = Tracker(Lens(description.camera, description.distortion), TrackerSettings(window_px=9))
+            tracker = Tracker(Lens(description.camera, description.distortion))
             image = simulation.step({"r0": command})["r0"].image
             pixels = cv2.goodFeaturesToTrack(image, 90, 0.02, 9)[:, 0].astype(float)
             pixels = pixels[camera.contains(pixels, 12.0)]

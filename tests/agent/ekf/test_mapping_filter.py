@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 
+from mapweave.agent.ekf import motion, pixel_noise
 from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.ekf.motion import WheelNoise, move_pose, move_rays
 from mapweave.agent.observation import Odometry
@@ -16,8 +17,8 @@ AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_for
 STILL = Odometry(0.0, 0.0)
 
 
-def start(run: MappingRun, side_slip: float = 0.0, **settings: float) -> MappingFilter:
-    made = FilterSettings(pixel_sigma=run.pixel_sigma, **settings)
+def start(run: MappingRun, side_slip: float = 0.0) -> MappingFilter:
+    made = FilterSettings(pixel_sigma=run.pixel_sigma)
     filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, made, side_slip)
     filter_.add(np.arange(len(run.points)), run.pixels[0])
     return filter_
@@ -74,10 +75,11 @@ def test_side_slip_moves_robot_and_landmarks_together() -> None:
     np.testing.assert_allclose(more, np.cov(np.array(samples).T), atol=0.06 * np.abs(more).max())
 
 
-def test_update_is_the_textbook_kalman_update() -> None:
+def test_update_is_the_textbook_kalman_update(monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a step before it there is nothing to linearise again: a plain linear update."""
     run = a_run()
-    filter_ = start(run, adaptation=0.0)
+    monkeypatch.setattr(pixel_noise, "ADAPTATION", 0.0)
+    filter_ = start(run)
     drive(filter_, run, last=60)
     before = filter_.state
     seen = CAMERA.project(run.poses[60].inverse().apply(run.points))
@@ -102,9 +104,10 @@ def test_update_is_the_textbook_kalman_update() -> None:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, AHEAD])
-def test_there_and_back_is_where_it_was(camera: Camera) -> None:
+def test_there_and_back_is_where_it_was(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(motion, "WHEEL_FLOOR", 0.0)
     run = a_run(camera=camera)
-    filter_ = MappingFilter(camera, AXLE, 0.0, FilterSettings(wheel_floor=0.0))
+    filter_ = MappingFilter(camera, AXLE, 0.0)
     filter_.add(np.arange(30), run.pixels[0])
     before = filter_.state
     for step in (Odometry(0.2, 0.3), Odometry(-0.2, -0.3)):

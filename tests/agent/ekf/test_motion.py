@@ -83,7 +83,7 @@ def test_pose_moves_by_composition_and_its_jacobians(step: Odometry, x: float, y
 
 @given(steps)
 def test_wheel_noise_is_that_of_two_independent_wheels(step: Odometry) -> None:
-    noise = WheelNoise(axle=0.24, share=0.02, floor=1e-5)
+    noise = WheelNoise(axle=0.24, share=0.02)
     ways = np.array([step.forward + 0.12 * step.turn, step.forward - 0.12 * step.turn])
     from_ways = np.array([[0.5, 0.5], [1 / 0.24, -1 / 0.24]])
     expected = from_ways @ np.diag((0.02 * ways) ** 2 + 1e-10) @ from_ways.T

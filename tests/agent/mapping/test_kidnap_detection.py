@@ -9,10 +9,10 @@ import skimage.data
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapweave.agent.mapping import image_acceptance
 from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector, relit, turned
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation, Odometry
-from mapweave.agent.settings import AgentSettings, TrackerSettings, TrackingSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
@@ -24,11 +24,7 @@ NOTHING = np.zeros((0, 2))
 
 @pytest.fixture
 def continuity(description) -> KidnapDetector:
-    return KidnapDetector(
-        Lens(description.camera, description.distortion),
-        description.camera,
-        TrackerSettings(),
-    )
+    return KidnapDetector(Lens(description.camera, description.distortion), description.camera)
 
 
 @pytest.fixture(scope="module")
@@ -163,10 +159,11 @@ def watch(mapper: Mapper, images, forward: float = 0.0) -> None:
 
 
 @pytest.fixture
-def mapper(walls, description) -> Mapper:
+def mapper(walls, description, monkeypatch) -> Mapper:
     """It has seen the walls for a moment."""
-    patient = AgentSettings(tracking=TrackingSettings(patience=10, blank_patience=30))
-    mapper = Mapper(MapId("r0", 1), description, patient)
+    monkeypatch.setattr(image_acceptance, "PATIENCE", 10)
+    monkeypatch.setattr(image_acceptance, "BLANK_PATIENCE", 30)
+    mapper = Mapper(MapId("r0", 1), description)
     watch(mapper, [walls.render(HERE)] * 3)
     assert mapper.tracked > 40
     return mapper

@@ -54,9 +54,10 @@ def test_a_missing_image_leaves_the_report(walls, description):
     assert tracking.report == report
 
 
-def test_the_filter_takes_further_tracks_when_its_own_are_left_behind(walls, description):
+def test_the_filter_takes_further_tracks_when_its_own_are_left_behind(walls, description, monkeypatch):
     """The robot turns away from what it chose first; tracks that it did not choose are still in view."""
-    tracking = begun(walls, description, TrackingSettings(filtered=12, refill=8))
+    monkeypatch.setattr("mapweave.agent.mapping.tracking.REFILL_SHARE", 8 / 12)
+    tracking = begun(walls, description, TrackingSettings(filtered=12))
     own, pose = set(tracking.landmarks().ids.tolist()), Pose2()
     assert len(own) == 12
     for tick in range(1, 13):
@@ -70,11 +71,12 @@ def test_the_filter_takes_further_tracks_when_its_own_are_left_behind(walls, des
     assert abs(tracking.pose.mean.heading - LEFT * 12) < 0.005
 
 
-def test_further_tracks_hold_the_heading_when_wheels_lie(walls, description):
+def test_further_tracks_hold_the_heading_when_wheels_lie(walls, description, monkeypatch):
     """Wheels that turn a tenth too far are corrected as long as anything is in view."""
 
-    def error(refill: int) -> float:
-        settings = replace(TrackingSettings(), filtered=12, refill=refill)
+    def error(refill: float) -> float:
+        monkeypatch.setattr("mapweave.agent.mapping.tracking.REFILL_SHARE", refill)
+        settings = TrackingSettings(filtered=12)
         tracking, pose = begun(walls, description, settings), Pose2()
         for tick in range(1, 14):
             before, pose = pose, Pose2(0.0, 0.0, LEFT * tick)
@@ -82,7 +84,7 @@ def test_further_tracks_hold_the_heading_when_wheels_lie(walls, description):
             tracking.step(replace(observed, odometry=Odometry(0.0, 1.1 * LEFT)))
         return abs(tracking.pose.mean.heading - pose.heading)
 
-    assert error(refill=8) < 0.6 * error(refill=0)
+    assert error(refill=8 / 12) < 0.6 * error(refill=0.0)
 
 
 def test_tracks_that_do_not_correct_the_filter_are_expected_where_they_were_last(

@@ -9,6 +9,7 @@ import pytest
 
 from mapweave.agent.mission import Question, ServerAnswer, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER
+from mapweave.agent.navigation import positioning, route_follower
 from mapweave.agent.navigation.blocks import Blocks
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.navigation.onboard_router import onboard_route
@@ -111,11 +112,13 @@ def test_it_goes_around_by_another_way(home):
     assert nav.tally.edges == 1 and nav.tally.skipped == 0, "it drove to the node in between"
 
 
-def held_at_the_goal(home: World, proximity: np.ndarray = FREE) -> tuple[Navigator, list[WhichWay]]:
+def held_at_the_goal(
+    home: World, monkeypatch: pytest.MonkeyPatch, proximity: np.ndarray = FREE
+) -> tuple[Navigator, list[WhichWay]]:
     """A robot that is held almost at the goal until it has asked for a third route; and its questions."""
     eyes = Eyes(home, Pose2(2.5, 2.0))
-    settings = NavigatorSettings(blind_distance=1e9, parking_patience=3.0)
-    nav = navigator(eyes, NOWHERE, B, settings)
+    monkeypatch.setattr(route_follower, "PARKING_PATIENCE", 3.0)
+    nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1e9))
     routes: list[WhichWay] = []
 
     def fleet(question: Question) -> ServerAnswer:
@@ -129,16 +132,16 @@ def held_at_the_goal(home: World, proximity: np.ndarray = FREE) -> tuple[Navigat
     return nav, routes
 
 
-def test_endless_parking_is_retried_before_it_is_a_block(home):
+def test_endless_parking_is_retried_before_it_is_a_block(home, monkeypatch):
     """Almost at the goal, held there by nothing that could block another robot."""
-    nav, routes = held_at_the_goal(home)
+    nav, routes = held_at_the_goal(home, monkeypatch)
     assert [question.blocked for question in routes] == [(), (), ((A, B),)], "no robot is informed at first"
     assert nav.tally.blocks == 1 and nav.tally.relocalizations == 2, "then it finds itself rebuilt"
 
 
-def test_what_is_near_at_the_goal_bars_no_other_way_to_it(home):
+def test_what_is_near_at_the_goal_bars_no_other_way_to_it(home, monkeypatch):
     """Before, the place right before the robot was the goal itself, and for 15 to 120 s no way led there."""
-    _, routes = held_at_the_goal(home, WALL_AHEAD)
+    _, routes = held_at_the_goal(home, monkeypatch, WALL_AHEAD)
     assert routes[-1].blocked == ((A, B),)
     assert [question.obstacles for question in routes] == [()] * 3
 
@@ -245,11 +248,11 @@ def test_a_photograph_of_unknown_distance_is_driven_to_and_a_vague_pose_is_not(h
     assert fixed == [True, False]
 
 
-def test_without_landmarks_it_drives_on_a_little_before_it_is_lost(home):
+def test_without_landmarks_it_drives_on_a_little_before_it_is_lost(home, monkeypatch):
     """A long way without a view: by wheels twice a little further, and only then it is lost."""
     eyes = Eyes(home, Pose2(0.5, 2.0))
-    settings = NavigatorSettings(blind_distance=1.0, further=0.5, looks=2)
-    nav = navigator(eyes, NOWHERE, B, settings)
+    monkeypatch.setattr(positioning, "FURTHER", 0.5)
+    nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1.0))
     observations: list[float] = []
     ahead = RouteLeg(bare(B), PoseGaussian(Pose2(9.0), EXACT), None)
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from mapweave.agent.settings import TrackerSettings
 from mapweave.agent.vision.node_tracks import NodeTracks
 from mapweave.hybridmap.pose import Pose2
 from mapweave.registration.recognition import recognise
@@ -37,7 +36,6 @@ def tracks(walls, description, features, pairs) -> NodeTracks:
         walls.render(HERE),
         features,
         pairs,
-        TrackerSettings(),
         strikes=2,
     )
 

@@ -7,7 +7,6 @@ import copy
 import numpy as np
 import pytest
 
-from mapweave.agent.settings import TrackerSettings
 from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
@@ -20,9 +19,9 @@ IDEAL = Lens(CAMERA)
 PHOTOGRAPHS = ("camera", "brick", "coins", "page", "text")
 
 
-def followed(image: np.ndarray, settings: TrackerSettings | None = None) -> Tracker:
+def followed(image: np.ndarray, anchored: bool = True) -> Tracker:
     """A tracker on an image's features."""
-    tracker = Tracker(IDEAL, settings)
+    tracker = Tracker(IDEAL, anchored)
     tracker.track(image)
     features = Sift(IDEAL).extract(image)
     tracker.add(np.arange(len(features)), features.raw)
@@ -145,7 +144,7 @@ def test_errors_do_not_add_up(pictures, name):
     there = [approach(step) for step in (*range(0, 56, 2), *range(56, -1, -2))]
 
     def error(anchored: bool) -> tuple[float, float]:
-        tracker = followed(image, TrackerSettings(anchored=anchored))
+        tracker = followed(image, anchored)
         start, worst = tracker.raw.copy(), 0.0
         for number, motion in enumerate(there):
             grain = np.random.default_rng(number).normal(0, 1.0, image.shape)
@@ -175,7 +174,7 @@ def test_age_and_hold_are_returned(pictures):
     inner = (np.abs(tracker.raw - [159.5, 119.5]) < [150, 110]).all(axis=1)
     assert inner.sum() > 40
     assert tracker.held[inner].all()
-    lone = followed(image, TrackerSettings(anchored=False))
+    lone = followed(image, anchored=False)
     lone.track(image)
     assert not lone.held.any()
 
