@@ -78,7 +78,7 @@ def _by_images(merged: MergedMap, asked: Linked, because: str, s: ConsistencySet
     verdict = verify(a, b)
     if isinstance(verdict, Link):
         pose, inliers = verdict.a_from_b, int(verdict.evidence["inliers"])
-        if asked.pose is not None and distance2_of(_by_person(asked.pose), pose, s) >= s.gate:
+        if asked.pose is not None and distance2_of(_by_person(asked.pose), pose) >= s.gate:
             raise InvalidValue(
                 f"{asked} cannot be linked so: {inliers} landmarks of the images agree on another pose, "
                 f"{_words(pose.mean)}, {_off(pose.mean, asked.pose)} from yours; leave your pose out"
@@ -118,7 +118,7 @@ def _check_geometry(merged: MergedMap, linked: Linked, s: ConsistencySettings) -
     relative = merged.relative(linked.a, linked.b)
     if relative is None:
         return
-    distance2 = distance2_of(linked.a_from_b, relative, s)
+    distance2 = distance2_of(linked.a_from_b, relative)
     if distance2 < s.gate:
         return
     assert linked.pose is not None
@@ -194,9 +194,9 @@ def _check_exclusion(merged: MergedMap, linked: Linked, settings: MergeSettings)
     solver = ComponentSolver(fragments)
     solver.solve([*links, link_by_hand(linked)])
     refutation = Refutation(maps, fragments, settings.exclusion)
-    for (first, second), clash in refutation.clashes([solver.graph_of(linked.a)]):
+    for (first, second), collision in refutation.collisions([solver.graph_of(linked.a)]):
         if any(first in graph.rows and second not in graph.rows for graph in graphs):
-            raise InvalidValue(f"{linked} cannot be linked: {clash.reason}")
+            raise InvalidValue(f"{linked} cannot be linked: {collision.reason}")
 
 
 def _landmarks(link: Link) -> str:

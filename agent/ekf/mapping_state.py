@@ -143,7 +143,7 @@ class WheelStep:
         _ = step.state
         return step
 
-    def glanced(
+    def linearised_by_image(
         self, slots: NDArray[np.intp], slopes: Array, variances: Array, most: float
     ) -> tuple[WheelStep, Examined]:
         """Linearise at the turn that the image suggests, and compare the image with that prediction.

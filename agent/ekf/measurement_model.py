@@ -105,7 +105,7 @@ class ImageMeasurement(NamedTuple):
             The step, linearised where it seems to have gone, and what came out.
         """
         if step is not None and RELINEARISATIONS and len(self.slots) >= LEAST_AGREEING:
-            return step.glanced(self.slots, self.slopes, variances, SLIP_SIGMAS)
+            return step.linearised_by_image(self.slots, self.slopes, variances, SLIP_SIGMAS)
         expected = settled if step is None else step.state
         return step, examine(expected.rays, expected.covariance, self.slots, self.slopes, variances)
 

@@ -1,4 +1,4 @@
-"""Unheld tracks: how far they are from where the filter expects them while wheels are trusted alone."""
+"""How far tracks are from where the filter expects them, while wheels are trusted alone."""
 
 from __future__ import annotations
 

@@ -129,7 +129,7 @@ class Tracking:
         self._pixel_sigma = settings.filter.pixel_sigma
         self._tracker = Tracker(lens)
         self._hidden = OccludedTracks()
-        self._unheld = PredictionOffset()
+        self._prediction_offset = PredictionOffset()
         d = description
         self._filter = MappingFilter(d.camera, d.axle, d.wheel_noise, settings.filter, d.side_slip)
         self.acceptance = ImageAcceptance(KidnapDetector(lens, description.camera))
@@ -217,7 +217,7 @@ class Tracking:
         self._correction = self._correct(held)
         self._dispute.compare(self._filter.pose.mean)
         self._refill()
-        self._note_unheld(self._correction)
+        self._note_prediction_offset(self._correction)
         self.remember()
 
     def remember(self, force: bool = False) -> None:
@@ -321,13 +321,13 @@ class Tracking:
         if len(self._filter.ids) - len(self._hidden.ids) < REFILL_SHARE * self._settings.filtered:
             self._fill()
 
-    def _note_unheld(self, correction: Correction) -> None:
+    def _note_prediction_offset(self, correction: Correction) -> None:
         """While the wheels are trusted alone, note how far the tracks are from where the filter has them."""
         if correction.unused is None:
-            self._unheld.forget()
+            self._prediction_offset.forget()
             return
         ids = self._tracker.ids
-        self._unheld.note(ids, self._tracker.pixels, self._filter.predict_pixels(ids))
+        self._prediction_offset.note(ids, self._tracker.pixels, self._filter.predict_pixels(ids))
 
     # What the stages are made of.
 
@@ -356,7 +356,7 @@ class Tracking:
         expected = turned(self._camera, self._tracker.pixels, self.acceptance.moved.heading)
         ids = self._tracker.ids
         if len(self._filter.ids):
-            rows = self._filter.predict_pixels(ids) + self._unheld.aside(ids)
+            rows = self._filter.predict_pixels(ids) + self._prediction_offset.aside(ids)
             hit = self._camera.contains(rows)
             expected[hit] = rows[hit]
         return expected

@@ -1,4 +1,4 @@
-"""Clashes: two robots that cannot both have been where a merge puts them, and why in words."""
+"""Collisions: two robots that cannot both have been where a merge puts them, and why in words."""
 
 from __future__ import annotations
 

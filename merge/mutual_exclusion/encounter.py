@@ -14,6 +14,9 @@ from mapweave.merge.settings import ExclusionSettings
 
 WINDOW = 2.0
 """Moments within this time count as one observation, s."""
+LEAST_WINDOWS = 3
+"""Windows that must each make the merge half as likely, at least. Chosen: with fewer, one wrong pose or one
+failed scan of 2 s could refute a true merge by itself (docs/decisions/exclusion.md)."""
 NEIGHBOURHOOD = 5.0
 """Robots further apart than this many least distances are no evidence for or against."""
 
@@ -86,7 +89,7 @@ class Encounter:
         by_window, total = self.added(clear, odds, weights)
         # What was enough at any time is enough: later meetings do not make it possible.
         windows = np.cumsum(by_window > math.log(2.0))
-        return bool(((windows >= s.least_moments) & (total >= -math.log(s.doubt))).any())
+        return bool(((windows >= LEAST_WINDOWS) & (total >= -math.log(s.doubt))).any())
 
     def added(self, clear: Array, odds: Array, weights: Array) -> tuple[Array, Array]:
         """(W,) logarithms of the odds against the merge that each window adds to those before, and (W,) sums.

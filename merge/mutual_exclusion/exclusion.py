@@ -36,7 +36,7 @@ SIGMAS = 2.0
 to all moments."""
 
 
-def clash_of(
+def collision_of(
     graph: PoseGraph,
     first: RobotTrajectory,
     second: RobotTrajectory,
@@ -51,7 +51,7 @@ def clash_of(
         settings: when they do.
 
     Returns:
-        The clash, or None if there is none, or nothing is known: other clocks, other times.
+        The collision, or None if there is none, or nothing is known: other clocks, other times.
     """
     s = settings or ExclusionSettings()
     met = _met(graph, first, second, s)
@@ -73,7 +73,7 @@ def clash_of(
         moved = odds_against(part.seen, errors, least_apart)
         if part.refuses(clear, moved, errors.weights, s):
             evidence = sum(part.evidence(clear, moved, errors.weights))
-            return _clash(
+            return _collision(
                 graph, (first, second), meeting, odds[0] if by_visibility > by_footprints else None, evidence
             )
     return None
@@ -136,7 +136,7 @@ def _met(
     return _Met(meeting, apart[close], spreads, clear, odds, first_stay, second_stay)
 
 
-def _clash(
+def _collision(
     graph: PoseGraph,
     trajectories: tuple[RobotTrajectory, RobotTrajectory],
     meeting: Encounter,

@@ -12,7 +12,7 @@ import numpy as np
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.merge.mutual_exclusion.collision import Collision
-from mapweave.merge.mutual_exclusion.exclusion import clash_of
+from mapweave.merge.mutual_exclusion.exclusion import collision_of
 from mapweave.merge.mutual_exclusion.trajectories import RobotTrajectory, TrajectoryCache
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment, fragment_by_node
@@ -42,7 +42,7 @@ class Refutation:
         Args:
             maps: with the nodes of all fragments.
             fragments: pieces of map.
-            exclusion: when two robots clash.
+            exclusion: when two robots collide.
             trajectories: kept from merges before.
         """
         self._by_node = fragment_by_node(fragments)
@@ -59,7 +59,7 @@ class Refutation:
         if len(ends.keys() & self._trajectories.keys()) < 2:
             return ""
         graph = ComponentSolver(list(ends.values())).solve(links)[0]
-        return next((clash.reason for _, clash in self.clashes([graph])), "")
+        return next((collision.reason for _, collision in self.collisions([graph])), "")
 
     def key_of(self, link: Link) -> Key:
         """Between which fragments a link is."""
@@ -75,9 +75,9 @@ class Refutation:
     ) -> tuple[dict[Key, str], dict[Pair, str]]:
         """Groups that must fall, with reasons; and links by hand that are contradicted and stay.
 
-        Where two pieces that clash are joined by links of their own, those are wrong: all other links between
-        them agree with these. Where they are joined by way of other pieces, one group on the way is wrong,
-        and the weakest is the likeliest.
+        Where two pieces that collide are joined by links of their own, those are wrong: all other links
+        between them agree with these. Where they are joined by way of other pieces, one group on the way is
+        wrong, and the weakest is the likeliest.
 
         Args:
             solved: the components.
@@ -85,8 +85,8 @@ class Refutation:
             changed: fragments whose robots may collide with others since the last test; None: all.
             certain: links by hand, which never fall, nor do others between the same two pieces.
         """
-        clashes = dict(self.clashes(solved, changed))
-        if not clashes:
+        collisions = dict(self.collisions(solved, changed))
+        if not collisions:
             return {}, {}
         weights: dict[Key, float] = {}
         by_hand: dict[Key, list[Pair]] = {}
@@ -95,20 +95,26 @@ class Refutation:
             if link.key in certain:
                 by_hand.setdefault(key, []).append(link.key)
             weights[key] = weights.get(key, 0) + (math.inf if link.key in certain else link.weight)
-        contradicted = {pair: clash.reason for key, clash in clashes.items() for pair in by_hand.get(key, ())}
-        direct = {key: clash.reason for key, clash in clashes.items() if key in weights.keys() - by_hand}
+        contradicted = {
+            pair: collision.reason for key, collision in collisions.items() for pair in by_hand.get(key, ())
+        }
+        direct = {
+            key: collision.reason for key, collision in collisions.items() if key in weights.keys() - by_hand
+        }
         if direct:
             return direct, contradicted
-        distant = {key: clash for key, clash in clashes.items() if key not in weights}
-        for (start, end), clash in sorted(distant.items(), key=lambda item: (-item[1].evidence, item[0])):
+        distant = {key: collision for key, collision in collisions.items() if key not in weights}
+        for (start, end), collision in sorted(distant.items(), key=lambda item: (-item[1].evidence, item[0])):
             weakest = _weakest_on_the_way(weights, start, end)
             if weakest not in by_hand:
-                words = f"{clash.reason}, and these are the weakest links that join the two"
+                words = f"{collision.reason}, and these are the weakest links that join the two"
                 return {weakest: words}, contradicted
-            contradicted |= dict.fromkeys(by_hand[weakest], f"{clash.reason}, and links by hand join the two")
+            contradicted |= dict.fromkeys(
+                by_hand[weakest], f"{collision.reason}, and links by hand join the two"
+            )
         return {}, contradicted
 
-    def clashes(
+    def collisions(
         self, solved: Sequence[PoseGraph], changed: Collection[NodeId] | None = None
     ) -> Iterator[tuple[Key, Collision]]:
         """Pairs of fragments in one component that collide, by the clock with most evidence."""
@@ -124,11 +130,11 @@ class Refutation:
                 (first, first_trajectory), (second, second_trajectory) = trajectories[k], trajectories[j]
                 if first == second or (changed is not None and not {first, second} & set(changed)):
                     continue
-                clash = clash_of(graph, first_trajectory, second_trajectory, self._exclusion)
-                if clash is not None:
-                    collisions.setdefault((first, second), []).append(clash)
-            for key, clashes in collisions.items():
-                yield key, max(clashes, key=lambda clash: clash.evidence)
+                collision = collision_of(graph, first_trajectory, second_trajectory, self._exclusion)
+                if collision is not None:
+                    collisions.setdefault((first, second), []).append(collision)
+            for key, of_pair in collisions.items():
+                yield key, max(of_pair, key=lambda collision: collision.evidence)
 
 
 def _near(graph: PoseGraph, trajectories: Sequence[RobotTrajectory]) -> Iterator[tuple[int, int]]:

@@ -246,7 +246,7 @@ def test_the_step_is_linearised_at_the_turn_of_the_image(size: tuple[int, int]) 
     step = WheelStep(state, measured, root, 0.003, 0.1, measured, state.pose_vector, expected)
     slopes = expected[slots, :2] + rng.normal(0, 0.01, (len(slots), 2))
     vote = turn_by_image(expected, slots, slopes, root, 4.0)
-    after, examined = step.glanced(slots, slopes, variances, 4.0)
+    after, examined = step.linearised_by_image(slots, slopes, variances, 4.0)
     assert after.at == Odometry(0.05, pytest.approx(0.02 + vote, abs=1e-12))
     alone = step.again(at=after.at).state
     np.testing.assert_allclose(after.state.covariance, alone.covariance)

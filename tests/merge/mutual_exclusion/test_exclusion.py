@@ -14,8 +14,9 @@ from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import MOST, TrajectorySegment
+from mapweave.merge.mutual_exclusion import encounter
 from mapweave.merge.mutual_exclusion.collision import Collision
-from mapweave.merge.mutual_exclusion.exclusion import chances_clear, clash_of
+from mapweave.merge.mutual_exclusion.exclusion import chances_clear, collision_of
 from mapweave.merge.mutual_exclusion.trajectories import RobotTrajectory, trajectories_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.settings import ExclusionSettings
@@ -108,15 +109,15 @@ def twins(seed: int) -> tuple[Walk, Walk, np.random.Generator]:
     return a, b, rng
 
 
-def clash(a: Walk, b: Walk, rng: np.random.Generator, **how: tuple[str, str]) -> Collision | None:
+def collision_on(a: Walk, b: Walk, rng: np.random.Generator, **how: tuple[str, str]) -> Collision | None:
     first, second = trajectories(a, b, **how)
-    return clash_of(graph(a, b, rng), first, second)
+    return collision_of(graph(a, b, rng), first, second)
 
 
 @pytest.mark.parametrize("seed", range(3))
 def test_twins_clash_and_the_reason_has_numbers(seed: int) -> None:
     a, b, rng = twins(seed)
-    collision = clash(a, b, rng)
+    collision = collision_on(a, b, rng)
     assert collision is not None and collision.evidence > 10 and collision.nearest < 0.1
     assert collision.reason.startswith("a and b would have been at the same place at the same time: 0.0")
     assert f"{collision.time:.1f} s of clock net, {collision.moments} such moments" in collision.reason
@@ -126,7 +127,7 @@ def test_it_is_the_same_from_either_side() -> None:
     a, b, rng = twins(4)
     first, second = trajectories(a, b)
     whole = graph(a, b, rng)
-    forth, back = clash_of(whole, first, second), clash_of(whole, second, first)
+    forth, back = collision_of(whole, first, second), collision_of(whole, second, first)
     assert forth is not None and back is not None
     assert back == replace(forth, first="b", second="a", evidence=back.evidence)
     assert np.isclose(forth.evidence, back.evidence, rtol=0.1)
@@ -149,9 +150,9 @@ def test_trajectory_segments_fill_gaps_between_nodes(seed: int) -> None:
     """Between nodes the robots' poses are unknown, without trajectory segments."""
     a, b, rng = scarce(seed, 0.7)
     whole = graph(a, b, rng)
-    collision = clash_of(whole, *trajectories(a, b, segments=True))
+    collision = collision_of(whole, *trajectories(a, b, segments=True))
     assert collision is not None and collision.evidence > 10 and collision.nearest < 0.15
-    bare = clash_of(whole, *trajectories(a, b))
+    bare = collision_of(whole, *trajectories(a, b))
     assert bare is None or bare.evidence < collision.evidence / 2
 
 
@@ -185,17 +186,17 @@ def test_moments_of_segments_move_with_their_nodes() -> None:
 
 def test_no_evidence_without_a_common_clock() -> None:
     a, b, rng = twins(0)
-    assert clash(a, b, rng, clocks=("net", "own")) is None
+    assert collision_on(a, b, rng, clocks=("net", "own")) is None
     assert trajectories(a, b, clocks=("", "")) == []
     late = Walk(np.random.default_rng(1), way=b.way)
     late.times = late.times + 1000.0
-    assert clash(a, late, rng) is None
+    assert collision_on(a, late, rng) is None
 
 
 def test_a_robot_does_not_clash_with_itself() -> None:
     a, b, rng = twins(0)
     first, second = trajectories(a, b, agents="aa")
-    assert clash_of(graph(a, b, rng, agents="aa"), first, second) is None
+    assert collision_of(graph(a, b, rng, agents="aa"), first, second) is None
 
 
 def test_a_moment_or_two_prove_nothing() -> None:
@@ -203,7 +204,7 @@ def test_a_moment_or_two_prove_nothing() -> None:
     a, b, rng = twins(0)
     b.moved(np.array([5.0, 0.0]))
     b.way[10] = a.way[10]
-    assert clash(a, b, rng) is None
+    assert collision_on(a, b, rng) is None
 
 
 def test_unknown_poses_are_no_evidence() -> None:
@@ -211,7 +212,7 @@ def test_unknown_poses_are_no_evidence() -> None:
     a, b, rng = twins(0)
     a.times = 4.0 * a.times
     b.times = a.times + 6.0
-    assert clash(a, b, rng) is None
+    assert collision_on(a, b, rng) is None
 
 
 @settings(max_examples=30, deadline=None)
@@ -232,14 +233,17 @@ def test_robots_that_meet_closely_are_not_refused(
     while apart(a, b).min() < 0.35:
         b.moved(step)
     first, second = trajectories(a, b, segments=segments)
-    assert clash_of(graph(a, b, rng, sigma=sigma), first, second) is None
+    assert collision_of(graph(a, b, rng, sigma=sigma), first, second) is None
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("segments", [False, True])
-def test_robots_that_nearly_touch_rarely_count_as_collisions(segments: bool) -> None:
+def test_robots_that_nearly_touch_rarely_count_as_collisions(
+    segments: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """The bound holds even for footprints exactly as small as supposed: here at 0.2 m, with loose doubt."""
-    s = ExclusionSettings(doubt=0.1, least_moments=1)
+    monkeypatch.setattr(encounter, "LEAST_WINDOWS", 1)
+    s = ExclusionSettings(doubt=0.1)
     refused = 0
     for seed in range(100):
         rng = np.random.default_rng(seed)
@@ -247,7 +251,7 @@ def test_robots_that_nearly_touch_rarely_count_as_collisions(segments: bool) -> 
         b = Walk(rng, way=a.way + rng.normal(0, 0.1, a.way.shape))
         while apart(a, b).min() < 0.2:
             b.moved(np.array([0.02, 0.0]))
-        refused += clash_of(graph(a, b, rng), *trajectories(a, b, segments=segments), s) is not None
+        refused += collision_of(graph(a, b, rng), *trajectories(a, b, segments=segments), s) is not None
     assert refused <= 10
 
 
@@ -258,13 +262,13 @@ def test_known_radii_decide_the_least_distance() -> None:
     b = Walk(rng, way=a.way + np.array([0.25, 0.0]) + rng.normal(0, 0.03, a.way.shape))
     b.times = a.times
     whole = graph(a, b, rng)
-    collision = clash_of(whole, *trajectories(a, b, radii=(0.2, 0.2)))
+    collision = collision_of(whole, *trajectories(a, b, radii=(0.2, 0.2)))
     assert collision is not None and collision.nearest > 0.15
     for radii in ((0.04, 0.04), (0.0, 0.0), (0.4, 0.0)):
-        assert clash_of(whole, *trajectories(a, b, radii=radii)) is None
+        assert collision_of(whole, *trajectories(a, b, radii=radii)) is None
     tiny = ExclusionSettings(least_apart=0.4)
-    assert clash_of(whole, *trajectories(a, b, radii=(0.04, 0.04)), tiny) is None
-    assert clash_of(whole, *trajectories(a, b), tiny) is not None
+    assert collision_of(whole, *trajectories(a, b, radii=(0.04, 0.04)), tiny) is None
+    assert collision_of(whole, *trajectories(a, b), tiny) is not None
 
 
 def test_probabilities_agree_with_monte_carlo() -> None:

@@ -15,7 +15,7 @@ from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
 from mapweave.merge.mutual_exclusion import mutual_visibility as rules
-from mapweave.merge.mutual_exclusion.exclusion import clash_of
+from mapweave.merge.mutual_exclusion.exclusion import collision_of
 from mapweave.merge.mutual_exclusion.mutual_visibility import errors_in_common, none_wrong, odds_against
 from mapweave.merge.mutual_exclusion.quadrature import quadrature_points
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
@@ -224,7 +224,7 @@ def test_looking_at_a_thousand_nodes_takes_no_time(segment: int, most: float) ->
     took = []
     for _ in range(5):
         start = time.process_time()
-        assert [clash_of(graph, first, second) for first, second in combinations(trajectories, 2)] == [
+        assert [collision_of(graph, first, second) for first, second in combinations(trajectories, 2)] == [
             None
         ] * 6
         took.append(time.process_time() - start)

@@ -20,8 +20,9 @@ from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import TrajectorySegment
+from mapweave.merge.mutual_exclusion import encounter
 from mapweave.merge.mutual_exclusion.collision import Collision
-from mapweave.merge.mutual_exclusion.exclusion import clash_of
+from mapweave.merge.mutual_exclusion.exclusion import collision_of
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.settings import ExclusionSettings
@@ -80,7 +81,7 @@ class Walks:
         node = Node(node_id, stamp, pose, CAMERA, Landmarks.empty(), d.clock, d.radius, ranges)
         self.nodes.append(node)
 
-    def clash(self, moved: float = 0.0, settings: ExclusionSettings | None = None) -> Collision | None:
+    def collision_on(self, moved: float = 0.0, settings: ExclusionSettings | None = None) -> Collision | None:
         """Whether they clash, if the second's room is taken to lie further east by `moved`."""
         return clash_of_mapped(self.nodes, self.truth, "r0", "r1", moved, settings)
 
@@ -108,7 +109,7 @@ def clash_of_mapped(
     means[len(a) :, :2] += rng.normal([moved, 0.0], 0.02)
     information = scipy.sparse.diags(np.tile([3e3, 3e3, 1e5], len(ids)))
     graph = PoseGraph(ids[0], tuple(ids), means, scipy.sparse.csc_matrix(information))
-    return clash_of(graph, trajectories_of(a)[0], trajectories_of(b)[0], settings)
+    return collision_of(graph, trajectories_of(a)[0], trajectories_of(b)[0], settings)
 
 
 def between_twins(seed: int) -> float:
@@ -158,22 +159,28 @@ def test_twins_should_have_seen_each_other_on_the_way(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_robots_in_one_room_are_not_refused_by_views_on_the_way(seed: int) -> None:
+def test_robots_in_one_room_are_not_refused_by_views_on_the_way(
+    seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Neither where they meet, nor where the second is taken to be elsewhere by a few centimetres."""
     walks = walked("arena", seed, (0, 0), 100, length=4.0, width=3.0)
     with_segments(walks)
-    assert walks.clash(settings=ExclusionSettings(doubt=0.9, least_moments=1)) is None
     assert walks.clash(moved=0.05) is None
+    monkeypatch.setattr(encounter, "LEAST_WINDOWS", 1)
+    assert walks.clash(settings=ExclusionSettings(doubt=0.9)) is None
 
 
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("kind", ["office", "arena"])
-def test_robots_that_are_in_one_room_are_not_refused(kind: str, seed: int) -> None:
+def test_robots_that_are_in_one_room_are_not_refused(
+    kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """They come as near as they can, with furniture between, and rays that miss them."""
     walks = walked(kind, seed, (0, 0))
     assert walks.clash() is None
     # Not even nearly: the scans are evidence for the merge. There is no evidence where no robots meet.
-    loose = ExclusionSettings(doubt=0.9, least_moments=1)
+    loose = ExclusionSettings(doubt=0.9)
+    monkeypatch.setattr(encounter, "LEAST_WINDOWS", 1)
     assert walks.clash(settings=loose) is None
     assert walks.clash(moved=20.0, settings=loose) is None
 
