@@ -17,6 +17,9 @@ def main() -> int:
     """Run a command; returns its exit status."""
     _open_output()
     try:
+        from mapweave.early_interrupt import remember
+
+        remember()
         from mapweave.cli import main as run
 
         try:

@@ -324,6 +324,31 @@ print(stop_on_signals().wait(0.0))
     assert printed(program).split() == ["KeyboardInterrupt", "True"]
 
 
+def test_an_interrupt_that_python_drops_comes_again():
+    """As in a callback at the end of an import: `map merge` went on after Ctrl-C, with a traceback."""
+    program = """
+import signal, sys, time, weakref
+sys.stderr = sys.stdout
+from mapweave import early_interrupt
+early_interrupt.remember()
+class Lock: pass
+lock = Lock()
+reference = weakref.ref(lock, lambda _: signal.raise_signal(signal.SIGINT))
+try:
+    del lock
+    time.sleep(20)
+    print("went on")
+except KeyboardInterrupt:
+    print("interrupted")
+class Other:
+    def __del__(self): raise ValueError("of its own")
+del reference
+Other()
+"""
+    first, *rest = printed(program).splitlines()
+    assert first == "interrupted" and rest[-1] == "ValueError: of its own", "others are printed as before"
+
+
 def test_a_signal_amid_another_stops_a_process():
     """Ctrl-C twice, or a signal to a process and its group: the second handler waited for the first."""
     program = """
