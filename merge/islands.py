@@ -215,7 +215,7 @@ class Islands:
         out, s = {}, self._settings.consistency
         for pair, linked in links.items():
             measured = merged.relative(*pair)
-            distance2 = 0.0 if measured is None else distance2_of(linked.a_from_b, measured, s)
+            distance2 = 0.0 if measured is None else distance2_of(linked.a_from_b, measured)
             if measured is not None and distance2 >= s.gate:
                 off = (linked.a_from_b.mean.inverse() @ measured.mean).vector
                 out[pair] = (

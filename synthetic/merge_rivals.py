@@ -67,7 +67,7 @@ def largest_sets(maps: Maps, links: Sequence[Link]) -> list[Link]:
     s, by_node = ConsistencySettings(), fragment_by_node(fragments_of(maps))
     out: list[Link] = []
     for (first, second), group in group_links(links, by_node).items():
-        agree = loop_distances2(group, by_node[first], by_node[second], s) < s.gate
+        agree = loop_distances2(group, by_node[first], by_node[second]) < s.gate
         best = best_clique(agree, np.ones(len(group), np.int64), EXACT)
         out += [group[k].canonical() for k in best if len(best) >= s.least_links]
     return out

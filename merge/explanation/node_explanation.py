@@ -222,7 +222,7 @@ def _other_links(
         and {pieces[candidate.a].name, pieces[candidate.b].name} == ends
     ]
     ((names, group),) = group_links([link, *near_links], pieces).items()
-    distances2 = loop_distances2(group, pieces[names[0]], pieces[names[1]], s)
+    distances2 = loop_distances2(group, pieces[names[0]], pieces[names[1]])
     own = next(k for k, candidate in enumerate(group) if candidate.key == link.key)
     return tuple(
         LinkAgreement(

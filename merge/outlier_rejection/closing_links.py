@@ -11,6 +11,7 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array
 from mapweave.merge.outlier_rejection.pairwise_consistency import Sorted
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
+from mapweave.merge.pose_graph.factors import LOOP_FLOOR
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.settings import ConsistencySettings
@@ -45,7 +46,7 @@ def join(
     for group in closing:
         solver.solve(kept)
         graph = solver.graph_of(group.kept[0].a)
-        good = misfits(group.kept, graph, s) < s.gate
+        good = misfits(group.kept, graph) < s.gate
         kept += [link for link, fits in zip(group.kept, good, strict=True) if fits]
         refusals += [
             refuse(link, "contradicts better supported links by way of other maps")
@@ -55,12 +56,11 @@ def join(
     return kept, refusals
 
 
-def misfits(links: Sequence[Link], graph: PoseGraph, s: ConsistencySettings) -> Array:
+def misfits(links: Sequence[Link], graph: PoseGraph) -> Array:
     """(N,) how far links that are not in the graph are from it, chi-square with 3 degrees of freedom."""
-    floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
     measured = PoseGaussians(
         np.stack([link.a_from_b.mean.vector for link in links]),
-        np.stack([link.a_from_b.covariance + floor for link in links]),
+        np.stack([link.a_from_b.covariance + LOOP_FLOOR for link in links]),
     )
     back = graph.relative([link.b for link in links], [link.a for link in links])
     return (measured @ back).distances2()

@@ -33,6 +33,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Array
+from mapweave.merge.pose_graph.factors import LOOP_FLOOR
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link, link_of
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
@@ -205,8 +206,7 @@ class _Sides:
                 [nodes[k - first] for k in ends[rows]], [nodes[k - first] for k in starts[rows]]
             )
             loop = self._between(sides[rows], None if but is None else but[rows]) @ back
-            floor = np.diag([c.floor_xy**2, c.floor_xy**2, c.floor_heading**2])
-            out[rows] = PoseGaussians(loop.means, loop.covariances + floor).distances2() > c.gate
+            out[rows] = PoseGaussians(loop.means, loop.covariances + LOOP_FLOOR).distances2() > c.gate
         return out
 
     def _between(self, sides: NDArray[np.int64], but: NDArray[np.int64] | None) -> PoseGaussians:

@@ -15,6 +15,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.pose_graph.factors import LOOP_FLOOR
 from mapweave.merge.pose_graph.links import RefusedLink, refuse_edge
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.settings import ConsistencySettings
@@ -55,7 +56,6 @@ def _objection(edge: Edge, graphs: Sequence[PoseGraph], s: ConsistencySettings) 
     if (np.diag(edge.a_from_b.covariance) > VAGUE**2).any():
         return f"measured no better than {VAGUE[0]:g} m and {VAGUE[2]:g} rad"
     merged = graph.relative([edge.a], [edge.b])
-    floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
-    spread = edge.a_from_b.covariance + merged.covariances[0] + floor
+    spread = edge.a_from_b.covariance + merged.covariances[0] + LOOP_FLOOR
     off = PoseGaussian(edge.a_from_b.mean, spread).mahalanobis2(Pose2.from_vector(merged.means[0]))
     return "" if off < s.gate else "contradicts the merged map"

@@ -65,7 +65,7 @@ class LinkGroup:
     def _without(self, refuted: Sequence[Link], reason: str, s: ConsistencySettings) -> LinkGroup:
         keys = {link.key for link in refuted}
         in_set = np.array([link.key in keys for link in self.links])
-        agree = loop_distances2(self.links, self.first, self.second, s) < s.gate
+        agree = loop_distances2(self.links, self.first, self.second) < s.gate
         falls = in_set | (agree[:, in_set].mean(axis=1) > 0.5)
         left = tuple(link for link, fallen in zip(self.links, falls, strict=True) if not fallen)
         fallen = tuple(refuse(link, reason) for link, fallen in zip(self.links, falls, strict=True) if fallen)

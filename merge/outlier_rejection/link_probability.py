@@ -25,19 +25,15 @@ import numpy as np
 
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian, nearest_covariance
-from mapweave.merge.pose_graph.factors import believable
+from mapweave.merge.pose_graph.factors import LOOP_FLOOR, believable
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
-from mapweave.merge.settings import ConsistencySettings
 
 AT_ONCE = 64
 """Links whose covariances are solved for together: all at once would take memory by the square."""
 LEAST_AREA = 4.0
 """What is mapped is never smaller than this, m^2: a single full turn."""
-_S = ConsistencySettings()
-FLOOR = np.diag([_S.floor_xy**2, _S.floor_xy**2, _S.floor_heading**2])
-"""Error beyond the covariances, as where links are compared with each other."""
 NO_INFORMATION = 1e-6
 """Share of a link's own information below which the rest of the graph is no evidence."""
 
@@ -51,8 +47,8 @@ class Standpoint(NamedTuple):
         strain2: `off` in the link's own uncertainty, chi-square with 3 degrees of freedom.
         alone: whether only this link connects the two.
         log_factor: natural logarithm of Bayes' factor for the link, 0 if it is alone.
-        residual2: of the link in a map that is solved with it, in its own uncertainty and `FLOOR`, chi-square
-            with 3 degrees of freedom: what is left where the map yields as far as it is uncertain.
+        residual2: of the link in a map that is solved with it, in its own uncertainty and `LOOP_FLOOR`,
+            chi-square with 3 degrees of freedom: what is left where the map yields as far as it is uncertain.
     """
 
     merged_a_from_b: PoseGaussian
@@ -130,7 +126,7 @@ def _standpoint(link: Link, merged: PoseGaussian, area: float, kept: bool) -> St
             return Standpoint(merged, off, strain2, True, 0.0, 0.0)
         rest = np.linalg.inv(information)
         moved = rest @ np.linalg.solve(merged.covariance, off)
-    spread = own + rest + FLOOR
+    spread = own + rest + LOOP_FLOOR
     # In the plane anywhere on the floor that is mapped, in heading anyhow.
     anywhere = -math.log(area * 2.0 * math.pi)
     log_density = -0.5 * float(np.linalg.slogdet(2.0 * math.pi * spread)[1])
@@ -138,4 +134,4 @@ def _standpoint(link: Link, merged: PoseGaussian, area: float, kept: bool) -> St
         return Standpoint(merged, off, strain2, True, 0.0, 0.0)
     weighed = np.linalg.solve(spread, moved)
     factor = log_density - 0.5 * float(moved @ weighed) - anywhere
-    return Standpoint(merged, off, strain2, False, factor, float(weighed @ (own + FLOOR) @ weighed))
+    return Standpoint(merged, off, strain2, False, factor, float(weighed @ (own + LOOP_FLOOR) @ weighed))

@@ -7,6 +7,7 @@ from collections.abc import Iterable
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import PoseGaussian
+from mapweave.merge.pose_graph.factors import LOOP_FLOOR
 from mapweave.merge.pose_graph.links import RefusedLink, link_of, refuse_edge
 from mapweave.merge.settings import ConsistencySettings
 
@@ -44,7 +45,7 @@ def sort_loop_closures(edges: Iterable[Edge], s: ConsistencySettings) -> tuple[C
         recognition = recognised.get(pair)
         if recognition is None:
             claims[pair] = (edge,)
-        elif distance2_of(link_of(edge).a_from_b, link_of(recognition).a_from_b, s) < s.gate:
+        elif distance2_of(link_of(edge).a_from_b, link_of(recognition).a_from_b) < s.gate:
             both = sorted(
                 (edge, recognition), key=lambda one: float(link_of(one).a_from_b.covariance.trace())
             )
@@ -54,8 +55,6 @@ def sort_loop_closures(edges: Iterable[Edge], s: ConsistencySettings) -> tuple[C
     return claims, refusals
 
 
-def distance2_of(a: PoseGaussian, b: PoseGaussian, s: ConsistencySettings) -> float:
+def distance2_of(a: PoseGaussian, b: PoseGaussian) -> float:
     """Squared Mahalanobis distance of two measurements of one pose, chi-square with 3 degrees of freedom."""
-    spread = b.covariance.copy()
-    spread[[0, 1, 2], [0, 1, 2]] += s.floor_xy**2, s.floor_xy**2, s.floor_heading**2
-    return PoseGaussian(a.mean, a.covariance + spread).mahalanobis2(b.mean)
+    return PoseGaussian(a.mean, a.covariance + b.covariance + LOOP_FLOOR).mahalanobis2(b.mean)

@@ -20,7 +20,7 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.merge.outlier_rejection.closing_links import join
 from mapweave.merge.outlier_rejection.loop_closures import CLAIMS, sort_loop_closures
-from mapweave.merge.outlier_rejection.pairwise_consistency import group_links, sort_links
+from mapweave.merge.outlier_rejection.pairwise_consistency import DOMINANCE, group_links, sort_links
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.factors import RelativePose
@@ -62,12 +62,12 @@ def _pieces(hybrid_map: HybridMap, s: ConsistencySettings) -> list[Fragment]:
         return strands
     solver = ComponentSolver(strands)
     loops = sorted((link_of(edges[0]) for edges in claims.values()), key=lambda link: link.pair)
-    within, between = replace(s, least_links=1), replace(s, least_links=1, dominance=0.0)
+    single = replace(s, least_links=1)
     groups = {}
     refused: list[RefusedLink] = []
     for (first, second), links in group_links(loops, solver.by_node).items():
         pair = solver.by_node[first], solver.by_node[second]
-        groups[first, second] = sort_links(links, *pair, within if first == second else between)
+        groups[first, second] = sort_links(links, *pair, single, DOMINANCE if first == second else 0.0)
         refused += groups[first, second].refused
     kept, more = join(solver, groups, s)
     refused += more

@@ -253,7 +253,7 @@ def link_sets(
         second: piece of map.
         s: when links agree.
     """
-    agree = loop_distances2(links, first, second, s) < s.gate
+    agree = loop_distances2(links, first, second) < s.gate
     np.fill_diagonal(agree, True)
     left, sets = np.ones(len(links), np.bool_), list[list[Link]]()
     while left.any():

@@ -23,7 +23,6 @@ from mapweave.merge.explanation.map_explanation import explain_fleet, explain_ma
 from mapweave.merge.explanation.node_explanation import explain_nodes
 from mapweave.merge.explanation.own_edges import reach_words
 from mapweave.merge.outlier_rejection.link_probability import (
-    FLOOR,
     LEAST_AREA,
     link_probabilities,
     prior_odds,
@@ -31,7 +30,7 @@ from mapweave.merge.outlier_rejection.link_probability import (
 )
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component import solve_graph
-from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, RelativePose
+from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, LOOP_FLOOR, RelativePose
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import ConsistencySettings
@@ -119,7 +118,7 @@ def test_leaving_a_link_out_is_as_good_as_solving_without_it(merged: MergedMap) 
     for link, one in list(zip(links, result, strict=True))[::3]:
         rest = without(merged, link)
         off = (link.a_from_b.mean.inverse() @ rest.mean).vector
-        spread = link.a_from_b.covariance + np.diag(LEAST_SIGMAS**2) + rest.covariance + FLOOR
+        spread = link.a_from_b.covariance + np.diag(LEAST_SIGMAS**2) + rest.covariance + LOOP_FLOOR
         density = math.exp(-0.5 * off @ np.linalg.inv(spread) @ off) / math.sqrt(
             np.linalg.det(2 * np.pi * spread)
         )
@@ -136,7 +135,7 @@ def test_what_is_left_of_a_residual_is_foretold_without_solving(merged: MergedMa
         rest = own + [RelativePose(*x.pair, x.a_from_b, robust=True) for x in links if x is not link]
         asked = Link(*link.pair, PoseGaussian(wrong, link.a_from_b.covariance), link.shared, link.evidence)
         (foretold,) = standpoints([asked], solve_graph(link.a, Pose2(), rest), kept=False)
-        floored = asked.a_from_b.covariance + FLOOR
+        floored = asked.a_from_b.covariance + LOOP_FLOOR
         solved = solve_graph(
             link.a, Pose2(), [*rest, RelativePose(*link.pair, PoseGaussian(wrong, floored), robust=True)]
         )
@@ -190,7 +189,7 @@ def test_other_links_close_loops_as_composed_poses(merged: MergedMap) -> None:
         home = pieces[one.a].graph.relative([other.a], [one.a])
         there, here = (PoseGaussian(Pose2.from_vector(r.means[0]), r.covariances[0]) for r in (back, home))
         loop = one.a_from_b @ there @ other.a_from_b.inverse() @ here
-        floor = np.diag([s.floor_xy**2, s.floor_xy**2, s.floor_heading**2])
+        floor = np.diag([0.02, 0.02, 0.01]) ** 2
         distance2 = PoseGaussian(loop.mean, loop.covariance + floor).mahalanobis2(Pose2())
         assert other_link.distance2 == pytest.approx(distance2, rel=1e-6)
         assert other_link.agrees == (distance2 < s.gate) and other_link.kept

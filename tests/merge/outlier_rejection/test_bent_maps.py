@@ -65,7 +65,7 @@ def test_a_sound_map_hangs_together_though_links_are_a_little_off() -> None:
             for link in links(rng, Pose2())
             for noise in [rng.normal(0.0, 2.5 * SIGMAS)]
         ]
-        agree = loop_distances2(off, sound, fixed, s)[np.triu_indices(len(off), 1)] < s.gate
+        agree = loop_distances2(off, sound, fixed)[np.triu_indices(len(off), 1)] < s.gate
         assert 0.0 < (~agree).mean() < 0.05
         assert len(link_sets(off, sound, fixed, s)[0]) >= AGREEING * len(off)
         assert len(link_sets(off, bent, fixed, s)[0]) < AGREEING * len(off)

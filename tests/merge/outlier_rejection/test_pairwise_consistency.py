@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.explanation import ALIASED
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.merge.outlier_rejection import pairwise_consistency
 from mapweave.merge.outlier_rejection.max_clique import best_clique, independent_links
 from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances2, sort_links
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import RelativePose
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
-from mapweave.merge.settings import ConsistencySettings
 
 
 def fragment(agent: str, tour: list[Pose2], rng: np.random.Generator, sigma: float = 0.02) -> Fragment:
@@ -82,13 +82,13 @@ def test_planted_false_links_are_refused(false_ones: int) -> None:
         assert all(first.reason for first in sorted_links.refused)
 
 
-def test_loop_misclosures_are_calibrated() -> None:
+def test_loop_misclosures_are_calibrated(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(pairwise_consistency, "LOOP_FLOOR", 1e-8 * np.eye(3))
     values = []
     for seed in range(40):
         two = Two(seed)
         links = [two.true_link(1, 1), two.true_link(9, 8)]
-        s = ConsistencySettings(floor_xy=1e-4, floor_heading=1e-4)
-        values.append(loop_distances2(links, two.a, two.b, s)[0, 1])
+        values.append(loop_distances2(links, two.a, two.b)[0, 1])
     assert 2.0 < np.mean(values) < 4.2
 
 
@@ -97,7 +97,7 @@ def test_an_aliased_room_is_refused_when_the_right_one_has_more_support() -> Non
     second = Two(3)
     aliased = second.alike_room()
     # They really close loops with each other: only better support can show that they are wrong.
-    assert (loop_distances2(aliased, second.a, second.b, ConsistencySettings()) < 11.34).mean() > 0.7
+    assert (loop_distances2(aliased, second.a, second.b) < 11.34).mean() > 0.7
     right = [second.true_link(k, k) for k in range(0, 12, 2)]
     sorted_links = sort_links([*aliased, *right], second.a, second.b)
     kept = {first.pair for first in sorted_links.kept}
