@@ -2,60 +2,53 @@
 
 from __future__ import annotations
 
+import heapq
 import math
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.jit import Cube, Matrix, compiled_form_of
 from mapweave.hybridmap.pose import Array
 
 _STEPS = np.array([(dx, dy) for dx in (-1, 0, 1) for dy in (-1, 0, 1) if dx or dy])
 _LENGTHS = np.hypot(*_STEPS.T)
 
 
-def _spread_in_numpy(tolls: Cube, costs: Matrix) -> None:
-    """See _spread: all cells at once, in as many sweeps as the longest way has cells."""
-    _, rows, columns = tolls.shape
-    inner = costs[1:-1, 1:-1]
-    origins = [costs[1 + dx : rows + 1 + dx, 1 + dy : columns + 1 + dy] for dx, dy in _STEPS.tolist()]
-    while True:
-        before = inner.copy()
-        for neighbour_costs, toll in zip(origins, tolls, strict=True):
-            np.minimum(inner, neighbour_costs + toll, out=inner)
-        if np.array_equal(before, inner):
-            return
+def _least_costs(tolls: Array, first: tuple[int, int], goal: tuple[int, int] | None) -> Array:
+    """(R, C) cost of the cheapest way to each cell, by Dijkstra's search; infinite where there is none.
 
-
-@compiled_form_of(_spread_in_numpy)
-def _spread(tolls: Cube, costs: Matrix) -> None:
-    """Lower costs until none can be lowered: that of a cell is the least of a neighbour's and its toll.
-
-    Cell by cell, to and fro, which takes a few passes. Each way is summed up from its beginning, so both
-    forms give the same costs to the last bit.
+    Plain Python: each cell waits for its neighbours, so there is nothing that NumPy could do for many at once
+    (docs/decisions/kernels.md).
 
     Args:
         tolls: (8, R, C) to enter each cell from each neighbour, in the order of _STEPS.
-        costs: (R + 2, C + 2) with a border of infinite ones; changed in place.
+        first: row and column where the ways begin.
+        goal: where the search ends: cells that cost more are left out. None searches to the end.
     """
     _, rows, columns = tolls.shape
-    lowered = True
-    while lowered:
-        lowered = False
-        for turn in range(4):
-            for k in range(rows):
-                row = k if turn < 2 else rows - 1 - k
-                for m in range(columns):
-                    column = m if turn % 2 == 0 else columns - 1 - m
-                    least, step = costs[row + 1, column + 1], 0
-                    for dx in range(3):
-                        for dy in range(3):
-                            if dx != 1 or dy != 1:
-                                least = min(least, costs[row + dx, column + dy] + tolls[step, row, column])
-                                step += 1
-                    if least < costs[row + 1, column + 1]:
-                        costs[row + 1, column + 1] = least
-                        lowered = True
+    # A border that cannot be entered saves the question whether a neighbour is inside.
+    fenced = np.pad(tolls, ((0, 0), (1, 1), (1, 1)), constant_values=np.inf).reshape(len(tolls), -1)
+    width = columns + 2
+    moves = [
+        (-dx * width - dy, toll) for (dx, dy), toll in zip(_STEPS.tolist(), fenced.tolist(), strict=True)
+    ]
+    costs = [math.inf] * ((rows + 2) * width)
+    start = (first[0] + 1) * width + first[1] + 1
+    end = None if goal is None else (goal[0] + 1) * width + goal[1] + 1
+    costs[start], queue = 0.0, [(0.0, start)]
+    while queue:
+        cost, at = heapq.heappop(queue)
+        if at == end:
+            break
+        if cost > costs[at]:
+            continue
+        for move, toll in moves:
+            there = at + move
+            total = cost + toll[there]
+            if total < costs[there]:
+                costs[there] = total
+                heapq.heappush(queue, (total, there))
+    return np.array(costs).reshape(rows + 2, width)[1:-1, 1:-1]
 
 
 class GridPlanner:
@@ -66,10 +59,18 @@ class GridPlanner:
     that is too tight.
 
     Attributes:
-        costs: (R, C) in cells; infinite where there is no way.
+        costs: (R, C) in cells; infinite where there is no way. Of cells further than the goal, if one is
+            given and can be reached, infinite or too large.
     """
 
-    def __init__(self, room: Array, first: tuple[int, int], least: float, wished: float) -> None:
+    def __init__(
+        self,
+        room: Array,
+        first: tuple[int, int],
+        least: float,
+        wished: float,
+        goal: tuple[int, int] | None = None,
+    ) -> None:
         """Compute them.
 
         Args:
@@ -77,20 +78,19 @@ class GridPlanner:
             first: row and column.
             least: m, clearance that a way needs.
             wished: m, clearance above which more has no value.
+            goal: the only one that `way_to` will be asked for; it saves most of the search if it is near.
         """
         self._room, self._least = room, least
         lack = np.clip((wished - room) / (wished - least), 0.0, 1.0)
         self._price = 1.0 + 3.0 * lack * lack
         rows, columns = room.shape
         padded = np.pad(room, 1, constant_values=-math.inf)
-        costs = np.full(padded.shape, np.inf)
-        costs[first[0] + 1, first[1] + 1] = 0.0
-        self.costs = costs[1:-1, 1:-1]
         tolls = np.empty((len(_STEPS), rows, columns))
         for toll, (dx, dy), length in zip(tolls, _STEPS.tolist(), _LENGTHS, strict=True):
             origin = (slice(1 + dx, rows + 1 + dx), slice(1 + dy, columns + 1 + dy))
             toll[:] = np.where(self._may(padded[origin], room), length * self._price, np.inf)
-        _spread(tolls, costs)
+        near = goal if goal is not None and room[goal] >= least else None
+        self.costs = _least_costs(tolls, first, near)
 
     def way_to(self, goal: tuple[int, int]) -> NDArray[np.int64]:
         """(N, 2) cells from the first one to a goal (row and column), or to the cell nearest to it.

@@ -84,8 +84,8 @@ class LocalPlanner:
         if (room[line[:, 0], line[:, 1]] >= 0.5 * (least + wished)).all():
             return np.zeros((0, 2))
         first, last = self._floor.cells(np.stack([start, goal]))
-        passage = GridPlanner(room, (int(first[0]), int(first[1])), least, wished)
-        cells = passage.way_to((int(last[0]), int(last[1])))
+        here, there = (int(first[0]), int(first[1])), (int(last[0]), int(last[1]))
+        cells = GridPlanner(room, here, least, wished, there).way_to(there)
         return np.array([self._floor.centre((int(a), int(b))) for a, b in cells[1:]]).reshape(-1, 2)
 
     def _steered_to(self, start: Array, goal: Array) -> Array:

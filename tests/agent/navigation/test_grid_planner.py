@@ -10,7 +10,6 @@ import pytest
 from scipy.ndimage import distance_transform_edt
 
 from mapweave.agent.navigation.grid_planner import GridPlanner
-from tests.hybridmap.kernel_forms import in_numpy
 
 LEAST, WISHED = 0.2, 0.4
 
@@ -55,14 +54,13 @@ def test_costs_are_the_least(seed):
     )
 
 
-@pytest.mark.parametrize("seed", range(6))
-def test_costs_are_the_same_to_the_last_bit_without_numba(seed):
+@pytest.mark.parametrize("seed", range(20))
+def test_a_search_that_ends_at_its_goal_finds_the_same_way(seed):
     rng = np.random.default_rng(50 + seed)
     room = random_room(rng)
-    first = tuple(int(rng.integers(n)) for n in room.shape)
-    compiled = GridPlanner(room, first, LEAST, WISHED).costs
-    with in_numpy():
-        assert np.array_equal(GridPlanner(room, first, LEAST, WISHED).costs, compiled)
+    first, goal = (tuple(int(rng.integers(n)) for n in room.shape) for _ in range(2))
+    whole = GridPlanner(room, first, LEAST, WISHED).way_to(goal)
+    assert np.array_equal(GridPlanner(room, first, LEAST, WISHED, goal).way_to(goal), whole)
 
 
 @pytest.mark.parametrize("seed", range(6))
