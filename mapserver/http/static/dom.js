@@ -11,6 +11,16 @@ export function add(parent, name, text, kind) {
   return child;
 }
 export function made(name, text, kind) { return add(document.createDocumentFragment(), name, text, kind); }
+// Words of a status, which are not read out again while they stay.
+export function say(element, words) { if (element.textContent !== words) element.textContent = words; }
+// A new title of a panel; the focus goes to it if what had the focus there is gone.
+export function retitled(panel, words) {
+  const focused = panel.contains(document.activeElement);
+  panel.textContent = "";
+  const title = add(panel, "h2", words);
+  title.tabIndex = -1;
+  if (focused) title.focus();
+}
 export function draw(parent, name, values) {
   const child = parent.appendChild(document.createElementNS(SVG, name));
   for (const key in values) child.setAttribute(key, values[key]);

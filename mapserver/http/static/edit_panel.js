@@ -1,6 +1,6 @@
 // The tab Edit: what is selected, a form for each kind of edit, what the server says it would do, and then does. Forms
 // stay as they are when the kind, the tab or the selection changes, so nothing that was typed is lost.
-import { add, button, byId, counted } from "./dom.js";
+import { add, button, byId, counted, say } from "./dom.js";
 import { change, callMe, onPermission, permission } from "./changes.js";
 import { EDITORS } from "./editors.js";
 import { placeNamed } from "./annotations.js";
@@ -129,8 +129,7 @@ export class EditPanel {
         words += a === b ? ` Both are in component ${a} already.`
           : ` It joins component ${a} (${counted(model.members[a].length, "node")}) and component ${b} (${counted(model.members[b].length, "node")}).`;
     }
-    // A status that has not changed is not read out again.
-    if (byId("edit-counts").textContent !== words) byId("edit-counts").textContent = words;
+    say(byId("edit-counts"), words);
     byId("edit-counts").className = this.lacks ? "bad" : "";
     byId("edit-check").disabled = Boolean(this.lacks);
     byId("edit-nodes").setAttribute("aria-invalid", Boolean(this.lacks));
@@ -153,7 +152,7 @@ export class EditPanel {
     for (const one of ["rectangle", "polygon"]) byId(`draw-${one}`).setAttribute("aria-pressed", shape === one);
     byId("draw-finish").hidden = shape !== "polygon";
     byId("draw-finish").disabled = this.drawing.corners.length < 3;
-    byId("draw-hint").textContent = this.drawing.hint();
+    say(byId("draw-hint"), this.drawing.hint());
     this.moved();
   }
   values() {

@@ -142,6 +142,8 @@ export async function explain({ a = "", b = "", route = false }, keep = true) {
   if (route) address.set("route", "1");
   if (keep) history.pushState(null, "", "why" + (a || b ? "?" + address : ""));
   document.title = a || b ? `${a} ${route ? "to" : "and"} ${b} - Mapweave` : "Mapweave";
+  // The focus does not go with the link that was followed.
+  if (result.contains(document.activeElement)) result.focus();
   result.textContent = "Asking ...";
   const number = ++asked;
   const answer = await ask((route ? "route" : "explain") + (a || b ? "?" + query : ""));

@@ -1,5 +1,5 @@
 // One node: GET /nodes/NODE.
-import { add, ask, button, byId, counted, draw, facts, when } from "./dom.js";
+import { add, ask, button, byId, counted, draw, facts, retitled, when } from "./dom.js";
 import { drawView } from "./views.js";
 
 const box = byId("selected");
@@ -28,8 +28,7 @@ export async function showNode(name, { select, why, send, edit }) {
   latest = name;
   const node = await ask("nodes/" + encodeURIComponent(name));
   if (latest !== name) return;
-  box.textContent = "";
-  add(box, "h2", `Node ${name}`);
+  retitled(box, `Node ${name}`);
   if (node.error) { add(box, "p", node.error, "bad"); return; }
   const fate = node.superseded;
   facts(box, [

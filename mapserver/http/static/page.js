@@ -1,5 +1,5 @@
 // The page: what comes over the WebSocket goes to the map and the panels, what is chosen on one shows on all.
-import { add, button, byId, counted, draw, listed, made } from "./dom.js";
+import { add, button, byId, counted, draw, listed, made, say } from "./dom.js";
 import { colours, edgeColour, followTheme, hue } from "./colours.js";
 import { drawAnnotations, loadAnnotations } from "./annotations.js";
 import { permit } from "./changes.js";
@@ -37,6 +37,10 @@ const page = { robots: [], commands: false, whyNot: "", node: "", robot: "", pho
 // For tests and measurements.
 window.mapweave = { model, viewport, painter, page, selection, drawing, planEditor };
 
+// A screen reader reads what is selected, where the focus does not move to it.
+function announce(what) {
+  if (!byId("selected").contains(document.activeElement)) say(byId("announcement"), what);
+}
 function selectNode(name, move = true) {
   const row = model.rowOf(name);
   page.node = name; page.robot = painter.robot = ""; painter.ways = [];
@@ -44,6 +48,7 @@ function selectNode(name, move = true) {
   painter.selected = row ?? -1;
   if (row !== undefined && move) viewport.show(model.x[row], model.y[row]);
   openTab("selected");
+  announce(`Node ${name}`);
   showNode(name, { select: selectNode, why: (a, b) => showWhy({ a, b }), send: offerToSend, edit: addToEdited });
   painter.ask();
 }
@@ -70,6 +75,7 @@ function selectRobot(name, goal = page.node) {
   page.robot = painter.robot = name;
   forget();
   openTab("selected");
+  announce(`Robot ${name}`);
   showRobot(name, page.whyNot, goal);
   updateRobot(page.robots);
   const robot = painter.robots.find(one => one.name === name);
@@ -201,7 +207,7 @@ watch({
     page.readOnly = read_only;
     page.loading = true;
     permit(commands, why_not);
-    byId("connection").textContent = read_only ? "map file" : "live";
+    say(byId("connection"), read_only ? "map file" : "live");
     clearEvents();
   },
   map(message, bytes) {
@@ -224,7 +230,7 @@ watch({
     page.loading = Boolean(server.loading);
     // Lists are shown once they are filled, so that nothing jumps.
     if (!server.loading || robots.length || model.components.length) byId("fleet").classList.remove("waiting");
-    if (!page.readOnly) byId("connection").textContent = server.loading ? server.summary : "live";
+    if (!page.readOnly) say(byId("connection"), server.loading ? server.summary : "live");
     painter.ask();
   },
   events({ history }) {
@@ -237,7 +243,7 @@ watch({
 }, up => {
   if (!up) permit(false, "The map server does not answer: nothing can be changed until it does. What you have typed stays.");
   byId("connection").className = up ? "" : "lost";
-  byId("connection").textContent = up ? "live" : "no server, trying again";
+  say(byId("connection"), up ? "live" : "no server, trying again");
   // Nothing is known of them any more.
   if (!up && !page.readOnly) showRobots(page.robots.map(robot => ({ ...robot, alive: false, lost: true })));
 }, admitted);

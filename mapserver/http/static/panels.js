@@ -5,6 +5,7 @@ const tabs = [...document.querySelectorAll("[role=tab]")];
 
 export const isOpen = name => !byId(name).hidden;
 export function openTab(name, focus = false) {
+  const left = document.activeElement?.closest("[role=tabpanel]");
   for (const tab of tabs) {
     const open = tab.getAttribute("aria-controls") === name;
     tab.setAttribute("aria-selected", open);
@@ -12,6 +13,8 @@ export function openTab(name, focus = false) {
     byId(tab.getAttribute("aria-controls")).hidden = !open;
     if (open && focus) tab.focus();
   }
+  // The focus does not stay on what is hidden: the next key would begin at the top of the page.
+  if (left?.hidden) byId(name).focus();
   document.dispatchEvent(new CustomEvent("tabopened"));
 }
 export function listenToTabs(opened) {

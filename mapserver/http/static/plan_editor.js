@@ -1,6 +1,6 @@
 // The form of a floor plan: an image, pairs of places by clicking the plan and the map in turn, and how well they fit.
 // After each pair the server fits the plan and says the residuals; nothing is kept before Save.
-import { add, button, byId } from "./dom.js";
+import { add, button, byId, say } from "./dom.js";
 import { change } from "./changes.js";
 import { colours } from "./colours.js";
 import { draft, imageOf, planNamed, planNames } from "./plans.js";
@@ -145,9 +145,9 @@ export class PlanEditor {
     this.moved();
   }
   words() {
-    byId("plan-next").textContent = !this.image ? "" : this.pixel ? "Now click the same place on the map."
+    say(byId("plan-next"), !this.image ? "" : this.pixel ? "Now click the same place on the map."
       : this.place ? "Now click the same place on the plan."
-        : `${this.pairs.length ? "" : `${LEAST} pairs or more, far apart. `}Click a place on the plan, then the same place on the map.`;
+        : `${this.pairs.length ? "" : `${LEAST} pairs or more, far apart. `}Click a place on the plan, then the same place on the map.`);
     byId("plan-save").disabled = !this.image || this.pairs.length < LEAST;
   }
   report() {

@@ -1,5 +1,5 @@
 // Robots: the list of all, and one with its missions. POST /robots/...
-import { add, ask, button, byId, counted, degrees, facts, listed, made, percent, seconds } from "./dom.js";
+import { add, ask, button, byId, counted, degrees, facts, listed, made, percent, retitled, seconds } from "./dom.js";
 import { wordsOf } from "./names.js";
 import { onPlans } from "./plans.js";
 
@@ -41,8 +41,7 @@ export function listRobots(robots, select, none) {
 // its height, and in view on a phone.
 export function showRobot(name, whyNot, goal) {
   const box = byId("selected");
-  box.textContent = "";
-  add(box, "h2", `Robot ${name}`);
+  retitled(box, `Robot ${name}`);
   panel = { name, facts: document.createElement("div"), portal: null };
   if (whyNot) { add(box, "p", whyNot, "soft"); box.append(panel.facts); return; }
   const form = add(box, "form", "", "actions"), input = add(form, "input"), via = add(form, "input");
