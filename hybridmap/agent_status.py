@@ -15,8 +15,11 @@ from mapweave.hybridmap.portal import PortalWait
 from mapweave.hybridmap.pose import Pose2
 
 MAX_STATUS_WORDS = 500
+"""Characters of a line. A limit for messages."""
 MAX_ROBOTS = 1024
+"""Robots in a status. A limit for messages."""
 MAX_ACCUSATION = 1000
+"""Characters. A limit for messages."""
 Line = Annotated[str, Meta(max_length=MAX_STATUS_WORDS)]
 
 IDENTITY = Pose2()

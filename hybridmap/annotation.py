@@ -26,6 +26,7 @@ from mapweave.hybridmap.portal import Portal
 from mapweave.hybridmap.wall_time import utc_words
 
 MAX_NAME = 64
+"""Characters. A limit for messages."""
 LEAST_FACTOR, MOST_FACTOR = 0.1, 100.0
 """By which a preference multiplies the cost of a way."""
 MAX_ANNOTATIONS = 10_000

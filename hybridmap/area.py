@@ -16,6 +16,7 @@ from mapweave.hybridmap.limits import Coordinate
 from mapweave.hybridmap.pose import Array, Pose2
 
 LEAST_CORNERS, MOST_CORNERS = 3, 64
+"""Of an area; the second is a limit for messages."""
 FARTHEST = 1e4
 """Of a corner from its anchor, m."""
 ROUND = 16

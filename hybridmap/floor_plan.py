@@ -14,6 +14,7 @@ from mapweave.hybridmap.limits import Amount, Coordinate, Number, Probability, W
 from mapweave.hybridmap.pose import Array, Pose2
 
 MAX_PAIRS = 64
+"""Of one plan. A limit for messages: three suffice."""
 MAX_SIDE = 20_000
 """Of an image, px."""
 MAX_BYTES = 16 * 2**20

@@ -18,6 +18,7 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.node import CODE_BYTES
 
 SIFT_DIMENSIONS = 128
+"""Lowe 2004: 4 x 4 histograms of 8 directions."""
 DIMENSIONS = CODE_BYTES
 """Coordinates of a compact descriptor."""
 

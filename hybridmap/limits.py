@@ -33,6 +33,7 @@ Key = Annotated[str, Meta(max_length=32)]
 """Of a table of numbers."""
 
 MAX_WORDS = 4096
+"""Characters of a text."""
 Words = Annotated[str, Meta(max_length=MAX_WORDS)]
 """For people."""
 

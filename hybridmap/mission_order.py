@@ -28,7 +28,9 @@ MOST_APART_NS = 86_400_000_000_000
 AT_START = "start"
 """In place of a person: the mission with which an agent is started."""
 MAX_TEXT = 64
+"""Characters of an id or a name. A limit for messages."""
 MAX_BECAUSE = 300
+"""Characters of a reason. A limit for messages."""
 Because = Annotated[str, Meta(max_length=MAX_BECAUSE)]
 """Why a mission is given, in the words of who gives it."""
 Text = Annotated[str, Meta(max_length=MAX_TEXT)]

@@ -12,6 +12,7 @@ from mapweave.hybridmap.limits import Amount, Name, Words
 from mapweave.hybridmap.pose import Pose2
 
 MAX_STARTS = 8
+"""Places at which a robot may be, in one question. A limit for messages."""
 MAX_NEARBY = 16
 """Robots in one answer, nearest first: more do not stand around one robot."""
 

@@ -15,6 +15,7 @@ from mapweave.hybridmap.limits import Name, Number
 MOST_NOTE = 120
 """Characters of a note."""
 MAX_FLOOR_WORDS = 256
+"""Characters of a floor's labels. A limit for messages; longer ones are cut."""
 
 
 class PortalMeans(StrEnum):

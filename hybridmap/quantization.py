@@ -33,11 +33,14 @@ CELLS = 14 * CELLS_PER_E
 """Coarse cells of depth: a factor of e^14, so many in each e."""
 
 DEPTH_LEAST = 0.01
+"""m. Chosen: nearer things are within the lens."""
 DEPTH_MOST = DEPTH_LEAST * math.exp(CELLS / CELLS_PER_E)
 """12 km; a depth beyond is as good as unknown."""
 
 SHARE_LEAST = 0.002
+"""Least sigma of a depth as a share of it. 2 mm at 1 m."""
 SHARES_PER_E = 8
+"""Steps of the share in each factor e: 13 % a step."""
 FINE_BITS = np.array(
     [0]
     + [

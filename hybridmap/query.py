@@ -31,13 +31,17 @@ from mapweave.hybridmap.portal import PortalStop
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
 MAX_CANDIDATES = 64
+"""In one answer; a limit for messages, as the next two are."""
 MAX_BLOCKED = 256
+"""Edges in one question."""
 MAX_OBSTACLES = 64
+"""In one question."""
 MAX_REACH = 5.0
 """Of an obstacle, m: two of the largest robots beside each other."""
 MAX_LEGS = 512
 """A route through a building has tens of legs."""
 MAX_WORDS_ASKED = 64
+"""Places that are asked for at once. A limit for messages."""
 REACH = 2.0
 """A position is the nearest node if that is no farther away, m; robots park at nodes alone."""
 MAX_KNOWN = 512

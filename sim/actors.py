@@ -27,6 +27,7 @@ PATIENCE_TICKS = 20
 GAP = 0.05
 """No actor comes nearer to a robot's side than this, m."""
 TEXELS_PER_METRE = 300
+"""Of an actor's textures: at 1 m a camera of 277 px focal length sees one in a pixel."""
 
 
 @dataclass(frozen=True, slots=True)

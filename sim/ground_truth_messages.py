@@ -20,6 +20,7 @@ from mapweave.wire.packing import Limit
 
 QUESTION = Limit("control", 1 << 20, 1 << 20)
 ANSWER = Limit("answer of the simulator", 64 * 2**20, 2_000_000)
+"""A limit for messages between processes of one machine: an answer has the images of all robots."""
 
 
 class _Question(msgspec.Struct, tag_field="op"):

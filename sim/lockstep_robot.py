@@ -15,6 +15,7 @@ from mapweave.wire.packing import Limit
 from mapweave.wire.typed import decode, encode
 
 LIMIT = Limit("rendezvous", 64)
+"""It is one number."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -23,6 +23,7 @@ VIEW = 1.2
 CORNER = math.radians(35.0)
 """By which the way bends half way, at most, to either side."""
 TRIES = 4000
+"""Ways that are tried before it is given up."""
 
 ASIDE, YAW, TILT, RISE, STEP = 0.03, math.radians(3.0), math.radians(1.5), 0.02, 0.2
 """Standard deviations of a hand-held camera: m across the way, rad of yaw, rad of pitch and of roll, m of

@@ -47,6 +47,7 @@ MAGIC = MAP_FILE
 VERSION = 1
 HEADER = struct.Struct("<8sIQ")
 DIGEST_BYTES = 32
+"""Of SHA-256."""
 # A map file may have any number of values: the user has chosen to read it.
 LIMIT = Limit("map file", 2**32 - 1, 2**32 - 1)
 

@@ -13,6 +13,7 @@ from collections.abc import Iterable
 from pathlib import Path
 
 HEADER, FRAME = 32, 24
+"""Bytes at the beginning of the file and of each frame, by SQLite's file format, section 4.1."""
 MAGIC = 0x377F0682
 """The lowest bit says whether checksums are of big-endian words."""
 CUT_SHORT = 1

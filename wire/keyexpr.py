@@ -13,6 +13,7 @@ from mapweave.hybridmap.errors import InvalidValue
 
 CHUNK = re.compile(r"[A-Za-z0-9._-]{1,64}")
 MAX_CHUNKS = 16
+"""Parts of a key. A limit for messages."""
 
 
 @lru_cache(maxsize=4096)

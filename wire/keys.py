@@ -39,6 +39,8 @@ from mapweave.hybridmap.ids import NAME, MapId, check_name
 
 VERSION = "1"
 MAX_EPOCH = 2**53
+"""Greatest number up to which a float keeps each whole number apart: JSON readers in browsers have no
+other."""
 MAX_KEY = 256
 """Characters of a key that is read."""
 KEYS_KEPT = 8192

@@ -35,6 +35,7 @@ HEAD = struct.Struct("<BBHHHHH")
 """Version, flags, count, least x, reach of x, least y, reach of y."""
 
 CHECK_BYTES = 4
+"""Of CRC-32."""
 ASCENDING, WITH_DEPTHS = 1, 2
 """Flags: whether y never falls; whether there are depths."""
 

@@ -18,6 +18,7 @@ from mapweave.hybridmap.pose import Array
 from mapweave.hybridmap.ranges import Ranges
 
 BEARING_STEP = 1e-4
+"""rad: 1 mm at 10 m."""
 MOST_STEPS = 31415
 """Bearings of half a turn to either side are the same; one step more would come back as the other."""
 

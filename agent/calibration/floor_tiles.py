@@ -23,11 +23,15 @@ from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 
 WIDTH_PX, HEIGHT_PX = 16, 8
+"""Of a tile. Flat, as a square piece of floor ahead is in the image."""
 ABREAST = 1.0
 """Tiles lie this many heights of the camera to either side of it: what a vehicle drives on, no verge."""
 MOST = 48
+"""Tiles of a pair of images, those with most texture. Chosen: the time of a pair grows with them."""
 MARGIN_PX = 4
+"""Tiles keep this distance from the image's border and from the horizon: they move between two images."""
 BLUR_PX = 0.8
+"""Standard deviation of the blur before tiles are compared, px."""
 SEARCHED = np.arange(-0.3, 0.31, 0.05)
 """Logarithms of inverse depth over the floor's with which a tile is tried first,"""
 EVERY_OTHER = slice(None, None, 2)

@@ -14,6 +14,7 @@ from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 
 CORNERS = 300
+"""Corners that are followed, half of them below the middle of the image and half above it."""
 QUALITY, APART_PX = 0.003, 7
 """Of corners: share of the strongest, and distance from each other."""
 LEAST_CORNER = 0.1
@@ -21,9 +22,11 @@ LEAST_CORNER = 0.1
 2004 has the same ratio of 10). Points slide along edges: at the foot of simulated walls two of three points
 with 0.02 to 0.1 are more than 1 px off after 0.4 s, one of ten with more."""
 WINDOW_PX = 15
+"""Side of the patch that is followed, px."""
 BACKWARD_PX = 0.5
 """A point that does not come back to within this is lost."""
 SHORTEST_S, LONGEST_S = 0.3, 1.0
+"""A pair of images is at least and at most so far apart, s."""
 ENOUGH_PX = 0.06
 """A pair ends when half of its points have moved this far, as a share of the image's width,"""
 LEAST_LEFT = 0.6

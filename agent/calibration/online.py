@@ -42,6 +42,7 @@ ENOUGH_HEIGHTS = 0.5
 LEAST = 0.004
 """and says nothing if they have moved less than this."""
 FEWEST_PAIRS = 20
+"""No solution before so many pairs, as of a recorded drive (`recorded_drive`)."""
 SOLVE_EVERY = 4
 """Pairs between two solutions."""
 PARTS = 2

@@ -20,6 +20,8 @@ from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 
 FEWEST_PAIRS = 20
+"""Pairs of images without which nothing is estimated. Chosen: a pair is up to 1 s, so these are at most 20 s
+of driving."""
 LEAST_S = 10.0
 """Of driving, s; half a minute is better."""
 LEAST_TURN = 0.5

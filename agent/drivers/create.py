@@ -15,6 +15,7 @@ from mapweave.agent.drivers.wheeled import WheeledRobot
 from mapweave.hybridmap.errors import DeviceError
 
 START, SAFE, DRIVE_DIRECT, QUERY_LIST = 128, 131, 145, 149
+"""Opcodes of the iRobot Create 2 Open Interface Specification, as all numbers here."""
 BUMPS, CHARGE, CAPACITY, MODE, LEFT_COUNTS, RIGHT_COUNTS = 7, 25, 26, 35, 43, 44
 """Sensor packets; their sizes are 1, 2, 2, 1, 2 and 2 bytes. Charge and capacity are in mAh."""
 WHEEL_DROPS = 0b1100
@@ -24,7 +25,9 @@ PASSIVE = 1
 LARGEST_BUMPS, LARGEST_MODE = 0b1111, 3
 """Of these packets, by the specification. Answers have no checksum."""
 METRES_PER_COUNT = math.pi * 72e-3 / 508.8
+"""Wheels of 72 mm, 508.8 counts a revolution (the specification, packets 43 and 44)."""
 FASTEST_MM = 500
+"""mm/s, of a wheel (the specification, opcode 145)."""
 QUERY = bytes([QUERY_LIST, 6, BUMPS, CHARGE, CAPACITY, MODE, LEFT_COUNTS, RIGHT_COUNTS])
 STOP = struct.pack(">Bhh", DRIVE_DIRECT, 0, 0)
 

@@ -40,7 +40,9 @@ AGAIN = "ask again later"
 """A refusal that contains this is answered by asking the same again (the bus says so when it is full)."""
 
 MAX_IMAGE_BYTES = 16 * 2**20
+"""Of an image: 16 megapixels, grey."""
 MAX_SIDE_PX = 16384
+"""Of an image; as for `[robot.camera]`."""
 MAX_SMALL_BYTES = 16384
 """Longest message without an image."""
 

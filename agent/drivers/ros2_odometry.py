@@ -13,7 +13,9 @@ from mapweave.hybridmap.errors import DeviceError
 JOINTS_TYPE, TICKS_TYPE = "sensor_msgs/msg/JointState", "irobot_create_msgs/msg/WheelTicks"
 KINDS = (ODOMETRY_TYPE, JOINTS_TYPE, TICKS_TYPE)
 TICKS_PER_TURN = 508.8
+"""Of a wheel of iRobot's Create 3, by its documentation, and of the Create 2."""
 TICKS_RANGE = 1 << 32
+"""After so many ticks the counter begins again: `WheelTicks` has int32."""
 CREATE_3_RADIUS = 0.03575
 """Of its wheels, m, by create3_sim."""
 FASTEST = 5.0

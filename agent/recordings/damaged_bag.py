@@ -22,7 +22,9 @@ Item = tuple[int, str, str] | tuple[int, int, bytes]
 
 MCAP_MAGIC, ROS1_MAGIC = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
 MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE, MCAP_CHUNK, MCAP_DATA_END = 0x03, 0x04, 0x05, 0x06, 0x0F
+"""Opcodes of records, by the specification of MCAP."""
 ROS1_MESSAGE, ROS1_CHUNK, ROS1_CONNECTION = 0x02, 0x05, 0x07
+"""The field `op` of records, by the specification of ROS bags 2.0."""
 
 
 @cache

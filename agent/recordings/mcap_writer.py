@@ -37,6 +37,7 @@ MCAP_END = struct.pack("<BQI", 0x0F, 4, 0) + struct.pack("<BQQQI", 0x02, 20, 0, 
 WAITING = 200
 """Observations that wait for the disk; more are dropped, and counted."""
 JPEG_QUALITY = 95
+"""Chosen, OpenCV's default. `--lossless` writes PNG."""
 KEPT = ("/tf_static", "/kidnap_status")
 """Topics whose last message holds: who subscribes later gets it too (durability transient-local)."""
 OPTICAL, ODOM = "camera_optical_frame", "odom"

@@ -15,6 +15,8 @@ LARGEST = 999_999
 """Epochs are counted: a larger one from a server is refused, or a server could use the numbers up."""
 
 FOUR_DIGITS = range(1000, 10_000)
+"""Of which an epoch is drawn where no server can be asked for the last one: two such maps of one robot have
+the same epoch in one of 9000 cases."""
 
 ASK_TIMEOUT = 2.0
 """How long a server may take to answer, s."""

@@ -44,6 +44,8 @@ STILL = (0.02, 0.005)
 MOVES = (0.05, 0.01)
 """The same above which it has moved."""
 SMALL_PX = (64, 48)
+"""Size to which images are reduced before they are compared: each pixel is the mean of 25 of an image of 320
+x 240."""
 AT_REST = 3.0
 """Mean difference of reduced images, grey levels, below which nothing has moved; as in `mapping_monitor`."""
 JUMP = (2.0, 0.05)

@@ -18,13 +18,16 @@ from mapweave.agent.servo.plan import Leg, Price, ServoPlan, Surroundings, sampl
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 
 _FIRST_OCTANT = ((1, 0), (3, 1), (2, 1), (3, 2))
+"""Directions of motion in cells, from 0 to 45 degrees; 32 in all, 7 to 18 degrees apart."""
 FARTHEST = 5.0
 """m; the grid covers start and goal, and its size grows with the square of their distance. The servo is given
 nodes within 1.4 m (DETECTION_REACH of the route follower), and parks in `benchmarks.servo` from up to
 2.5 m."""
 
 _BORDER = 3
+"""Cells beside the grid: the longest move along one axis."""
 _BINS = 72
+"""Headings of which it is known whether landmarks stay in view: each 5 degrees."""
 
 
 def _compass() -> tuple[NDArray[np.intp], Array]:

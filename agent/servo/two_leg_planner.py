@@ -13,11 +13,12 @@ _SPACING = 0.06
 """rad between candidate headings."""
 
 _REACH = 1.5
+"""rad to either side in which headings are searched."""
 _LONGEST = 4.0
 """Longest leg, m."""
-"""rad to either side in which headings are searched."""
 
 _ALONG: Array = np.linspace(0.0, 1.0, 9)[1:]
+"""Shares of a leg at which it is tested."""
 
 
 def headings_around(surroundings: Surroundings, pose: Pose2, margin: float) -> Array:

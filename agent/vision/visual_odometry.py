@@ -20,8 +20,11 @@ from mapweave.agent.arrays import median
 from mapweave.hybridmap.camera import Camera
 
 WINDOW_PX = (15, 15)
+"""Patch that is followed, px."""
 POINTS = 100
+"""Corners that are followed."""
 LEAST_POINTS = 12
+"""With fewer nothing is said. Chosen: a turn needs two, the others are for outliers."""
 WIDTH_PX = 160
 """Images are reduced to this width: turns need no more, and it takes a quarter of the time of 320 px."""
 ROUNDS = 4

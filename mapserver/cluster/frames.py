@@ -15,6 +15,7 @@ REPLY = struct.Struct("<q?")
 MOST_FRAME = MOST_BYTES + max(REQUEST.size, REPLY.size)
 """Bytes; `Connection.recv_bytes` reads no more."""
 MOST_WORDS = 500
+"""Characters of an error that are passed on."""
 
 
 class GatewayRequest(NamedTuple):

@@ -16,7 +16,9 @@ from mapweave.mapserver.http.photo import Photo
 logging.getLogger("python_multipart").setLevel(logging.CRITICAL)
 
 MOST_PARTS = 32
+"""Of a form. A limit for requests."""
 LONGEST_FIELD = 4096
+"""Bytes of a field that is text."""
 LONGEST_CAMERA = 4096
 """Bytes. A camera.toml has about 200."""
 LONGEST_HEADER = 1024

@@ -32,6 +32,7 @@ from mapweave.mapserver.http.websocket import WebSocketConnection
 MAX_HEAD_BYTES = 16384
 """Of a request: its first line and headers."""
 MAX_CONNECTIONS = 1024
+"""At once; a new one takes the place of the oldest that waits. A limit for requests."""
 MAX_WAITING = 512
 """Connections that have not sent the head of a request yet; a new one takes the place of the oldest."""
 LINGER = 1.0

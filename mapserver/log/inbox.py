@@ -11,6 +11,7 @@ from mapweave.wire.fair_queue import FairQueue
 _T = TypeVar("_T")
 
 MOST = 4096
+"""Published changes that wait; what finds no room is pulled later. Also at most as many bytes:"""
 MOST_BYTES = 2**25
 """Of published changes; what finds no room is pulled later."""
 LONGEST_WAIT = 3600.0

@@ -26,6 +26,7 @@ THING_SIGMA = 0.35
 BESIDE = 0.35
 """What is farther from all landmarks on a thing is not of it, m."""
 MISSING_BY_CHANCE = 0.05
+"""Chance below which missing landmarks are evidence that the view is not of this place."""
 HIDDEN_WIDTH, HIDDEN_AGREEING, HIDDEN_FEATURES = 0.4, 0.1, 3
 """A person before the camera hides at most this share of an image's width, from top to bottom: at most this
 share of what agrees is seen there, and at least so many features of his own."""

@@ -26,6 +26,7 @@ PUSH = "Push the robot forward by about 30 cm and turn it by about 45 degrees wi
 DRIVE_SPEED, TURN_RATE = 0.1, 0.4
 """m/s and rad/s, by itself."""
 DRIVE_SECONDS, TURN_SECONDS = 2.0, 2.0
+"""s: 20 cm and 46 degrees at those speeds."""
 
 
 def examine(

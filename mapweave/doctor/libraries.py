@@ -16,6 +16,7 @@ from mapweave.extras import MODULES, pip
 IMPORTED_AS = {"eclipse-zenoh": "zenoh", "opencv-python-headless": "cv2", "pyserial": "serial"}
 """Modules whose names differ from those of their packages."""
 OLDEST_PYTHON = (3, 11)
+"""As `requires-python` of pyproject.toml."""
 
 
 def examine() -> Iterator[Finding]:

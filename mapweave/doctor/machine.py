@@ -16,6 +16,7 @@ from mapweave.doctor.finding import Finding, good, skipped, warning, wrong
 LEAST_FREE = 100e6
 """bytes; a map of 1 000 nodes takes 5 MB, a minute of recording 60 MB."""
 LITTLE_FREE = 1e9
+"""bytes, of which the examination warns: a quarter of an hour of recording."""
 SYNCS = 8
 """Writes whose time is taken."""
 SLOW_SYNC = 0.5

@@ -17,6 +17,7 @@ OVERLAP = 0.3
 LEAST_IMAGES = 20
 """A piece with fewer maps nothing."""
 MOST_ROBOTS = 26
+"""Pieces are named by letters."""
 
 
 def pieces(folder: Path, robots: int | None) -> dict[str, Replay]:

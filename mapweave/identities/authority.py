@@ -16,6 +16,7 @@ from mapweave.hybridmap.errors import SettingsError
 from mapweave.wire.credentials import Role
 
 AUTHORITY_DAYS = 3650
+"""For which the authority of a fleet holds. Chosen: all keys have to be made again after it."""
 BACKDATED = timedelta(minutes=5)
 """A robot's clock may be behind."""
 

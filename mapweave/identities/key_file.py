@@ -16,6 +16,7 @@ from mapweave.wire.credentials import Credentials, Role
 
 SUFFIX = ".key.toml"
 PRIVATE = 0o600
+"""Permissions: only its owner may read it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -43,7 +43,9 @@ from mapweave.wire.credentials import Credentials, Member, Role, RouterAccess
 CATALOGUE = "fleet.json"
 AUTHORITY, AUTHORITY_KEY, PASSWORDS = "authority.pem", "authority.key", "passwords"
 PORT = 7447
+"""Zenoh's default port."""
 SERVER_DAYS = 825
+"""Devices of Apple accept no certificate of a server that holds longer (support.apple.com, HT210176)."""
 DAYS = 365
 """For which a key holds, unless it is said otherwise."""
 

@@ -12,6 +12,7 @@ from mapweave.scenarios.scenario import Scenario
 from mapweave.terminal import Bar, plain_or_terminal
 
 MOST_SEEDS = 10_000
+"""Of one batch. Chosen: more is a slip of the pen."""
 
 
 @dataclass(frozen=True)

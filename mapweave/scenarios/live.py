@@ -19,6 +19,7 @@ if TYPE_CHECKING:
 
 HOST = "127.0.0.1"
 PORT = 8090
+"""Chosen: beside the 8080 of servers."""
 MOST_RATE = 20.0
 """Frames that a viewer gets in a wall second, at most: watching shall not slow the trial down."""
 QUALITY = 80

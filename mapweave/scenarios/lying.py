@@ -37,6 +37,7 @@ NEAR = (0.2, 0.2, 0.15)
 CLEARANCE = 0.25
 """Of a lost robot from walls, m."""
 TRIES = 1000
+"""Places that are tried for a lost robot before it is given up."""
 
 
 @dataclass(frozen=True)

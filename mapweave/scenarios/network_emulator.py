@@ -17,6 +17,7 @@ RESEND = 0.2
 """What TCP loses it sends again after about this, s."""
 
 CHUNK = 65536
+"""Bytes that are read at once."""
 THAW = 0.05
 """How often it is looked whether a frozen cable is one no longer, s."""
 

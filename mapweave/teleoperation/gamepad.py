@@ -14,6 +14,7 @@ from mapweave.hybridmap.errors import DeviceError
 
 EVENT = struct.Struct("=IhBB")
 BUTTON, AXIS, INIT = 0x01, 0x02, 0x80
+"""Kinds of events, by linux/joystick.h."""
 FULL = 32767
 """Value of an axis at its end."""
 TURN_AXIS, FORWARD_AXIS = 0, 1

@@ -27,6 +27,7 @@ MAX_AREA = 20_000.0
 MAX_WALLS = 5_000.0
 """Length of all walls together, m."""
 MAX_SEED = 2**53
+"""Greatest number up to which a float keeps each whole number apart."""
 
 Point = tuple[float, float]
 

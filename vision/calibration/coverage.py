@@ -16,9 +16,11 @@ RANGES = np.array([0.7, 0.7, 0.4, 0.5])
 DIFFERENT = 0.2
 """A view counts as new when its placement differs by this much in all from that of each other view."""
 FEWEST_VIEWS = 10
+"""Views that differ, below which guidance asks for more."""
 GRID = (3, 3)
 """Columns and rows of cells of the image in which there must be corners."""
 FEWEST_IN_CELL = 4
+"""Corners in a cell below which guidance asks for more there."""
 PLACES = (
     ("upper left corner", "upper edge", "upper right corner"),
     ("left edge", "middle", "right edge"),

@@ -15,6 +15,7 @@ FOCAL = 4
 """The intrinsics begin with fx, fy, cx, cy; the lens's coefficients follow."""
 COEFFICIENTS = {LensModel.RADIAL_TANGENTIAL: 5, LensModel.EQUIDISTANT: 4}
 EXACT = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, 100, 1e-12)
+"""When the iteration that takes distortion away ends: steps, and accuracy."""
 
 
 class Projected(NamedTuple):

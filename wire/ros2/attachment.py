@@ -12,6 +12,7 @@ from typing import NamedTuple
 from mapweave.hybridmap.errors import InvalidMessage
 
 GID_BYTES = 16
+"""Of an id of a publisher, by rmw."""
 NOW = struct.Struct("<qqB16s")
 """Sequence number, ns since 1970, length of the gid, gid."""
 NAMES = (b"sequence_number", b"source_timestamp", b"source_gid")

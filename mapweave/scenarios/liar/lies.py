@@ -30,6 +30,7 @@ SURE = np.diag([0.015, 0.015, 0.008]) ** 2
 OFF_M = 2.0
 """By which copied places are torn apart."""
 EPOCHS = 40
+"""Maps of the robot that begins a new one for every few nodes."""
 ALTERED_PIXEL, ALTERED_CODE, ALTERED_DEPTH = 0.7, 0.04, 0.03
 """By how much two views of a landmark differ: standard deviations, px, of a decoded descriptor's coordinates,
 and of the depth as a share of it."""
