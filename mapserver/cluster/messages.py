@@ -33,7 +33,10 @@ Pairs = Sequence[tuple[Node, Node]]
 MOST_BYTES = 4 << 20
 """Of a message. The longest has little more than half as many: the nearest landmarks of a view with as many
 features as there may be, each in a map of its own."""
+MOST_NEAREST = 32_000
+"""Landmarks of an answer, of all features together: 16 of each of as many as there may be."""
 LIMIT = Limit("message of the cluster", MOST_BYTES, 1 << 18)
+"""Values: 260 000, eight for each of the nearest landmarks."""
 NOWHERE = PoseGaussian(Pose2(), np.zeros((3, 3)))
 """Of a node that is compared: its pose in its map plays no part."""
 
@@ -188,15 +191,18 @@ class Ask:
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """Asks for the nearest landmarks of features, (N, 32) codes; see `PlaceIndex.nearest`."""
+    """Asks for so many nearest landmarks of features, (N, 32) codes; see `PlaceIndex.nearest`."""
 
     codes: NDArray[np.uint8]
+    count: int
     TAG = "nearest"
 
     def __post_init__(self) -> None:
-        """Refuse other shapes, and codes that are none (InvalidMessage)."""
+        """Refuse other shapes, codes that are none, and too many landmarks (InvalidMessage)."""
         _shaped(self.codes, CODE_BYTES)
         _rows(self.codes, 0, SYMBOLS)
+        if self.count < 1 or self.count * len(self.codes) > MOST_NEAREST:
+            raise InvalidMessage(f"{self.count} landmarks of each of {len(self.codes)} features")
 
 
 @dataclass(frozen=True, eq=False)

@@ -57,9 +57,9 @@ class Shard:
         self._nodes.update((node.id, node) for node in nodes)
         self._index.extend(nodes)
 
-    def nearest(self, codes: NDArray[np.uint8]) -> NearestLandmarks:
+    def nearest(self, codes: NDArray[np.uint8], count: int) -> NearestLandmarks:
         """The nearest landmarks of features; see `PlaceIndex.nearest`."""
-        return self._index.nearest(codes)
+        return self._index.nearest(codes, count)
 
     def overlaps(self, node: Node) -> dict[NodeId, float]:
         """Which nodes of this shard overlap with a node; see `PlaceIndex.overlaps`."""
@@ -68,7 +68,7 @@ class Shard:
     def answer(self, question: Question) -> Answer:
         """The answer to a question."""
         if isinstance(question, Nearest):
-            return self.nearest(question.codes)
+            return self.nearest(question.codes, question.count)
         return self.overlaps(*question.nodes.nodes)
 
 

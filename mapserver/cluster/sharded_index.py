@@ -17,11 +17,19 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.query import View
-from mapweave.mapserver.cluster.messages import ComparedNodes, Nearest, Overlaps, Question, encoded
+from mapweave.mapserver.cluster.messages import (
+    MOST_NEAREST,
+    ComparedNodes,
+    Nearest,
+    Overlaps,
+    Question,
+    encoded,
+)
 from mapweave.mapserver.cluster.shard_link import ShardLink
 from mapweave.mapserver.retrieval.place_database import NodeOf
 from mapweave.mapserver.retrieval.place_index import PlaceIndexSettings
 from mapweave.mapserver.retrieval.ranking import IncompleteSearch, NearestLandmarks, Ranked
+from mapweave.mapserver.retrieval.wanted_landmarks import nearest_wanted
 
 
 class ShardedIndex:
@@ -80,12 +88,28 @@ class ShardedIndex:
 
     def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> Ranked:
         """Rank nodes by their similarity to a view; says what could not be searched in time."""
-        parts, silent = self._asked(Nearest(view.codes), self._links)
-        missing = f"{len(silent)} of {len(self._links)} shards of the map did not answer" if silent else ""
-        if not parts:
-            return Ranked((), missing)
-        nearest = NearestLandmarks.together(parts, self._votes)
-        return Ranked(nearest.ranked(k, exclude), missing)
+        unwanted, answering = frozenset(exclude), self._links
+        numbers: dict[NodeId, int] = {}
+
+        def search(features: NDArray[np.int64], count: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
+            nonlocal answering
+            parts, silent = self._asked(Nearest(view.codes[features], count), answering)
+            answering = tuple(link for link in answering if link not in silent)
+            nothing = NearestLandmarks.none(len(features), count)
+            nearest = NearestLandmarks.together([*parts, nothing], count)
+            own = [numbers.setdefault(node, len(numbers)) for node in nearest.nodes]
+            return nearest.squared, np.array([*own, -1])[nearest.owners]
+
+        def hidden(found: NDArray[np.int64]) -> NDArray[np.bool_]:
+            return np.array([*(node in unwanted for node in numbers), False])[found]
+
+        if unwanted:
+            squared, owners = nearest_wanted(search, len(view), self._votes, hidden, MOST_NEAREST)
+        else:
+            squared, owners = search(np.arange(len(view)), self._votes)
+        silent = len(self._links) - len(answering)
+        missing = f"{silent} of {len(self._links)} shards of the map did not answer" if silent else ""
+        return Ranked(NearestLandmarks(squared, owners, tuple(numbers)).ranked(k), missing)
 
     def overlaps(self, node: Node, node_of: NodeOf) -> dict[NodeId, float]:
         """Overlaps of a node with all others; waits for a shard that does not answer, or its stand-in.

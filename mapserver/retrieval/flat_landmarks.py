@@ -6,11 +6,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.landmark_tables import DIMENSIONS
 from mapweave.mapserver.retrieval.coarse_quantizer import Codes, Ids, Vectors
 from mapweave.mapserver.retrieval.inverted_file import CellContents
-from mapweave.mapserver.retrieval.similar_landmarks import comparable, similar
+from mapweave.mapserver.retrieval.similar_landmarks import comparable, nearest, similar
+from mapweave.mapserver.retrieval.wanted_landmarks import Hidden
 
 
 class FlatLandmarks:
@@ -49,20 +49,20 @@ class FlatLandmarks:
         part = slice(start, self._count)
         self._codes[part], self._ids[part], self._rows[part] = codes, ids, comparable(codes)
 
-    def remove(self, first: int, last: int) -> None:
-        """Forget the ids from first to last, that one left out."""
+    def remove(self, first: int, last: int, codes: Codes | None = None) -> None:
+        """Forget the ids from first to last, that one left out; their codes are not needed."""
+        del codes
         kept = np.flatnonzero((self.ids < first) | (self.ids >= last))
         for values in (self._codes, self._ids, self._rows):
             values[: len(kept)] = values[kept]
         self._count = len(kept)
 
-    def nearest(self, codes: Codes, k: int, probes: int = 0) -> tuple[Vectors, Ids]:
-        """(N, k) squared distances and ids of the nearest landmarks, nearest first; there are as many."""
-        import faiss
-
-        del probes  # There are no cells.
-        squared, places = faiss.knn(decode(codes), decode(self.codes), k)
-        return squared, self.ids[places]
+    def nearest(self, codes: Codes, k: int, hidden: Hidden | None = None) -> tuple[Vectors, Ids]:
+        """The k nearest landmarks, see `InvertedFile.nearest`."""
+        unwanted = None if hidden is None else hidden(self.ids)
+        squared, places = nearest(self._rows[: self._count], codes, k, unwanted)
+        # -1 is none.
+        return squared, np.append(self.ids, -1)[places]
 
     def within(self, codes: Codes, reach: float, most: int) -> tuple[Ids, Vectors, Ids]:
         """(M,) row of the code, squared distance and id of the `most` nearest landmarks within reach."""

@@ -13,9 +13,12 @@ import numpy as np
 
 from mapweave.hybridmap.landmark_tables import DIMENSIONS, landmark_tables
 from mapweave.mapserver.retrieval.coarse_quantizer import BLOCK, CoarseQuantizer, Codes, Ids, Vectors, probing
+from mapweave.mapserver.retrieval.wanted_landmarks import Hidden, nearest_wanted
 
 STEP2 = np.float32(landmark_tables().step ** 2)
 """What a squared distance of codes is worth."""
+MOST_FOUND = 1 << 18
+"""Landmarks that one search finds at most, hidden ones among them."""
 
 
 class CellContents(NamedTuple):
@@ -92,19 +95,27 @@ class InvertedFile:
         self._index.ntotal -= count
         return count
 
-    def nearest(self, codes: Codes, k: int, probes: int) -> tuple[Vectors, Ids]:
+    def nearest(self, codes: Codes, k: int, probes: int, hidden: Hidden | None = None) -> tuple[Vectors, Ids]:
         """The k nearest landmarks in the nearest cells.
 
         Args:
             codes: (N, 32).
             k: at most.
             probes: cells to search.
+            hidden: which ids are not wanted.
 
         Returns:
             (N, k) squared distances of decoded descriptors, and ids; -1 where there are fewer.
         """
-        squared, ids = self._index.search(codes.astype(np.float32), k, params=self._searching(probes))
-        return squared * STEP2, ids
+        vectors, searching = codes.astype(np.float32), self._searching(probes)
+
+        def search(features: Ids, count: int) -> tuple[Vectors, Ids]:
+            squared, ids = self._index.search(vectors[features], count, params=searching)
+            return squared * STEP2, ids
+
+        if hidden is None:
+            return search(np.arange(len(codes)), k)
+        return nearest_wanted(search, len(codes), k, hidden, MOST_FOUND)
 
     def blocks(self, size: int) -> Iterator[CellContents]:
         """All landmarks, cell by cell, about `size` at once: a copy of all would take the memory twice."""

@@ -18,6 +18,7 @@ from mapweave.mapserver.retrieval.coarse_quantizer import SAMPLE, CoarseQuantize
 from mapweave.mapserver.retrieval.flat_landmarks import FlatLandmarks
 from mapweave.mapserver.retrieval.inverted_file import CellContents, InvertedFile
 from mapweave.mapserver.retrieval.shared_lock import SharedLock
+from mapweave.mapserver.retrieval.wanted_landmarks import Hidden
 
 log = logging.getLogger(__name__)
 
@@ -33,14 +34,12 @@ class LandmarkIndexSettings:
     """How landmarks are found.
 
     Attributes:
-        small: up to as many every one is compared; beyond, those of some cells.
-        exact: up to as many `within` works.
+        exact: up to as many every one is compared; beyond, those of some cells, and `within` does not work.
         growth: cells are trained again when there are so many times as many landmarks.
         probes: cells that are searched for a feature of a view.
         patience: landmarks beyond which cells are trained in the background of questions, not between them.
     """
 
-    small: int = 10_000
     exact: int = 30_000
     growth: float = 4.0
     probes: int = 8
@@ -80,8 +79,7 @@ class LandmarkIndex:
         """Start empty."""
         self.lock = SharedLock()
         self._settings = settings or LandmarkIndexSettings()
-        self._flat: FlatLandmarks | None = FlatLandmarks()
-        self._cells: InvertedFile | None = None
+        self._landmarks: FlatLandmarks | InvertedFile = FlatLandmarks()
         self._learned = 0
         self._learner: threading.Thread | None = None
         self._missed: list[AddedRows | RemovedRows] = []
@@ -92,16 +90,9 @@ class LandmarkIndex:
         return len(self._landmarks)
 
     @property
-    def _landmarks(self) -> FlatLandmarks | InvertedFile:
-        if self._cells is not None:
-            return self._cells
-        assert self._flat is not None  # It goes when there are cells.
-        return self._flat
-
-    @property
     def means(self) -> CoarseQuantizer | None:
         """What the cells are about; None as long as there are none."""
-        return None if self._cells is None else self._cells.means
+        return None if isinstance(self._landmarks, FlatLandmarks) else self._landmarks.means
 
     def add(self, codes: Codes, ids: Ids) -> None:
         """Take in (N, 32) codes with (N,) ids."""
@@ -111,10 +102,7 @@ class LandmarkIndex:
             self._end = int(ids[-1]) + 1
             if self._learner is not None:
                 self._missed.append(AddedRows(codes, ids))
-            if self._cells is not None:
-                self._cells.add(codes, ids)
-            if self._flat is not None:
-                self._flat.add(codes, ids)
+            self._landmarks.add(codes, ids)
             self._grow()
 
     def remove(self, first: int, last: int, codes: Codes | None = None) -> None:
@@ -122,15 +110,17 @@ class LandmarkIndex:
         with self.lock.writing():
             if self._learner is not None:
                 self._missed.append(RemovedRows(first, last, codes))
-            if self._flat is not None:
-                self._flat.remove(first, last)
-            if self._cells is not None:
-                self._cells.remove(first, last, codes)
+            self._landmarks.remove(first, last, codes)
 
-    def nearest(self, codes: Codes, k: int) -> tuple[Vectors, Ids]:
-        """(N, k) squared distances and ids of the nearest landmarks, nearest first; id -1 is none."""
+    def nearest(self, codes: Codes, k: int, hidden: Hidden | None = None) -> tuple[Vectors, Ids]:
+        """(N, k) squared distances and ids of the nearest landmarks, nearest first; id -1 is none.
+
+        What is hidden is as if it were not there.
+        """
         with self.lock.reading():
-            return self._landmarks.nearest(codes, max(min(k, len(self)), 1), self._settings.probes)
+            if isinstance(self._landmarks, FlatLandmarks):
+                return self._landmarks.nearest(codes, k, hidden)
+            return self._landmarks.nearest(codes, k, self._settings.probes, hidden)
 
     def within(self, codes: Codes, reach: float) -> tuple[Ids, Vectors, Ids] | None:
         """(M,) row of the code, squared distance and id of the `MOST_WITHIN` nearest landmarks within reach.
@@ -139,9 +129,9 @@ class LandmarkIndex:
             None if there are too many landmarks for that.
         """
         with self.lock.reading():
-            if self._flat is None:
-                return None
-            return self._flat.within(codes, reach, MOST_WITHIN)
+            if isinstance(self._landmarks, FlatLandmarks):
+                return self._landmarks.within(codes, reach, MOST_WITHIN)
+            return None
 
     def keep_up(self) -> None:
         """Wait for the training of cells if too many landmarks have come since: they are kept twice."""
@@ -172,12 +162,12 @@ class LandmarkIndex:
     def _grow(self) -> None:
         """Learn cells if there are many more landmarks than when it was last done."""
         s, n = self._settings, len(self)
-        few = self._cells is None or len(self._cells.means) < MOST_CELLS
-        if n <= s.small or n < s.growth * self._learned or self._learner is not None or not few:
+        few = self.means is None or len(self.means) < MOST_CELLS
+        if n <= s.exact or n < s.growth * self._learned or self._learner is not None or not few:
             return
         self._learned, self._missed = n, []
         if n <= s.patience:
-            self._swap(self._new(n, self._end))
+            self._landmarks = self._new(n, self._end)
             return
         self._learner = threading.Thread(target=self._learn, args=(n, self._end), name="cells", daemon=True)
         self._learner.start()
@@ -190,8 +180,7 @@ class LandmarkIndex:
                 with self.lock.writing():
                     missed, self._missed = self._missed, []
                     if not missed:
-                        self._swap(cells)
-                        self._learner = None
+                        self._landmarks, self._learner = cells, None
                         return
                 _catch_up(cells, missed)
         except Exception:  # the old cells go on serving, more slowly
@@ -210,12 +199,6 @@ class LandmarkIndex:
             old = block.ids < end
             cells.add(block.codes[old], block.ids[old])
         return cells
-
-    def _swap(self, cells: InvertedFile) -> None:
-        """Use new cells."""
-        self._cells = cells
-        if len(cells) > self._settings.exact:
-            self._flat = None
 
 
 def _catch_up(cells: InvertedFile, missed: list[AddedRows | RemovedRows]) -> None:

@@ -119,24 +119,24 @@ class PlaceIndex:
         Args:
             view: the image's features.
             k: nodes wanted at most.
-            exclude: nodes that are not wanted.
+            exclude: nodes that are not wanted: others are ranked as if these were not there.
 
         Returns:
             Nodes with a positive score, best first.
         """
         return Ranked(self._ranked(view.codes, k, exclude))
 
-    def nearest(self, codes: NDArray[np.uint8]) -> NearestLandmarks:
-        """The landmarks that features vote for, for an index that is one of several.
+    def nearest(self, codes: NDArray[np.uint8], count: int) -> NearestLandmarks:
+        """The nearest landmarks of features, for an index that is one of several.
 
         Args:
             codes: (N, 32) of the features.
+            count: landmarks of each.
         """
         with self._current():
             if len(codes) == 0 or len(self._landmarks) == 0:
-                empty = np.zeros((len(codes), 0))
-                return NearestLandmarks(empty.astype(np.float32), empty.astype(np.int64), ())
-            squared, ids = self._landmarks.nearest(codes, self._settings.votes)
+                return NearestLandmarks.none(len(codes), count)
+            squared, ids = self._landmarks.nearest(codes, count)
             slots, owners = np.unique(ids >> SLOT_BITS, return_inverse=True)
             owners, first = owners.reshape(ids.shape), int(slots[0] < 0)
             nodes = tuple(self._nodes[slot] for slot in slots[first:].tolist())
@@ -148,10 +148,11 @@ class PlaceIndex:
         with self._current():
             if len(codes) == 0 or len(self._landmarks) == 0:
                 return []
-            squared, ids = self._landmarks.nearest(codes, self._settings.votes)
             hidden = [self._slots[node_id] for node_id in exclude if node_id in self._slots]
+            unwanted = (lambda ids: np.isin(ids >> SLOT_BITS, hidden)) if hidden else None
+            squared, ids = self._landmarks.nearest(codes, self._settings.votes, unwanted)
             # -1 belongs to no node, shifted too.
-            return rank(squared, ids >> SLOT_BITS, self._nodes, k, hidden)
+            return rank(squared, ids >> SLOT_BITS, self._nodes, k)
 
     def overlaps(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
         """Overlaps of a node: shared similar descriptors, see mapweave.merge.pose_graph.candidates.

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -35,7 +35,7 @@ class Ranked(list[tuple[NodeId, float]]):
 
 @dataclass(frozen=True, eq=False)
 class NearestLandmarks:
-    """The nearest landmarks of each of N features, as far as votes need them.
+    """The nearest landmarks of each of N features.
 
     Attributes:
         squared: (N, k) squared distances, nearest first.
@@ -46,6 +46,12 @@ class NearestLandmarks:
     squared: NDArray[np.float32]
     owners: NDArray[np.int64]
     nodes: tuple[NodeId, ...]
+
+    @staticmethod
+    def none(features: int, k: int) -> NearestLandmarks:
+        """Of so many features, where there are no landmarks."""
+        nowhere = np.full((features, k), -1)
+        return NearestLandmarks(np.full((features, k), np.inf, np.float32), nowhere, ())
 
     @staticmethod
     def together(parts: Sequence[NearestLandmarks], k: int) -> NearestLandmarks:
@@ -64,7 +70,7 @@ class NearestLandmarks:
             ],
             axis=1,
         )
-        # What is no landmark is last: faiss gives it the greatest distance there is.
+        # What is no landmark is last.
         order = np.argsort(np.where(owners < 0, np.inf, squared), axis=1, kind="stable")[:, :k]
         return NearestLandmarks(
             np.take_along_axis(squared, order, axis=1),
@@ -72,11 +78,9 @@ class NearestLandmarks:
             tuple(node for part in parts for node in part.nodes),
         )
 
-    def ranked(self, k: int, exclude: Collection[NodeId] = ()) -> list[tuple[NodeId, float]]:
+    def ranked(self, k: int) -> list[tuple[NodeId, float]]:
         """At most k nodes by their votes, see `rank`."""
-        unwanted = frozenset(exclude)
-        hidden = [owner for owner, node in enumerate(self.nodes) if node in unwanted]
-        return rank(self.squared, self.owners, dict(enumerate(self.nodes)), k, hidden)
+        return rank(self.squared, self.owners, dict(enumerate(self.nodes)), k)
 
 
 def rank(
@@ -84,7 +88,6 @@ def rank(
     owners: NDArray[np.int64],
     names: Mapping[int, NodeId],
     k: int,
-    hidden: Collection[int] = (),
 ) -> list[tuple[NodeId, float]]:
     """Rank nodes by the votes of features, see mapweave.mapserver.retrieval.voting.votes.
 
@@ -93,14 +96,11 @@ def rank(
         owners: (N, k) the nodes of the landmarks, by number; below 0 for none.
         names: of the nodes.
         k: nodes wanted at most.
-        hidden: numbers of nodes that are not wanted. They have their votes all the same.
 
     Returns:
         Nodes with a positive score, best first.
     """
     voted, scores = voting.votes(squared, owners, REACH)
-    if len(hidden):
-        voted, scores = voted[wanted := ~np.isin(voted, list(hidden))], scores[wanted]
     if not len(scores):
         return []
     best = np.flatnonzero(scores >= np.sort(scores)[-min(k, len(scores))])

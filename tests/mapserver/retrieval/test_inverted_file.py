@@ -56,6 +56,21 @@ def test_all_cells_are_brute_force(landmarks: tuple[Codes, Ids]) -> None:
     assert np.allclose(again, squared, atol=1e-4)
 
 
+def test_hidden_landmarks_are_as_if_they_were_not_there(landmarks: tuple[Codes, Ids]) -> None:
+    codes, ids = landmarks
+    questions, means = asked(codes, 50, 2), CoarseQuantizer.learn(codes, 64)
+    # Of each landmark that is wanted there are forty that are not.
+    wanted, cells = InvertedFile(means), InvertedFile(means)
+    wanted.add(codes[:200], ids[:200])
+    cells.add(codes[:200], ids[:200])
+    cells.add(np.repeat(codes[:200], 40, axis=0), 100_000 + np.arange(8000))
+    squared, result = cells.nearest(questions, 10, 4, lambda found: found >= 100_000)
+    expected_squared, expected = wanted.nearest(questions, 10, 4)
+    assert np.array_equal(np.sort(result), np.sort(expected))
+    there = expected >= 0
+    assert np.array_equal(squared[there], expected_squared[there]) and np.isinf(squared[~there]).all()
+
+
 def test_a_few_cells_find_nearly_all_that_was_seen_before(landmarks: tuple[Codes, Ids]) -> None:
     codes, ids = landmarks
     cells, questions = filled(codes, ids, 64), asked(codes, 300, 3)

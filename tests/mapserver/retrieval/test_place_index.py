@@ -118,7 +118,7 @@ def test_overlaps_of_compared_nodes_are_exact_in_a_large_fleet(
 ) -> None:
     _, nodes, _ = building
     table, known = overlaps(nodes), {node.id: node for node in nodes}
-    landmarks = LandmarkIndexSettings(small=300, exact=600)
+    landmarks = LandmarkIndexSettings(exact=600)
     few, all_of_them = (
         filled(nodes, PlaceIndexSettings(landmarks=landmarks, compared=compared)) for compared in (3, 99)
     )
@@ -150,6 +150,23 @@ def test_added_is_found_at_once_and_removed_never(building: tuple[World, list[No
     assert len(index.landmarks) == sum(len(node.landmarks) for node in nodes[:-1])
 
 
+@pytest.mark.parametrize("exact", [100_000, 600], ids=["all are compared", "cells are searched"])
+def test_what_another_robot_adds_changes_nothing_once_it_is_hidden(
+    building: tuple[World, list[Node], list[Pose2]], exact: int
+) -> None:
+    """However many copies of a place it adds: all nearest landmarks are copies then."""
+    world, nodes, tour = building
+    index = filled(nodes, PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=exact, growth=99.0)))
+    assert (index.landmarks.means is None) == (exact == 100_000)
+    views = [take_view(world, stop, np.random.default_rng(12))[0] for stop in tour[::4]]
+    before = [index.query(view, 16) for view in views]
+    copies = [replace(node, id=NodeId("liar", k, node.id.number)) for node in nodes[::4] for k in range(20)]
+    index.extend(copies)
+    assert "liar" in {node.agent for node, _ in index.query(views[0], 3)}, "as long as nothing is hidden"
+    hidden = [node.id for node in copies]
+    assert [index.query(view, 16, hidden) for view in views] == before
+
+
 def test_adding_again_replaces(building: tuple[World, list[Node], list[Pose2]]) -> None:
     _, nodes, _ = building
     index = filled(nodes)
@@ -160,8 +177,8 @@ def test_adding_again_replaces(building: tuple[World, list[Node], list[Pose2]]) 
 
 def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[Node], list[Pose2]]) -> None:
     world, nodes, tour = building
-    index = filled(nodes, PlaceIndexSettings(landmarks=LandmarkIndexSettings(small=500, exact=1500)))
-    assert index.landmarks._flat is None
+    index = filled(nodes, PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=1500)))
+    assert index.landmarks.means is not None
     rng = np.random.default_rng(5)
     hits = 0
     for node, stop in zip(nodes, tour, strict=True):
@@ -178,7 +195,7 @@ def test_a_removed_node_stays_removed_despite_its_landmarks(
     building: tuple[World, list[Node], list[Pose2]], named: str
 ) -> None:
     nodes = building[1]
-    index = PlaceIndex(PlaceIndexSettings(landmarks=LandmarkIndexSettings(small=100, exact=100)))
+    index = PlaceIndex(PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=100)))
     index.extend(nodes)
     before, codes = len(index.landmarks), nodes[3].landmarks.codes
     known = {"its own": codes, "some of them": codes[:5], "another's": nodes[4].landmarks.codes, "none": None}
@@ -202,7 +219,7 @@ def test_nothing_is_found_in_nothing(building: tuple[World, list[Node], list[Pos
 
 def everywhere() -> PlaceIndexSettings:
     """Cells, of which all are searched: then nothing may be missing."""
-    landmarks = LandmarkIndexSettings(small=300, growth=2.0, probes=10_000)
+    landmarks = LandmarkIndexSettings(exact=300, growth=2.0, probes=10_000)
     return PlaceIndexSettings(landmarks=landmarks)
 
 
@@ -233,7 +250,7 @@ def test_many_at_once_equal_one_by_one(building: tuple[World, list[Node], list[P
 def test_cells_are_trained_in_the_background(building: tuple[World, list[Node], list[Pose2]]) -> None:
     """What comes and goes while new cells are learned is in them."""
     world, nodes, tour = building
-    landmarks = LandmarkIndexSettings(small=300, exact=600, growth=2.0, patience=500, probes=10_000)
+    landmarks = LandmarkIndexSettings(exact=300, growth=2.0, patience=500, probes=10_000)
     index = PlaceIndex(PlaceIndexSettings(landmarks=landmarks))
     index.extend(nodes[:8])
     index.add(nodes[8])
@@ -258,7 +275,7 @@ def test_an_index_that_cannot_be_trained_reports_it_and_goes_on(
     world, nodes, tour = building
     monkeypatch.setattr("mapweave.mapserver.retrieval.landmark_index.InvertedFile", None)
     index = PlaceIndex(
-        PlaceIndexSettings(landmarks=LandmarkIndexSettings(small=300, growth=2.0, patience=300))
+        PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=300, growth=2.0, patience=300))
     )
     index.extend(nodes)
     index.settle()
