@@ -134,6 +134,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     # OpenCV and its FFmpeg read these likewise. What they print comes beside the one line of an error.
     os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
     os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+    # Where the home cannot be written, as that of a service, Matplotlib says in two lines where its cache is.
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)
     commands = parser()
     if "_ARGCOMPLETE" in os.environ:
         import argcomplete

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import socket
 import subprocess
 import sys
@@ -11,6 +12,10 @@ from pathlib import Path
 
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.processes import parent_watchdog
+from mapweave.storage.os_errors import NO_ROOM
+
+LEAST_ROOM = 4096
+"""Bytes: less than a block of the disk, so not even a line of a log is written."""
 
 
 class ChildFailed(MapweaveError):
@@ -65,7 +70,7 @@ class Children:
         for name, process in self._running.items():
             if process.poll() is not None:
                 output = self._log(name).read_text(errors="replace").strip().splitlines()
-                last = output[-1] if output else "it printed nothing"
+                last = output[-1] if output else self._silence()
                 raise ChildFailed(
                     f"{name} ended with status {process.returncode}: {last} ({self._log(name)})"
                 )
@@ -89,6 +94,11 @@ class Children:
         if process is not None:
             with process:
                 process.kill()
+
+    def _silence(self) -> str:
+        """Why a process that failed may have printed nothing: it could not be written."""
+        full = shutil.disk_usage(self._logs).free < LEAST_ROOM
+        return f"it printed nothing; {NO_ROOM}" if full else "it printed nothing"
 
     def _log(self, name: str) -> Path:
         return self._logs / f"{name}.log"

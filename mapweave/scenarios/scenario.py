@@ -180,7 +180,7 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     table = read_toml(path)
     for override in overrides:
         _override(table, override)
-    where = str(path)
+    where = " with ".join([str(path), *(f"--set {override}" for override in overrides)])
     keys = ("name", "summary", "seed", "robots", "robot", "world", "events", "expect")
     for name in table:
         if name not in keys:

@@ -55,7 +55,10 @@ class TerminalProgress:
         self._printed = len(runner.moments)
         doing = f"{runner.now:6.1f} s  {runner.doing}"
         if not self._console.is_terminal and time.monotonic() - self._said_at >= EVERY:
-            self._console.print(f" {doing}", highlight=False)
+            nodes = ", ".join(
+                f"{name} {report.status.nodes}" for name, report in sorted(runner.agents.items())
+            )
+            self._console.print(f" {doing}{nodes and f'; nodes: {nodes}'}", highlight=False)
             self._said_at = time.monotonic()
         self._progress.update(self._whole, completed=float(runner.done), doing=doing[:110])
         for robot, task in self._robots.items():

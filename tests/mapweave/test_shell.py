@@ -25,9 +25,12 @@ from mapweave.cli import main, parser
 from mapweave.commands.completion import SHELLS
 from mapweave.commands.examples import EXAMPLES
 from mapweave.exit_status import FAILED, USAGE
+from mapweave.hybridmap.hybrid_map import HybridMap
+from mapweave.hybridmap.ids import MapId
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.storage.os_errors import NO_ROOM
 from mapweave.terminal import EVERY, PLAIN_WIDTH, Bar, EventLog, tracked
+from synthetic.maps import looked_around
 from tests.mapweave.command_line import parsers
 from tests.waiting import eventually
 
@@ -298,3 +301,16 @@ def test_a_name_that_the_locale_cannot_show_is_shown_by_its_codes(
     done = started("map", "show", path, "--no-picture", env=codec, stdout=subprocess.PIPE)
     assert (done.stderr, done.returncode) == (b"", 0)
     assert printed in done.stdout.decode(encoding)
+
+
+def test_a_home_that_cannot_be_written_is_no_matter(tmp_path: Path) -> None:
+    """As that of a service: two lines of Matplotlib about its cache came before what was asked for."""
+    path = tmp_path / "r0.1.mapweave"
+    (log,) = looked_around((MapId("r0", 1),), seed=8).values()
+    write_map_file(path, MapFile("agent", "r0.1", tuple(HybridMap(log).contents())))
+    # Not even root can make a folder there.
+    home = dict.fromkeys(("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "MPLCONFIGDIR"), "/proc/none")
+    run = [sys.executable, "-m", "mapweave", "map", "show", str(path), "-o", str(tmp_path / "a.png")]
+    shown = subprocess.run(run, capture_output=True, text=True, timeout=60, env=os.environ | home)
+    assert (shown.returncode, shown.stderr) == (0, "")
+    assert (tmp_path / "a.png").exists()

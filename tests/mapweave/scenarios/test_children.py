@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+import shutil
 import signal
 import subprocess
 import sys
 import threading
+from argparse import Namespace
 from pathlib import Path
 
 import pytest
@@ -115,3 +117,20 @@ def test_the_stdin_of_all_others_means_nothing(monkeypatch: pytest.MonkeyPatch) 
     parent_watchdog.hold(stop)
     assert not stop.wait(0.2)
     assert "lifeline" not in {thread.name for thread in threading.enumerate()}
+
+
+def test_a_child_whose_output_finds_no_room_on_the_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was said to have printed nothing, though it had said why it ended."""
+    with Children(tmp_path) as children:
+        children.start("server", ["no such command"])
+        eventually(lambda: "no command" in said(tmp_path))
+        os.waitid(os.P_PID, children.pid("server"), os.WEXITED | os.WNOWAIT)
+        # As on a disk that takes no line.
+        (tmp_path / "server.log").write_text("")
+        with pytest.raises(ChildFailed, match=r"status 2: it printed nothing \("):
+            children.check()
+        monkeypatch.setattr(shutil, "disk_usage", lambda _: Namespace(total=10**9, used=10**9, free=0))
+        with pytest.raises(ChildFailed, match="it printed nothing; the disk is full; make room"):
+            children.check()
