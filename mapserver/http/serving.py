@@ -343,6 +343,13 @@ class HttpThread:
         self._thread.join(10.0)
 
 
+_UNUSABLE = {
+    errno.EADDRINUSE: "the port is taken; choose another one",
+    errno.EACCES: "ports below 1024 are for root alone; choose another one, for example 8080",
+}
+"""Why a port cannot be had, by the error's number."""
+
+
 def _listen(address: tuple[str, int]) -> socket.socket:
     listening = socket.socket(socket.AF_INET6 if ":" in address[0] else socket.AF_INET)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -351,11 +358,6 @@ def _listen(address: tuple[str, int]) -> socket.socket:
         listening.listen(MAX_CONNECTIONS)
     except (OSError, OverflowError) as error:
         listening.close()
-        number = getattr(error, "errno", None)
-        reason = (
-            "the port is taken; choose another one"
-            if number == errno.EADDRINUSE
-            else getattr(error, "strerror", None)
-        )
+        reason = _UNUSABLE.get(getattr(error, "errno", 0)) or getattr(error, "strerror", None)
         raise NotConnected(str(reason or error)) from None
     return listening

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import pty
 import signal
@@ -61,6 +62,18 @@ def test_a_port_for_people_that_is_taken(capfd, port, closed, tmp_path):
     )
     assert "write a port, or HOST:PORT" in output
     assert not (tmp_path / "b").exists()
+
+
+def test_a_port_for_people_that_is_for_root_alone(capfd, closed, tmp_path, monkeypatch):
+    """It said only that permission was denied."""
+
+    def bind(self, address):
+        if address[1] == 80:
+            raise PermissionError(errno.EACCES, "Permission denied")
+
+    monkeypatch.setattr(socket, "socket", type("Socket", (socket.socket,), {"bind": bind}))
+    output = complaint(capfd, "server", "--listen", closed, "--data", tmp_path, "--http", "80")
+    assert "cannot listen at http 127.0.0.1:80: ports below 1024 are for root alone; choose another" in output
 
 
 def test_an_address_of_another_machine(capfd, tmp_path):
