@@ -9,7 +9,6 @@ with mapweave.connect("tcp/127.0.0.1:7447") as fleet:
 
 from __future__ import annotations
 
-import getpass
 import threading
 import time
 from collections.abc import Callable, Sequence
@@ -38,6 +37,7 @@ from mapweave.hybridmap.mission_order import (
 )
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.identities.key_file import read_key_file
+from mapweave.login import login
 from mapweave.refusals import listed
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
@@ -112,14 +112,6 @@ def send_portal_done(bus: Bus, keys: Keys, done: PortalDone, timeout: float = 10
     if replies[0].error:
         raise Refused(replies[0].error.removeprefix("refused: "))
     return str(decode_record(replies[0].payload)["said"])
-
-
-def login() -> str:
-    """Name of the person, for records."""
-    try:
-        return getpass.getuser()
-    except (OSError, KeyError):  # no user of that number
-        return "a person"
 
 
 def author(holder: Credentials | None, by: str) -> str:

@@ -21,10 +21,11 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.constraint_methods import ConstraintMethods
 from mapweave.extras import need
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.constraint_subject import read_end, read_ends
+from mapweave.hybridmap.constraint_subject import Subject, read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue, Refused
 from mapweave.hybridmap.explanation import (
     Explanation,
@@ -36,10 +37,12 @@ from mapweave.hybridmap.explanation import (
 )
 from mapweave.hybridmap.floor_plan import PlacedPlans
 from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.named_nodes import asked_of, ids_of
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
+from mapweave.login import login
 from mapweave.map_reading import MapReading
 from mapweave.merge.settings import MergeSettings
 from mapweave.node_table import NodeTable
@@ -336,17 +339,23 @@ class Map(ABC):
         write_map_file(Path(path), self.content)
 
 
-class FileMap(Map):
-    """A map from a file; it asks no server."""
+class FileMap(Map, ConstraintMethods):
+    """A map from a file; it asks no server.
 
-    def __init__(self, content: MapFile, settings: MergeSettings | None = None) -> None:
+    Corrections (`link`, `unlink`, `retire`, `undo`) merge the map again, in memory: its nodes, components and
+    ways are then those with the correction. A file has it once the map is saved.
+    """
+
+    def __init__(self, content: MapFile, settings: MergeSettings | None = None, by: str = "") -> None:
         """Take the content of a map file.
 
         Args:
             content: as `read_map_file` and `merge_map_files` give it.
             settings: with which it was merged.
+            by: who corrects the map, for its record; the login name by default.
         """
         self._read = MapReading(content, settings)
+        self._by = by or login()
 
     @property
     def _reading(self) -> MapReading:
@@ -364,6 +373,30 @@ class FileMap(Map):
 
         with refusals():
             return explained(request, router, self._read.settings.consistency)
+
+    def constraints(self) -> tuple[ManualConstraint, ...]:
+        """What people have linked, unmerged, retired and taken back, in order; the first is number 1."""
+        return tuple(self.content.constraints)
+
+    def constrain(self, about: Subject, holds: bool, because: str = "", *, check: bool = False) -> str:
+        """Set a manual constraint of any kind, or take it back; see `link`. The map is merged again.
+
+        Raises:
+            Refused: the map contradicts it, or it has no effect: the evidence, and what to do.
+            MissingExtra: that needs the extra "server".
+        """
+        before, settings = self._read.merged, self._read.settings
+        from mapweave.offline_constraints import CHECKED, checked_constraint, with_constraint
+        from mapweave.opened_map import MapSource, OpenedMap
+
+        asked = ManualConstraint(about, holds, self._by, time.time_ns(), because)
+        constraint, words = checked_constraint(self.content, before, asked, settings)
+        if check:
+            return CHECKED + words
+        one = OpenedMap("the map", MapSource.FILE, self.content, tuple(before.maps), {})
+        _, content = with_constraint(one, before, constraint, settings)
+        self._read = MapReading(content, settings)
+        return words
 
     def annotations(self) -> Annotations:
         """What people say about the map, as the file has it."""
@@ -389,11 +422,15 @@ class FileMap(Map):
         return self._read.router.at(self.annotations(), time.time_ns())
 
 
-def open(path: str | os.PathLike[str]) -> FileMap:
+def open(path: str | os.PathLike[str], by: str = "") -> FileMap:
     """Open a map file, a server's store, also one in PostgreSQL, or an agent's journal. It is never changed.
 
     Several maps of a store or journal are merged first. Of a damaged one what can be read is opened, with a
     warning that says what is lost.
+
+    Args:
+        path: of the file, or the address of the database.
+        by: who corrects the map, for its record; the login name by default.
 
     Raises:
         InvalidFile: it cannot be read, is damaged, in use, or none of these.
@@ -406,9 +443,9 @@ def open(path: str | os.PathLike[str]) -> FileMap:
     for complaint in opened.complaints.values():
         warnings.warn(complaint, stacklevel=2)
     if opened.source is MapSource.FILE or len(opened.maps) < 2:
-        return FileMap(opened.content)
+        return FileMap(opened.content, by=by)
     need("server")
-    return FileMap(opened.file(opened.merged()))
+    return FileMap(opened.file(opened.merged()), by=by)
 
 
 def _is_map(name: str) -> bool:

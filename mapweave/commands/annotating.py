@@ -126,7 +126,7 @@ def record_of(arguments: argparse.Namespace) -> Iterator[Fleet | OfflineAnnotati
     Raises:
         MapweaveError: no server answers, or the file cannot be read.
     """
-    from mapweave.fleet import login
+    from mapweave.login import login
 
     if arguments.map is None:
         if getattr(arguments, "out", None) is not None:

@@ -6,7 +6,6 @@ import argparse
 import sys
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -139,14 +138,8 @@ def _settled(arguments: argparse.Namespace) -> list[str]:
 
 
 def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> list[str]:
-    from mapweave.hybridmap.annotation import Annotations
-    from mapweave.hybridmap.manual_constraint import ManualConstraints
-    from mapweave.mapserver.annotation_effects import without_effect
-    from mapweave.mapserver.map_files import map_file_of
-    from mapweave.mapserver.map_history import between
-    from mapweave.merge.constraint_checks import check_manual_constraint
+    from mapweave.offline_constraints import CHECKED, checked_constraint, with_constraint
     from mapweave.opened_map import MapSource
-    from mapweave.refusals import refusals
     from mapweave.storage.atomic_file import check_place
 
     settings = settings_of(arguments).merge
@@ -164,18 +157,11 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> lis
     if out is not None:
         check_place(out)
     before = merged_with_progress(one, settings)
-    said = Annotations(content.annotations)
-    earlier = ManualConstraints(content.constraints, floors=said.floors)
-    with refusals():
-        checked = check_manual_constraint(before, earlier, constraint, settings=settings)
-    constraint = checked.constraint
-    words = "; ".join(filter(None, (checked.words, without_effect(constraint, before, said))))
+    constraint, words = checked_constraint(content, before, constraint, settings)
     if arguments.check:
-        return [f"only checked, nothing is changed: {words}"]
+        return [CHECKED + words]
     assert out is not None
-    changed = replace(one, content=replace(content, constraints=(*content.constraints, constraint)))
     with merge_progress() as report:
-        merged = changed.merged_again(settings, report)
-    history = (*content.history, *between(before, merged, constraint.stamp_ns))
-    changed.written(out, map_file_of(merged, history, said, content.images))
+        merged, file = with_constraint(one, before, constraint, settings, report)
+    one.written(out, file)
     return [words, f"{out}: {merged.summary()}"]

@@ -17,13 +17,14 @@ import pytest
 
 from mapweave.cli import main
 from mapweave.exit_status import FAILED, NO, USAGE
-from mapweave.fleet import Fleet, login
+from mapweave.fleet import Fleet
 from mapweave.hybridmap.errors import InvalidValue, Refused
 from mapweave.hybridmap.floor_plan import PIECE, PlanPiece
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.map_event import MapEventKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ResolveRequest
+from mapweave.login import login
 from mapweave.map import FileMap
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.map_files import map_file_of, merged_of

@@ -91,7 +91,7 @@ def test_merging_in_steps_is_merging_at_once(files: list[Path], said: Said, tmp_
 def test_how_maps_are_merged_can_be_chosen(files: list[Path], said: Said, tmp_path: Path) -> None:
     path, out = tmp_path / "strict.toml", tmp_path / "m.mapweave"
     usual = said("map", "merge", *files[:3], "-o", out, "--json")
-    path.write_text("[merge.consistency]\ngate = 1e-6\nfloor_xy = 0.0\nfloor_heading = 0.0\n")
+    path.write_text("[merge.consistency]\ngate = 1e-6\n")
     strict = said("map", "merge", *files[:3], "-o", out, "--json", "--settings", path)
     assert json.loads(strict)["links"] < json.loads(usual)["links"], "to a thousandth of a sigma few agree"
     path.write_text("[merge.consistency]\ngate = 'much'\n")
