@@ -5,6 +5,7 @@ from __future__ import annotations
 import sqlite3
 from collections import Counter
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -73,7 +74,7 @@ def test_counts_are_those_of_the_bus_and_of_the_disk(tmp_path: Path) -> None:
         answers = fleet.where()
         eventually(lambda: Scrape(fleet)("settled") == 1)
         scrape, merged = Scrape(fleet), fleet.server.merged()
-    with sqlite3.connect(path) as rows:
+    with closing(sqlite3.connect(path)) as rows:
         (kept,) = rows.execute("SELECT count(*) FROM change").fetchone()
     assert kept == len(sent) - 4 == scrape("changes_taken_total") == scrape("ack_seconds_count")
     assert scrape("changes_received_total") == len(sent)

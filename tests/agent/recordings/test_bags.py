@@ -321,8 +321,8 @@ def test_images_of_distances_are_not_taken_where_there_are_others(drive: Drive, 
     opened = SimpleNamespace(
         path=tmp_path,
         topics=[
-            bag.Topic("/camera/aligned_depth_to_color/image_raw", bag.IMAGE_TYPES[1], 90),
-            bag.Topic("/camera/color/image_raw", bag.IMAGE_TYPES[1], 80),
+            bag.BagTopic("/camera/aligned_depth_to_color/image_raw", bag.IMAGE_TYPES[1], 90),
+            bag.BagTopic("/camera/color/image_raw", bag.IMAGE_TYPES[1], 80),
         ],
     )
     assert bag._chosen(opened, None, bag.IMAGE_TYPES, "images").name == "/camera/color/image_raw"
@@ -415,7 +415,7 @@ def test_a_robot_that_is_lifted_between_two_images_was_lifted_at_the_second(
 
 def test_a_camera_topic_that_lost_its_messages_is_reported_in_one_line() -> None:
     """Its count says that there are some; found by fuzzing."""
-    topic = bag.Topic("/camera/camera_info", bag.CAMERA_TYPE, 3)
+    topic = bag.BagTopic("/camera/camera_info", bag.CAMERA_TYPE, 3)
     opened = SimpleNamespace(path="walk.mcap", topics=[topic], damage=[], messages=lambda name: iter(()))
     with pytest.raises(DeviceError, match="camera_info has no message"):
         bag._camera(opened, "/camera/image", RecordingOptions(), [])

@@ -183,10 +183,10 @@ def test_scoring_writes_no_file_at_home_and_prints_nothing(tmp_path):
     program = (
         "import logging, sys\n"
         "import numpy as np\n"
-        "from mapweave.scenarios.recording import Trajectory\n"
+        "from mapweave.scenarios.recording import TrialTrajectory\n"
         "from mapweave.scenarios.trajectories import score_trajectory\n"
         "t = np.arange(50) * 10**8\n"
-        "way = Trajectory(t, np.stack([t / 1e9, np.sin(t / 1e9), t * 0.0], axis=1))\n"
+        "way = TrialTrajectory(t, np.stack([t / 1e9, np.sin(t / 1e9), t * 0.0], axis=1))\n"
         "assert score_trajectory(way, way).ate_m < 1e-9\n"
         "assert not logging.getLogger().handlers\n"
         "assert not {'matplotlib', 'seaborn', 'pandas', 'evo.tools'} & set(sys.modules)\n"
