@@ -64,6 +64,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import (
     Ack,
     Head,
+    KeptNodes,
     LogAnswer,
     LogRequest,
     Mark,
@@ -385,6 +386,8 @@ def changes() -> list[dict[str, Any]]:
         ("log answer", KEYS.log(MAP), LogAnswer(2**63, 1003, 1008, ((1007, made[7]), (1008, b"")))),
         ("acknowledgement", KEYS.ack("s0", "r0"), Ack(MAP, 2**63, 1005, (Refusal(1004, "none"),), 77, 2.5)),
         ("newest map", KEYS.ack("s0", "r0"), NewestMap(3)),
+        ("kept nodes", KEYS.ack("s0", "r0"), KeptNodes(2, (1, 4, 1000))),
+        ("newest map", KEYS.ack("s0", "r0"), NewestMap(3, pruned=True)),
     )  # fmt: skip
     vectors += [
         vector(what, "", key, one.encode(), type(one).decode(one.encode())) for what, key, one in small

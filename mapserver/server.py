@@ -195,7 +195,7 @@ class MapServer:
             self._bus, self._keys, self._store, self._name, worker.take, None,
             lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
             self._quotas, self._gone, worker.unmerged, worker.note_refusal, worker.note_disbelief,
-            self._metrics.acknowledged, self._roster.status_period_of,
+            self._metrics.acknowledged, self._roster.status_period_of, self._was_pruned,
         )  # fmt: skip
         self._roster.remind = self._ingest.remind
         clock.give_way(lambda: self._ingest.busy or self._admission.busy)
@@ -477,6 +477,11 @@ class MapServer:
         """All that people have said of nodes."""
         yield from self._constraints.constraints.made
         yield from self._annotations.annotations.made
+
+    def _was_pruned(self, node: NodeId) -> bool:
+        """Whether a node has left the map for good, since it was superseded for long."""
+        merged = self._worker.answers.merged
+        return node in merged.pruned and node not in merged.poses
 
     def _gone(self) -> Collection[MapId]:
         """Maps that people have retired, or of which nothing is left."""

@@ -32,6 +32,7 @@ from mapweave.wire.range_codec import pack_ranges, unpack_ranges
 from mapweave.wire.trajectory_codec import MAX_SEGMENT_BYTES, pack_trajectory, unpack_trajectory
 
 MAX_RADIUS_MM = 5000
+"""mm. Of a footprint; a limit for messages."""
 MAX_BODY_BYTES = MAX_LANDMARKS_BYTES + MAX_SEGMENT_BYTES + 2048
 MAX_CHANGE_BYTES = MAX_BODY_BYTES + 256
 BODY = Limit("change", MAX_BODY_BYTES)
@@ -53,6 +54,10 @@ KINDS_OF_EDGE = {number: kind for kind, number in EDGE_KINDS.items()}
 
 class _Element(msgspec.Struct, tag_field="k", omit_defaults=True):
     id: NodeId = msgspec.field(name="i")
+
+
+class _Kind(msgspec.Struct):
+    kind: int = msgspec.field(name="k")
 
 
 class _NodePut(_Element, tag=1):
@@ -126,6 +131,18 @@ def encode_body(body: ChangeBody) -> bytes:
     except InvalidMessage as error:
         raise InvalidValue(str(error)) from None
     return data
+
+
+def puts_node(body: bytes) -> bool:
+    """Whether a body puts a node; quick, since nothing else of it is read.
+
+    Raises:
+        InvalidMessage: it is none.
+    """
+    try:
+        return msgspec.msgpack.decode(body, type=_Kind).kind == _NodePut.__struct_config__.tag
+    except msgspec.MsgspecError as error:
+        raise InvalidMessage(f"change: {error}") from None
 
 
 def decode_body(data: bytes) -> ChangeBody:

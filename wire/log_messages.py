@@ -23,9 +23,15 @@ MAX_ROWS = 256
 """Changes in one answer for a range of a log."""
 
 MAX_SERVERS = 64
+"""Of a fleet. A limit for messages, as all here."""
 MAX_REFUSALS = 16
+"""In one acknowledgement, the newest."""
 MAX_REASON = 300
+"""Characters of why a change is refused."""
+MAX_KEPT_NODES = 2048
+"""Nodes in one question whether they were pruned."""
 MAX_SMALL_BYTES = 65536
+"""Of a message without changes."""
 MAX_SAID = 1024
 """Characters of a text in a flat record."""
 
@@ -140,10 +146,25 @@ class NewestMap(LogMessage, frozen=True):
 
     Attributes:
         epoch: 0 if it has no map of this agent.
+        pruned: whether each of the nodes that the agent has asked about, see KeptNodes, was pruned.
     """
 
     limit = Limit("newest map", MAX_SMALL_BYTES)
     epoch: Number = field(name="e")
+    pruned: bool = field(name="g", default=False)
+
+
+class KeptNodes(LogMessage, frozen=True):
+    """An agent asks whether some nodes of a map that it has left were all pruned.
+
+    Attributes:
+        epoch: of the map.
+        numbers: of the nodes.
+    """
+
+    limit = Limit("kept nodes", MAX_SMALL_BYTES)
+    epoch: Number = field(name="e")
+    numbers: Annotated[tuple[Number, ...], Meta(min_length=1, max_length=MAX_KEPT_NODES)] = field(name="n")
 
 
 class LogRequest(LogMessage, frozen=True):

@@ -18,7 +18,7 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.hybridmap.mission_order import MAX_KEPT, MissionReport, Missions
 from mapweave.storage.database import Database
-from mapweave.wire.codec import decode_body, element_of, encode_body, wrap_body
+from mapweave.wire.codec import decode_body, element_of, encode_body, puts_node, wrap_body
 from mapweave.wire.keys import check_epoch
 from mapweave.wire.messages import decode, encode
 
@@ -43,6 +43,7 @@ CREATE TABLE checksum (name TEXT PRIMARY KEY, crc INTEGER NOT NULL)
 """
 
 READ_AT_ONCE = 256
+"""Changes in memory at a time while a map is read: mostly of 3 kB each, so below 1 MB."""
 ADVICE = (
     "save what can be read with `mapweave map extract FILE -o FOLDER`, then move the file away: the agent "
     "begins a new map"
@@ -316,6 +317,31 @@ class Journal:
         for row in self._read(query, self._epoch(map_id)):
             yield entry_of(map_id, *row)
 
+    def nodes(self, map_id: MapId) -> list[NodeId]:
+        """Nodes of a map that are not retired, without reading their contents.
+
+        Raises:
+            InvalidFile: a change is damaged, which may have been a node.
+        """
+        query = "SELECT sequence, element, put, body, crc FROM change WHERE epoch = ? ORDER BY sequence"
+        there: dict[int, bool] = {}
+        for sequence, element, put, body, crc in self._read(query, self._epoch(map_id)):
+            if not put:
+                there.pop(element, None)
+                continue
+            try:
+                if not _body_holds(body, crc):
+                    raise InvalidMessage("is not what was written")
+                there[element] = puts_node(body)
+            except InvalidMessage as error:
+                raise self._damaged(sequence, error) from None
+        return [NodeId(*map_id, element) for element, is_node in sorted(there.items()) if is_node]
+
+    def newest_stamp(self, map_id: MapId) -> int:
+        """The latest stamp of a map's changes, ns; 0 if there are none."""
+        query = "SELECT coalesce(max(stamp_ns), 0) FROM change WHERE epoch = ?"
+        return int(self._read(query, self._epoch(map_id))[0][0])
+
     def acknowledge(self, server: str, map_id: MapId, watermark: int, reset: bool = False) -> None:
         """Remember that a server has every change up to the watermark; it never goes back.
 
@@ -438,4 +464,7 @@ class Journal:
         try:
             return decode_body(body)
         except InvalidMessage as error:
-            raise InvalidFile(f"{self._database.path}: change {sequence}: {error}") from None
+            raise self._damaged(sequence, error) from None
+
+    def _damaged(self, sequence: int, error: InvalidMessage) -> InvalidFile:
+        return InvalidFile(f"{self._database.path}: change {sequence}: {error}")

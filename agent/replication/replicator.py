@@ -19,9 +19,9 @@ from mapweave.agent.replication.ack_timer import AckTimer
 from mapweave.agent.replication.journal import Draft, Journal
 from mapweave.agent.replication.log_state import LogState
 from mapweave.hybridmap.agent_status import FIRST_STATUS_PERIOD
-from mapweave.hybridmap.change import ChangeBody
+from mapweave.hybridmap.change import ChangeBody, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
-from mapweave.hybridmap.ids import MapId, check_name
+from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.wire.bus import Bus, Request, Sample
 from mapweave.wire.codec import wrap_body
 from mapweave.wire.keys import Keys
@@ -77,6 +77,14 @@ RAREST = 4
 first: the beacons of a fleet that a server cannot keep up with must not hold it up further."""
 
 
+@dataclass(frozen=True, slots=True)
+class _Retirement:
+    """Of nodes of a map that was left."""
+
+    map: MapId
+    drafts: Sequence[Draft]
+
+
 class Replicator:
     """Replicates the logs of one agent; changes are added to one of them."""
 
@@ -125,7 +133,9 @@ class Replicator:
         self._compacted = 0
         for state in self._logs.values():
             self._compact(state)
-        self._work: queue.SimpleQueue[list[Draft] | Sample | Request | bool | None] = queue.SimpleQueue()
+        self._work: queue.SimpleQueue[list[Draft] | _Retirement | Sample | Request | bool | None] = (
+            queue.SimpleQueue()
+        )
         self._thread = threading.Thread(target=self._run, name=f"replicate-{map_id}", daemon=True)
         self._thread.start()
         self._declared = [
@@ -166,6 +176,18 @@ class Replicator:
         with self._changed:
             self._submitted += len(drafts)
             self._work.put(drafts)
+
+    def retire(self, map_id: MapId, nodes: Iterable[NodeId], stamp_ns: int) -> None:
+        """Have all nodes of a map that was left retired. Waits for neither disk nor network.
+
+        Once its servers have that, the nodes are dropped from the disk.
+
+        Raises:
+            InvalidValue: the map is the one that is being made, or none of the journal's when this began.
+        """
+        if map_id == self._map or map_id not in self._logs:
+            raise InvalidValue(f"map {map_id} was not left")
+        self._work.put(_Retirement(map_id, [Draft.of(NodeRetired(node), stamp_ns) for node in nodes]))
 
     def flush(self, timeout: float) -> bool:
         """Wait until all that was submitted is on the own disk; False if the time is over first."""
@@ -246,6 +268,8 @@ class Replicator:
                         stop = True
                     elif isinstance(item, list):
                         self._pending += item
+                    elif isinstance(item, _Retirement):
+                        self._retire(item)
                     elif isinstance(item, Sample):
                         self._take_ack(item)
                     elif isinstance(item, bool):
@@ -296,19 +320,32 @@ class Replicator:
                     log.error("%s; %d changes wait in memory", error, len(drafts))
                 self._disk_failure = str(error)
             return
-        encoded = [(first + k, wrap_body(first + k, d.stamp_ns, d.encoded)) for k, d in enumerate(drafts)]
         with self._changed:
             self._current.newest = first + len(drafts) - 1
             self._committed += len(drafts)
             self._disk_failure = ""
             self._changed.notify_all()
-        for sequence, change in encoded:
-            self._bus.publish(self._keys.change(self._map), change, self._mark(sequence))
+        self._publish(self._current, first, drafts)
         self._ack_timer.sent(first, time.monotonic())
         self._beacon_after(self._ack_timer.timeout)
 
-    def _mark(self, sequence: int) -> bytes:
-        return Mark(sequence, self._current.log_id).encode()
+    def _retire(self, retirement: _Retirement) -> None:
+        state = self._logs[retirement.map]
+        try:
+            first = self._journal.write(retirement.map, retirement.drafts)
+        except InvalidFile as error:
+            # The nodes only take more room until they are asked about again.
+            log.warning("%s", error)
+            return
+        with self._changed:
+            state.newest = first + len(retirement.drafts) - 1
+        self._publish(state, first, retirement.drafts)
+        self._beacon_after(self._ack_timer.timeout)
+
+    def _publish(self, state: LogState, first: int, drafts: Sequence[Draft]) -> None:
+        for sequence, draft in enumerate(drafts, start=first):
+            change = wrap_body(sequence, draft.stamp_ns, draft.encoded)
+            self._bus.publish(self._keys.change(state.map), change, Mark(sequence, state.log_id).encode())
 
     def _send_beacons(self, now: float) -> None:
         everyone = now >= self._everyone_at
@@ -364,6 +401,9 @@ class Replicator:
             }
             self._changed.notify_all()
         if state is self._current and state.settled(self._servers) - self._compacted >= COMPACTED:
+            self._compact(state)
+        if state is not self._current and not state.unsettled(self._servers):
+            # Nothing but retirements is added to a map that was left.
             self._compact(state)
         if state is self._current:
             self._ack_timer.settled(state.settled(self._servers), time.monotonic())

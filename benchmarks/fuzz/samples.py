@@ -45,7 +45,16 @@ from mapweave.offline_merge import merge_parts
 from mapweave.storage.map_file import MapFile, pack_map_file
 from mapweave.wire.codec import encode_change
 from mapweave.wire.credentials import Role
-from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, Mark, Refusal, encode_record
+from mapweave.wire.log_messages import (
+    Ack,
+    Head,
+    KeptNodes,
+    LogAnswer,
+    LogRequest,
+    Mark,
+    Refusal,
+    encode_record,
+)
 from mapweave.wire.messages import encode, encode_view
 from mapweave.wire.ros2.attachment import Attachment, encode_attachment
 from mapweave.wire.ros2.messages import encode as encode_ros2
@@ -98,6 +107,7 @@ class Samples:
             Mark(7, 2**63).encode(),
             Head(5, 7, {"s0": 3}).encode(),
             Ack(self.map_id, 5, 7, (Refusal(3, "because"),)).encode(),
+            KeptNodes(3, (1, 2**53)).encode(),
             LogRequest(3, 200).encode(),
             LogAnswer(5, 3, 6, ((3, b"abc"), (5, b""))).encode(),
             encode_record({"a": 1, "b": 0.5, "c": "text", "d": True}),

@@ -63,7 +63,16 @@ from mapweave.wire import messages
 from mapweave.wire.codec import decode_change, encode_change
 from mapweave.wire.credentials import Credentials, Role
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, Mark, NewestMap, decode_record
+from mapweave.wire.log_messages import (
+    Ack,
+    Head,
+    KeptNodes,
+    LogAnswer,
+    LogRequest,
+    Mark,
+    NewestMap,
+    decode_record,
+)
 from mapweave.wire.messages import LIMITS, decode_view, encode_view
 from mapweave.wire.pose_messages import PoseNews
 from mapweave.wire.ros2.attachment import decode_attachment
@@ -108,7 +117,7 @@ def _messages(data: bytes, _: Path) -> None:
         return
     kinds: list[Callable[[bytes], Any]] = [
         decode_change, decode_view, decode_record, Mark.decode, Head.decode, Ack.decode, NewestMap.decode,
-        LogRequest.decode, LogAnswer.decode, lambda body: PoseNews.decode(body, "r0"),
+        KeptNodes.decode, LogRequest.decode, LogAnswer.decode, lambda body: PoseNews.decode(body, "r0"),
         *(partial(messages.decode, kind=kind) for kind in LIMITS),
     ]  # fmt: skip
     value = kinds[data[0] % len(kinds)](data[1:])

@@ -14,9 +14,10 @@ are taken of the rooms as they are at last. Times are of this process alone. Ten
 and a half.
 
 Drives are 3.65 days apart, so a hundred are a year. After each the server prunes what has been superseded
-for long, in memory and in a store. After 60 drives and more there are also what a drive adds in the long run:
-the means of memory, merge and store over the last five drives by those over the five about the fiftieth.
-Memory is that of the process, less what it was before the first drive.
+for long, in memory and in a store, and the robot drops from its journal the maps of which nothing is left.
+After 60 drives and more there are also what a drive adds in the long run: the means of memory, merge, store
+and journal over the last five drives by those over the five about the fiftieth. Memory is that of the
+process, less what it was before the first drive.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -38,6 +39,8 @@ from rich.table import Table
 from benchmarks.command_line import command_line
 from benchmarks.life.house import TwoRooms
 from benchmarks.process_usage import held_bytes
+from mapweave.agent.replication.journal import Journal
+from mapweave.hybridmap.change import Change, NodeRetired
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty, View
@@ -82,6 +85,7 @@ class MapAfterDrive:
         merge_s: what the last merge took, s.
         memory: of the process, bytes.
         store: what the store takes, bytes.
+        journal: what the robot's journal takes, bytes.
     """
 
     nodes: int
@@ -92,6 +96,7 @@ class MapAfterDrive:
     merge_s: float
     memory: int
     store: int
+    journal: int
 
 
 def main() -> None:
@@ -158,8 +163,11 @@ def run(
             if plan is not None:
                 store.prune(plan.nodes, plan.edges, merger.pruning.records(plan))
                 merger.prune(plan)
+        journal = journal_of(Path(folder.name) / "r0.sqlite", map_id, changes, merger.pruning.pruned)
         counts = len(merged.poses) - old, old, len(merged.pruned), len(merged.components)
-        curve.append(MapAfterDrive(*counts, node_ms, spent, held_bytes() - at_first, path.stat().st_size))
+        curve.append(
+            MapAfterDrive(*counts, node_ms, spent, held_bytes() - at_first, path.stat().st_size, journal)
+        )
         if epoch <= EARLY[-1]:
             early.apply(map_id, 1, entries)
         console.print(
@@ -181,6 +189,7 @@ def run(
         "merge_s": [round(one.merge_s, 2) for one in curve],
         "memory_mb": [round(one.memory / 1e6, 1) for one in curve],
         "store_mb": [round(one.store / 1e6, 2) for one in curve],
+        "journal_mb": [round(one.journal / 1e6, 2) for one in curve],
         **in_the_long_run(curve),
         "components": curve[-1].components,
         "routes_found": routes_found(merged, rng),
@@ -198,6 +207,21 @@ def run(
             right, wrong = answered(mapped, mapped.merged(), hidden, asked, truth)
             figures |= {f"recall{where}_{name}": right, f"wrong{where}_{name}": wrong}
     return figures, curve
+
+
+def journal_of(path: Path, map_id: MapId, changes: Sequence[Change], pruned: Container[NodeId]) -> int:
+    """What a robot's journal takes after a drive that the server has taken in, bytes; see LeftMaps."""
+    with closing(Journal(path, map_id.agent)) as journal:
+        journal.open_map(map_id.epoch)
+        journal.append(map_id, [change.body for change in changes], changes[-1].stamp_ns)
+        journal.acknowledge("s0", map_id, journal.head(map_id))
+        for left in journal.maps()[:-1]:
+            nodes = journal.nodes(left)
+            if nodes and all(node in pruned for node in nodes):
+                journal.append(left, map(NodeRetired, nodes), changes[-1].stamp_ns)
+                journal.acknowledge("s0", left, journal.head(left))
+                journal.prune(left, ["s0"])
+    return path.stat().st_size
 
 
 def driven_through(store: Store, drives: int) -> Merger:
@@ -223,6 +247,7 @@ def in_the_long_run(curve: Sequence[MapAfterDrive]) -> dict[str, float | list[fl
         "memory_ratio": ratio(lambda drive: drive.memory),
         "merge_ratio": ratio(lambda drive: drive.merge_s),
         "store_ratio": ratio(lambda drive: drive.store),
+        "journal_ratio": ratio(lambda drive: drive.journal),
     }
 
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterable
 
-from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.ids import MapId, check_name
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
+from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.store import Store
 from mapweave.wire.bus import Bus, Closing, Request
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import Ack, NewestMap, Refusal
+from mapweave.wire.log_messages import Ack, KeptNodes, NewestMap, Refusal
 
 
 class Acknowledgements:
@@ -24,6 +24,7 @@ class Acknowledgements:
         store: Store,
         taken: Collection[MapId],
         status_period: Callable[[str], float],
+        pruned: Callable[[NodeId], bool],
     ) -> None:
         """Begin with nothing sent.
 
@@ -34,13 +35,16 @@ class Acknowledgements:
             store: has the logs; stays the caller's.
             taken: maps that are here and not in the store: no new one may have their names.
             status_period: of a robot's statuses, s; 0: its own.
+            pruned: whether a node has left the map for good, since it was superseded.
         """
         self._bus, self._keys, self._name = bus, keys, check_name(server_name)
         self._store, self._taken = store, tuple(taken)
-        self._status_period = status_period
+        self._status_period, self._pruned = status_period, pruned
 
     def serve(self) -> Closing:
-        """Begin to answer which numbers an agent must not give to a new map: it may have lost its disk."""
+        """Begin to answer which numbers an agent must not give to a new map, since it may have lost its disk,
+        and whether maps that it has left were pruned.
+        """
         return self._bus.serve(self._keys.all_acks(self._name), self._tell_newest)
 
     def acknowledge(self, agent_log: AgentLog) -> None:
@@ -67,9 +71,19 @@ class Acknowledgements:
     def _tell_newest(self, request: Request) -> None:
         _, agent = self._keys.parse_ack(request.key)
         try:
+            kept = KeptNodes.decode(request.payload) if request.payload else None
             maps = (*self._store.maps(agent), *self._taken)
-        except InvalidFile as error:
+            pruned = kept is not None and self._all_pruned(MapId(agent, kept.epoch), kept.numbers)
+        except (InvalidFile, InvalidMessage) as error:
             request.refuse(str(error))
             return
         epochs = (known.epoch for known in maps if known.agent == agent)
-        request.reply(NewestMap(max(epochs, default=0)).encode())
+        request.reply(NewestMap(max(epochs, default=0), pruned).encode())
+
+    def _all_pruned(self, map_id: MapId, numbers: Iterable[int]) -> bool:
+        """Whether none of some nodes is in the store since each of them was pruned.
+
+        A node that its robot has sent again is there again, perhaps not yet in the merged map.
+        """
+        nodes = [NodeId(*map_id, number) for number in numbers]
+        return all(map(self._pruned, nodes)) and all(self._store.landmarks(node) is None for node in nodes)

@@ -23,7 +23,7 @@ from typing import NamedTuple
 
 from mapweave.hybridmap.change import Change, ChangeBody
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, MapweaveError
-from mapweave.hybridmap.ids import MapId, check_name
+from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.mapserver.log.acknowledgements import Acknowledgements
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.entry import ReceivedChange, words_of
@@ -85,6 +85,7 @@ class Ingest:
         note_disbelief: Callable[[MapId, str], None] = lambda map_id, reason: None,
         observe_ack: Callable[[float], None] = lambda seconds: None,
         status_period: Callable[[str], float] = lambda robot: 0.0,
+        pruned: Callable[[NodeId], bool] = lambda node: False,
     ) -> None:
         """Replay the store, then listen.
 
@@ -108,6 +109,7 @@ class Ingest:
             observe_ack: called for each published change with the time from its receipt to its
                 acknowledgement, s.
             status_period: of a robot's statuses, s; 0: its own.
+            pruned: whether a node has left the map for good, since it was superseded.
 
         Raises:
             InvalidFile: the store cannot be read.
@@ -122,7 +124,7 @@ class Ingest:
         self._logs = KnownLogs()
         self._intakes = Intakes(store, self._quotas, retired)
         self._group = GroupCommit(store, self._intakes)
-        self._acks = Acknowledgements(bus, keys, server_name, store, taken, status_period)
+        self._acks = Acknowledgements(bus, keys, server_name, store, taken, status_period, pruned)
         self._pieces = Pieces()
         self._puller = Puller(bus, keys, self._intakes, unmerged, s.ask_timeout, self._put_pulled)
         self._pulls = self._puller.schedule

@@ -21,6 +21,7 @@ from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.agent.recordings.trajectory_file import TrajectoryFile
 from mapweave.agent.replication.epochs import newest_on_server, next_epoch
 from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.left_maps import LeftMaps
 from mapweave.agent.replication.merged_poses import MergedPoses
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.replication.retained_map import RetainedMap
@@ -235,6 +236,9 @@ class Agent:
         self.pipeline = pipeline
         self.replicator = Replicator(self._bus, self._keys, self.journal, map_id, servers=(options.server,))
         self.merged_poses = MergedPoses(self._bus, self._keys, options.name, options.server)
+        self._left_maps = LeftMaps(
+            self._bus, self._keys, self.journal, self.replicator, options.server, lambda: self._stamp_ns
+        )
         self._fleet = FleetClient(
             self._bus, self._keys, map_id, self.missions, options.synchronization.answer_timeout,
             self.replicator.unacknowledged, self._placed, self._teleoperation,
@@ -374,6 +378,7 @@ class Agent:
         if self._trajectory is not None:
             self._trajectory.close()
         self._fleet.close()
+        self._left_maps.close()
         self.merged_poses.close()
         self.replicator.close()
 

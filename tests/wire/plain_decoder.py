@@ -351,7 +351,12 @@ class Plain:
         }  # fmt: skip
 
     def _newest_map(self, data: bytes) -> Any:
-        return {"epoch": message(data)["e"]}
+        fields = message(data)
+        return {"epoch": fields["e"], "pruned": fields.get("g", False)}
+
+    def _kept_nodes(self, data: bytes) -> Any:
+        fields = message(data)
+        return {"epoch": fields["e"], "numbers": fields["n"]}
 
     def _merged_poses(self, data: bytes) -> Any:
         fields, placed = message(data), []

@@ -48,6 +48,7 @@ from mapweave.wire.codec import decode_body, decode_change, encode_body, encode_
 from mapweave.wire.log_messages import (
     Ack,
     Head,
+    KeptNodes,
     LogAnswer,
     LogRequest,
     Mark,
@@ -78,6 +79,7 @@ def one_of_each(some: SimpleNamespace) -> list[tuple[Decoder, bytes]]:
         (Head.decode, Head(5, 7, {"s0": 3, "s1": 7}).encode()),
         (partial(PoseNews.decode, agent="r0"), poses(node, NodeId("r0", 4, 9)).encode("r0")),
         (Ack.decode, Ack(some.map, 5, 7, (Refusal(3, "because"), Refusal(5, "of this"))).encode()),
+        (KeptNodes.decode, KeptNodes(3, (1, 2**53)).encode()),
         (LogRequest.decode, LogRequest(3, 200).encode()),
         (LogAnswer.decode, LogAnswer(5, 3, 6, ((3, b"abc"), (5, b""))).encode()),
         (decode_record, encode_record({"a": 1, "b": 0.5, "c": "text", "d": True})),
