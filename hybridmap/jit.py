@@ -118,8 +118,25 @@ class Kernel(Generic[P, R]):
             # Nowhere to keep it: an installation that may not be written to, and no home either.
             machine = numba.njit(**_OPTIONS)(self._linked())
         hints = get_type_hints(self._function, include_extras=True)
-        machine.compile(tuple(_type_of(hint) for name, hint in hints.items() if name != "return"))
+        types = tuple(_type_of(hint) for name, hint in hints.items() if name != "return")
+        try:
+            machine.compile(types)
+        except Exception:  # noqa: BLE001 - what is unpickled of another version, or of a damaged file, raises anything
+            machine = self._anew(numba, machine)
+            machine.compile(types)
         return machine
+
+    def _anew(self, numba: Any, machine: Any) -> Any:
+        """The same without what is kept on disk.
+
+        numba reads all of it before it looks whether it is of this source: that of an earlier version of this
+        program may name a class that has another name now, and a file may be cut off.
+        """
+        try:
+            machine._cache.flush()
+        except OSError:
+            return numba.njit(**_OPTIONS)(self._linked())
+        return numba.njit(cache=True, **_OPTIONS)(self._linked())
 
     def _looping(self, numba: Any) -> Any:
         """To be compiled as part of the kernels that call it, for the types that they have."""

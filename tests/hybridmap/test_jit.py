@@ -57,14 +57,18 @@ print(json.dumps(report))
 """
 
 
-def run(folder: Path, how: str, cache: Path) -> dict[str, object]:
-    (folder / "some_kernels.py").write_text(MODULE)
+def run(folder: Path, how: str, cache: Path, scale: str = "Scale") -> dict[str, object]:
+    (folder / "some_kernels.py").write_text(MODULE.replace("Scale", scale))
     environment = dict(os.environ)
     environment["NUMBA_CACHE_DIR"] = str(cache)
     environment["NUMBA_DISABLE_JIT"] = str(int(how == "disabled"))
     environment["PYTHONPATH"] = os.pathsep.join([str(folder), *sys.path])
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, how], capture_output=True, text=True, check=False, env=environment
+        [sys.executable, "-c", PROGRAM.replace("Scale", scale), how],
+        capture_output=True,
+        text=True,
+        check=False,
+        env=environment,
     )
     assert done.returncode == 0, done.stderr
     collected: dict[str, object] = json.loads(done.stdout)
@@ -133,3 +137,26 @@ def test_a_kernel_is_compiled_without_a_cache_folder(tmp_path: Path) -> None:
     pytest.importorskip("numba")
     (tmp_path / "file").write_text("")
     assert run(tmp_path, "with", tmp_path / "file" / "cache")["hits"] == 0
+
+
+@pytest.mark.slow
+def test_a_kernel_of_an_earlier_version_is_compiled_again(tmp_path: Path) -> None:
+    """After an upgrade that renamed a class, agents ended with a traceback until the cache was deleted."""
+    pytest.importorskip("numba")
+    assert run(tmp_path, "with", tmp_path / "cache")["hits"] == 0
+    assert run(tmp_path, "with", tmp_path / "cache", "Size")["hits"] == 0
+    assert run(tmp_path, "with", tmp_path / "cache", "Size")["hits"] == 1
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("kind", ["nbi", "nbc"])
+@pytest.mark.parametrize("left", [0, 40, 200])
+def test_a_kernel_whose_file_is_cut_off_is_compiled_again(tmp_path: Path, kind: str, left: int) -> None:
+    """As after a loss of power: so many bytes of the index, or of the compiled code, are left."""
+    pytest.importorskip("numba")
+    cache = tmp_path / "cache"
+    assert run(tmp_path, "with", cache)["hits"] == 0
+    for path in cache.rglob(f"*.{kind}"):
+        path.write_bytes(path.read_bytes()[:left])
+    assert run(tmp_path, "with", cache)["hits"] == 0
+    assert run(tmp_path, "with", cache)["hits"] == 1
