@@ -23,10 +23,10 @@ from mapweave.agent.ros_messages.values import KIDNAP_TYPE
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Pose2
 from mapweave.storage.os_errors import reason_of
-from mapweave.vision.equidistant import Equidistant
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Qos
+    from rosbags.rosbag2 import Writer
 
 PART_S = 60.0
 """A recording is a row of files, none longer than this, s: what a disk's failure can damage."""
@@ -40,8 +40,8 @@ JPEG_QUALITY = 95
 """Chosen, OpenCV's default. `--lossless` writes PNG."""
 KEPT = ("/tf_static", "/kidnap_status")
 """Topics whose last message holds: who subscribes later gets it too (durability transient-local)."""
-OPTICAL, ODOM = "camera_optical_frame", "odom"
-"""Frames of REP 105 and REP 103."""
+ODOM = "odom"
+"""Frame of REP 105."""
 
 
 def check_new(folder: Path) -> None:
@@ -153,6 +153,26 @@ class McapWriter:
         self._parts += 1
 
 
+class McapTopics:
+    """Messages of ROS 2 in a bag; a topic is there once it has a message."""
+
+    def __init__(self, writer: Writer, store: Any) -> None:
+        """Take a bag that is open, and a store with the types of all messages."""
+        self._writer, self._store = writer, store
+        self._connections: dict[str, Any] = {}
+
+    def send(self, topic: str, message: Any, stamp_ns: int) -> None:
+        """Write a message."""
+        name = message.__msgtype__
+        if topic not in self._connections:
+            profiles = [_transient_local()] if topic in KEPT else []
+            self._connections[topic] = self._writer.add_connection(
+                topic, name, typestore=self._store, offered_qos_profiles=profiles
+            )
+        data = self._store.serialize_cdr(message, name)
+        self._writer.write(self._connections[topic], stamp_ns, data)
+
+
 class _Part:
     """One bag of a recording."""
 
@@ -174,14 +194,13 @@ class _Part:
         for key, value in wheel_data(description).items():
             self._writer.set_custom_data(key, value)
         self._writer.open()
-        self._connections: dict[str, Any] = {}
+        self._topics = McapTopics(self._writer, self._store)
         self._description = description
-        self._info = self._camera_info()
         self._put(
             "/tf_static",
             "tf2_msgs/msg/TFMessage",
             begun_ns,
-            transforms=[self._mount(), *self._ranger_mounts()],
+            transforms=[making.mount(self._make, begun_ns, description.camera), *self._ranger_mounts()],
         )
         self._flush()
 
@@ -191,11 +210,14 @@ class _Part:
             kind = ".png" if self._lossless else ".jpg"
             quality = [] if self._lossless else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
             data = cv2.imencode(kind, observation.image, quality)[1].reshape(-1)
-            header = self._header(stamp, OPTICAL)
+            header = self._header(stamp, making.OPTICAL)
             name = "sensor_msgs/msg/CompressedImage"
             word = "png" if self._lossless else "jpeg"
             self._put("/camera/image/compressed", name, stamp, header=header, format=word, data=data)
-            self._put("/camera/camera_info", "sensor_msgs/msg/CameraInfo", stamp, header=header, **self._info)
+            info = making.camera_info(
+                self._make, header, self._description.camera, self._description.distortion
+            )
+            self._topics.send("/camera/camera_info", info, stamp)
         unknown = np.zeros(36)
         pose = self._make(
             "geometry_msgs/msg/PoseWithCovariance", pose=self._pose(odom_from_robot), covariance=unknown
@@ -248,43 +270,10 @@ class _Part:
             self._writer.storage = storage
 
     def _put(self, topic: str, name: str, stamp_ns: int, **fields: Any) -> None:
-        if topic not in self._connections:
-            profiles = [_transient_local()] if topic in KEPT else []
-            self._connections[topic] = self._writer.add_connection(
-                topic, name, typestore=self._store, offered_qos_profiles=profiles
-            )
-        data = self._store.serialize_cdr(self._make(name, **fields), name)
-        self._writer.write(self._connections[topic], stamp_ns, data)
+        self._topics.send(topic, self._make(name, **fields), stamp_ns)
 
     def _make(self, name: str, **fields: Any) -> Any:
         return self._types[name](**fields)
-
-    def _camera_info(self) -> dict[str, Any]:
-        c = self._description.camera
-        region = self._make(
-            "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
-        )
-        lens = self._description.distortion
-        real, model, d = (
-            (lens, "equidistant", lens.k) if isinstance(lens, Equidistant) else (c, "plumb_bob", lens)
-        )
-        k = np.array([real.fx, 0.0, real.cx, 0.0, real.fy, real.cy, 0.0, 0.0, 1.0])
-        p = np.array([c.fx, 0.0, c.cx, 0.0, 0.0, c.fy, c.cy, 0.0, 0.0, 0.0, 1.0, 0.0])
-        return {
-            "height": c.height, "width": c.width, "k": k, "p": p, "r": np.eye(3).ravel(),
-            "distortion_model": model, "d": np.array(d),
-            "binning_x": 0, "binning_y": 0, "roi": region,
-        }  # fmt: skip
-
-    def _mount(self) -> Any:
-        """The camera in the robot: it looks ahead, turned into the optical axes."""
-        c = self._description.camera
-        at = self._make("geometry_msgs/msg/Vector3", x=c.mount_forward, y=0.0, z=c.mount_height)
-        turn = self._make("geometry_msgs/msg/Quaternion", x=-0.5, y=0.5, z=-0.5, w=0.5)
-        transform = self._make("geometry_msgs/msg/Transform", translation=at, rotation=turn)
-        name = "geometry_msgs/msg/TransformStamped"
-        header = self._header(self.begun_ns, BASE)
-        return self._make(name, header=header, child_frame_id=OPTICAL, transform=transform)
 
     def _ranger_mounts(self) -> list[Any]:
         """The proximity sensors, each at the robot's edge along its bearing."""

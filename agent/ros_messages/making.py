@@ -9,10 +9,16 @@ from typing import Any
 import numpy as np
 
 from mapweave.agent.observation import Command
+from mapweave.agent.ros_messages.values import FOOTPRINT
+from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.vision.equidistant import Equidistant
+from mapweave.vision.lens import NO_DISTORTION, Distortion
 
 Make = Callable[..., Any]
 """Makes a message: `make(type, **fields)`."""
+OPTICAL = "camera_optical_frame"
+"""Frame of a camera, by REP 103: x right, y down, z forward."""
 
 
 def header(make: Make, stamp_ns: int, frame: str) -> Any:
@@ -58,3 +64,34 @@ def twist(make: Make, command: Command) -> Any:
     linear = make("geometry_msgs/msg/Vector3", x=command.forward, y=0.0, z=0.0)
     angular = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=command.turn)
     return make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
+
+
+def mount(make: Make, stamp_ns: int, camera: Camera) -> Any:
+    """A TransformStamped: the camera in the robot. It looks ahead, turned into the optical axes."""
+    at = make("geometry_msgs/msg/Vector3", x=camera.mount_forward, y=0.0, z=camera.mount_height)
+    turn = make("geometry_msgs/msg/Quaternion", x=-0.5, y=0.5, z=-0.5, w=0.5)
+    moved = make("geometry_msgs/msg/Transform", translation=at, rotation=turn)
+    name, head = "geometry_msgs/msg/TransformStamped", header(make, stamp_ns, FOOTPRINT)
+    return make(name, header=head, child_frame_id=OPTICAL, transform=moved)
+
+
+def camera_info(make: Make, head: Any, camera: Camera, lens: Distortion = NO_DISTORTION) -> Any:
+    """A CameraInfo.
+
+    Args:
+        make: makes messages.
+        head: of the image.
+        camera: ideal, into which images are rectified.
+        lens: of the real one.
+    """
+    name = "sensor_msgs/msg/RegionOfInterest"
+    region = make(name, x_offset=0, y_offset=0, height=0, width=0, do_rectify=False)
+    real, model, d = (
+        (lens, "equidistant", lens.k) if isinstance(lens, Equidistant) else (camera, "plumb_bob", lens)
+    )
+    k = np.array([real.fx, 0.0, real.cx, 0.0, real.fy, real.cy, 0.0, 0.0, 1.0])
+    p = np.array([camera.fx, 0.0, camera.cx, 0.0, 0.0, camera.fy, camera.cy, 0.0, 0.0, 0.0, 1.0, 0.0])
+    return make(
+        "sensor_msgs/msg/CameraInfo", header=head, height=camera.height, width=camera.width, k=k, p=p,
+        r=np.eye(3).ravel(), distortion_model=model, d=np.array(d), binning_x=0, binning_y=0, roi=region,
+    )  # fmt: skip

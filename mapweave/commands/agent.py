@@ -78,7 +78,7 @@ def add_to(commands: Any) -> None:
         help="publish pose, tf, path and map as ROS 2 topics, for rviz and Nav2 (docs/ros2.md), through this "
         "Zenoh router (default: that of the driver ros2, else tcp/127.0.0.1:7447)",
     )  # fmt: skip
-    add_rerun(parser)
+    add_logs(parser)
     parser.add_argument(
         "--metrics", type=values.port, metavar="PORT",
         help="tell Prometheus about the robot at http://127.0.0.1:PORT/metrics, on this machine alone "
@@ -95,13 +95,16 @@ def add_to(commands: Any) -> None:
     parser.set_defaults(run=run)
 
 
-def add_rerun(parser: argparse.ArgumentParser) -> None:
-    """Declare the log for the Rerun viewer."""
+def add_logs(parser: argparse.ArgumentParser) -> None:
+    """Declare the logs for the Rerun viewer and for Foxglove."""
     parser.add_argument(
         "--rerun", nargs="?", const="connect", metavar="FILE|connect",
         help="show what it senses and estimates in the Rerun viewer: into FILE.rrd, or to the viewer on this "
         "computer (default), or to that at rerun+http://HOST:PORT/proxy (docs/see-inside.md)",
     )  # fmt: skip
+    parser.add_argument(
+        "--mcap-log", metavar="FOLDER", help="the same into FOLDER/NAME.mcap, for Foxglove and rviz"
+    )
 
 
 def add_robot(parser: argparse.ArgumentParser) -> None:
@@ -212,6 +215,7 @@ def run(arguments: argparse.Namespace) -> int:
             calibration=calibration,
             ros2=None if arguments.ros2 is None else ros2_link(arguments, settings.robot),
             rerun=arguments.rerun,
+            mcap_log=arguments.mcap_log,
             metrics=arguments.metrics,
         )
         agent = settings.agent

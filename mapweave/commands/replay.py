@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.agent import add_calibration, add_rerun, calibration_of
+from mapweave.commands.agent import add_calibration, add_logs, calibration_of
 from mapweave.commands.network import (
     add_network,
     client_settings,
@@ -59,7 +59,7 @@ def add_to(commands: Any) -> None:
         help="longest wait for the server (default: 20)",
     )
     add_calibration(parser)
-    add_rerun(parser)
+    add_logs(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 
@@ -141,6 +141,7 @@ def run(arguments: argparse.Namespace) -> int:
             patience=0.0 if arguments.offline else arguments.timeout,
             calibration=calibration,
             rerun=arguments.rerun,
+            mcap_log=arguments.mcap_log,
         )
         stop = stop_on_signals()
         run_agent(robot, bus, keys, settings.agent, options, stop)
@@ -168,10 +169,12 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
     from mapweave.visual_mapping import keyframes, nothing_mapped, visual_maps
     from mapweave.visual_trajectory import tum_lines
 
-    if arguments.rerun is not None:
-        raise UsageError(
-            f"{recording.path}: has no odometry, so no agent runs on it that --rerun could show: leave it out"
-        )
+    for option, value in (("--rerun", arguments.rerun), ("--mcap-log", arguments.mcap_log)):
+        if value is not None:
+            raise UsageError(
+                f"{recording.path}: has no odometry, so no agent runs on it that {option} could show: "
+                "leave it out"
+            )
     taken_images = images_of(recording, arguments.robot)
     name, data, console = name_of(arguments), arguments.data, plain_or_terminal()
     say = EventLog(console)

@@ -73,6 +73,7 @@ class AgentOptions:
         calibration: file with what `mapweave calibrate` has measured of this robot, if it exists.
         ros2: where pose and map are published as ROS 2 topics; None if they are not.
         rerun: where all that it senses and estimates goes for the Rerun viewer; None if it does not.
+        mcap_log: folder to which the same goes as MCAP, for Foxglove; None if it does not.
         metrics: port of this machine on which it tells Prometheus about itself; None if it does not.
     """
 
@@ -92,6 +93,7 @@ class AgentOptions:
     calibration: Path | None = None
     ros2: Ros2Link | None = None
     rerun: str | None = None
+    mcap_log: str | None = None
     metrics: int | None = None
 
 

@@ -30,6 +30,7 @@ from mapweave.wire.zenoh_bus import ZenohBus
 if TYPE_CHECKING:
     from mapweave.processes.agent_metrics import AgentMetrics
     from mapweave.processes.rerun_log import RerunLog
+    from mapweave.processes.tick_log import TickLog
 
 SILENCE = 2.0
 """s; a longer wait for the robot is reported."""
@@ -58,7 +59,7 @@ def run_agent(
     show, manager = AgentProgress(console, options.name, options.total), ServiceManager()
     describe = partial(_describe, robot, say, options.name)
     publisher = None if options.ros2 is None else Ros2Publisher(options.ros2, options.name)
-    rerun = None if options.rerun is None else rerun_log(options.rerun, options.name)
+    logs = _tick_logs(options)
     metrics = None if options.metrics is None else _metrics(options.name)
 
     def stepped(observation: Observation, step: TickResult) -> None:
@@ -66,16 +67,16 @@ def run_agent(
         show(observation, step)
         if publisher is not None:
             publisher.step(observation, bool(step.changes), agent.pipeline, agent.merged_poses)
-        if rerun is not None:
-            rerun.step(observation, step, agent.pipeline)
+        for log in logs:
+            log.step(observation, step, agent.pipeline)
         if metrics is not None:
             metrics.step(step, agent.runner.busy)
 
     with contextlib.ExitStack() as closing:
         if publisher is not None:
             closing.callback(publisher.close)
-        if rerun is not None:
-            closing.callback(_end_log, rerun, say, options.name)
+        for log in logs:
+            closing.callback(_end_log, log, say, options.name)
         if metrics is not None and options.metrics is not None:
             closing.callback(metrics.serve(options.metrics))
         agent = Agent(describe, bus, keys, settings, options, stepped, say)
@@ -125,9 +126,21 @@ def _metrics(robot: str) -> AgentMetrics:
     return AgentMetrics(robot)
 
 
-def _end_log(rerun: RerunLog, say: Callable[[str], None], name: str) -> None:
-    if missing := rerun.close():
-        say(f"{name}: not in the Rerun log: {missing}")
+def _tick_logs(options: AgentOptions) -> list[TickLog]:
+    """The logs that the options ask for."""
+    logs: list[TickLog] = []
+    if options.rerun is not None:
+        logs.append(rerun_log(options.rerun, options.name))
+    if options.mcap_log is not None:
+        from mapweave.processes.mcap_log import McapLog
+
+        logs.append(McapLog(options.mcap_log))
+    return logs
+
+
+def _end_log(log: TickLog, say: Callable[[str], None], name: str) -> None:
+    if missing := log.close():
+        say(f"{name}: not in the {log.title}: {missing}")
 
 
 def _describe(robot: Robot, print_line: Callable[[str], None], name: str) -> RobotDescription:

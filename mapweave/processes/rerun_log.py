@@ -15,12 +15,8 @@ Below the robot's name, on the time line `stamp`:
 
 from __future__ import annotations
 
-import contextlib
 import math
-import queue
 import socket
-import threading
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -28,18 +24,15 @@ import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
-from numpy.typing import NDArray
 
-from mapweave.agent.observation import Command, Observation
 from mapweave.agent.occupancy_grid import GridCells
-from mapweave.agent.pipeline import Pipeline, TickResult
-from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, Node
-from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.processes.edge_colours import COLOURS
+from mapweave.processes.tick_log import PATIENCE, QUALITY, STEP, LoggedTick, TickLog, ellipsoids
 
 CONNECT = "connect"
 """Instead of a file: to the viewer on this computer."""
@@ -47,67 +40,18 @@ VIEWER = "rerun+http://127.0.0.1:9876/proxy"
 """Where a viewer listens, see `rerun --help`."""
 SOON = 2.0
 """s; a viewer that is there is found sooner."""
-PATIENCE = 10.0
-"""How long the end of the recording may take, s."""
-QUEUED = 64
-"""Ticks that wait to be written; beyond that ticks are left out, so that the robot never waits."""
-FLOOR_EVERY = 10
-"""Ticks between two occupancy grids."""
-SIGMAS = 2.0
-"""Of the ellipsoids."""
-LARGEST = 3.0
-"""m; larger ellipsoids, of landmarks that were just begun, would hide all others."""
 IMAGE_AT = 0.5
 """m before the camera, where its image hangs: farther away it hides the map."""
 SIDES, LIMIT = {"left": [60, 150, 230], "right": [50, 170, 90]}, [200, 60, 60]
 """Colours of the outermost bearings, and of their limits."""
-QUALITY = 80
-"""Of the JPEG images, %."""
-STEP = 0.02
-"""m between two points of the path."""
 FREE, UNKNOWN, OCCUPIED = 0, 255, 100
 """Cells of the floor, as in an OccupancyGrid of ROS, where -1 is unknown."""
 
 
-@dataclass(frozen=True, eq=False)
-class LoggedTick:
-    """What is written of one tick; nothing in it changes later.
+class RerunLog(TickLog):
+    """Writes for the Rerun viewer."""
 
-    Attributes:
-        stamp_ns: of the observation.
-        image: (H, W) grey as the pipeline takes it; None without one.
-        camera: that took it, ideal.
-        tracks_px: (N, 2) px in the image: all tracks, or those of the node by which the robot is localized.
-        bearings: (N,) rad, of the tracks, positive to the left.
-        landmarks: (M, 3) m, in robot.
-        covariances: (M, 3, 3) m^2, in robot.
-        map_from_robot: None if the robot does not know where it is.
-        status: of the pipeline.
-        command: for the wheels.
-        map: nodes and edges if they have changed, else None.
-        floor: now and then, else None.
-    """
-
-    stamp_ns: int
-    image: NDArray[np.uint8] | None
-    camera: Camera
-    tracks_px: Array
-    bearings: Array
-    landmarks: Array
-    covariances: Array
-    map_from_robot: PoseGaussian | None
-    status: Status
-    command: Command
-    map: tuple[tuple[Node, ...], tuple[Edge, ...]] | None
-    floor: GridCells | None
-
-
-class RerunLog:
-    """Writes in a thread of its own; the agent's loop only hands over.
-
-    Attributes:
-        left_out: ticks that were not written, since writing was slower than the robot.
-    """
+    title = "Rerun log"
 
     def __init__(self, target: str, robot: str) -> None:
         """Begin a recording.
@@ -121,7 +65,6 @@ class RerunLog:
             SettingsError: the target is none of these, or the file cannot be written.
             NotConnected: there is no viewer.
         """
-        self.left_out = 0
         self._robot = robot
         self._recording = recording = rr.RecordingStream("mapweave", make_default=False)
         if target == CONNECT or target.startswith("rerun+"):
@@ -132,77 +75,30 @@ class RerunLog:
             recording.save(_writable(target), default_blueprint=_layout(robot))
         recording.set_log_tick_enabled(False)
         recording.set_log_time_enabled(False)
-        self._pipeline: Pipeline | None = None
-        self._stamp_ns = 0
-        self._ticks = 0
-        self._changed = True
-        self._waiting: queue.Queue[LoggedTick | None] = queue.Queue(QUEUED)
         self._words = ""
         self._path: list[Array] = []
         self._camera: Camera | None = None
-        self._thread = threading.Thread(target=self._serve, name="rerun", daemon=True)
-        self._thread.start()
+        super().__init__("rerun")
 
-    def step(self, observation: Observation, step: TickResult, pipeline: Pipeline) -> None:
-        """Take in a tick; never waits.
+    def _write(self, moment: LoggedTick) -> None:
+        self._recording.set_time("stamp", timestamp=np.datetime64(moment.stamp_ns, "ns"))
+        self._write_camera(moment)
+        self._write_pose(moment)
+        self._write_map(moment)
+        self._write_words(moment)
 
-        Args:
-            observation: of the tick.
-            step: what it gave.
-            pipeline: after the tick.
-        """
-        self._changed |= bool(step.changes) or pipeline is not self._pipeline
-        self._pipeline, self._stamp_ns = pipeline, observation.stamp_ns
-        if self._waiting.full():
-            self.left_out += 1
-            return
-        tracks, bearings, landmarks, covariances = _tracked(pipeline)
-        # Only this thread puts, so there is room.
-        self._waiting.put_nowait(
-            LoggedTick(
-                observation.stamp_ns,
-                pipeline.image,
-                pipeline.lens.camera,
-                tracks,
-                bearings,
-                landmarks,
-                covariances,
-                pipeline.map_from_robot,
-                step.status,
-                step.command,
-                _map_of(pipeline) if self._changed else None,
-                pipeline.floor.taken() if self._ticks % FLOOR_EVERY == 0 else None,
-            )
-        )
-        self._changed = False
-        self._ticks += 1
+    def _write_last(self, stamp_ns: int, nodes: tuple[Node, ...], edges: tuple[Edge, ...]) -> None:
+        self._recording.set_time("stamp", timestamp=np.datetime64(stamp_ns, "ns"))
+        self._write_nodes(nodes, edges)
 
-    def close(self) -> str:
-        """Write what waits, and end the recording; returns what is missing in it, in words."""
-        with contextlib.suppress(queue.Full):
-            self._waiting.put(None, timeout=PATIENCE)
-        self._thread.join(PATIENCE)
-        if self._pipeline is not None and not self._thread.is_alive():
-            # Nodes that were made when the robot had stopped.
-            self._recording.set_time("stamp", timestamp=np.datetime64(self._stamp_ns, "ns"))
-            self._write_nodes(*_map_of(self._pipeline))
-        missing = f"{self.left_out} ticks, since writing was too slow" if self.left_out else ""
+    def _end(self, ended: bool) -> str:
+        missing = ""
         try:
             self._recording.flush(timeout_sec=PATIENCE)
         except RuntimeError as error:
             missing = f"the end ({str(error).splitlines()[0]})"
         self._recording.disconnect()
         return missing
-
-    # In the thread of the log.
-
-    def _serve(self) -> None:
-        while (moment := self._waiting.get()) is not None:
-            self._recording.set_time("stamp", timestamp=np.datetime64(moment.stamp_ns, "ns"))
-            self._write_camera(moment)
-            self._write_pose(moment)
-            self._write_map(moment)
-            self._write_words(moment)
 
     def _log(self, path: str, value: rr.AsComponents, static: bool = False) -> None:
         self._recording.log(f"{self._robot}/{path}", value, static=static)
@@ -277,48 +173,19 @@ class RerunLog:
             self._log("status", rr.TextLog(now))
 
 
-def _tracked(pipeline: Pipeline) -> tuple[Array, Array, Array, Array]:
-    """Tracks (px), their bearings, landmarks and covariances in robot: of the node that the robot drives by,
-    else of the mapping filter.
-    """
-    lens, fix = pipeline.lens, pipeline.fix
-    if fix is None:
-        mapper = pipeline.mapper
-        seen = mapper.landmarks
-        return mapper.tracks[2], mapper.bearings, seen.points_in_robot, seen.covariances_in_robot
-    if fix.localizer is None:
-        return np.zeros((0, 2)), np.zeros(0), np.zeros((0, 3)), np.zeros((0, 3, 3))
-    known, robot_from_node = fix.localizer.landmarks, fix.node_from_robot.mean.inverse()
-    rotation = np.eye(3)
-    rotation[:2, :2] = robot_from_node.rotation
-    points = np.column_stack([robot_from_node.apply(known.points[:, :2]), known.points[:, 2]])
-    pixels = fix.localizer.pixels
-    covariances = rotation @ known.covariances @ rotation.T
-    return lens.distort(pixels), lens.camera.bearings(pixels), points, covariances
-
-
-def _map_of(pipeline: Pipeline) -> tuple[tuple[Node, ...], tuple[Edge, ...]]:
-    return tuple(pipeline.map.nodes.values()), tuple(pipeline.map.edges.values())
-
-
 def _raised(pose: Pose2) -> Array:
     return np.array([pose.x, pose.y, 0.0])
 
 
 def _ellipsoids(points: Array, covariances: Array) -> rr.Ellipsoids3D:
     """Of landmarks that are known well enough to be drawn."""
-    finite = np.isfinite(points).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
-    variances, axes = np.linalg.eigh(covariances[finite])
-    half_sizes = SIGMAS * np.sqrt(np.maximum(variances, 0.0))
-    drawn = half_sizes.max(axis=1, initial=0.0) <= LARGEST
-    # Axes are columns; a rotation has no reflection.
-    axes[np.linalg.det(axes) < 0.0, :, 0] *= -1.0
-    turns = np.array([cv2.Rodrigues(matrix)[0].ravel() for matrix in axes[drawn]]).reshape(-1, 3)
+    centres, half_sizes, axes = ellipsoids(points, covariances)
+    turns = np.array([cv2.Rodrigues(matrix)[0].ravel() for matrix in axes]).reshape(-1, 3)
     angles = np.linalg.norm(turns, axis=1, keepdims=True)
     units = np.divide(turns, angles, out=np.zeros_like(turns), where=angles > 0.0)
     quaternions = np.concatenate([units * np.sin(angles / 2.0), np.cos(angles / 2.0)], axis=1)
     return rr.Ellipsoids3D(
-        centers=points[finite][drawn], half_sizes=half_sizes[drawn], quaternions=quaternions,
+        centers=centres, half_sizes=half_sizes, quaternions=quaternions,
         colors=[240, 160, 40], fill_mode=rr.components.FillMode.DenseWireframe,
     )  # fmt: skip
 

@@ -20,8 +20,6 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from mapweave.agent.drivers.clock import RemoteClock, of_monotonic_ns
 from mapweave.agent.observation import Observation
 from mapweave.agent.pipeline import Pipeline
@@ -31,7 +29,7 @@ from mapweave.agent.ros_messages.values import BASES, FOOTPRINT, TF_TYPE, headin
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
-from mapweave.processes.edge_colours import COLOURS
+from mapweave.processes.markers import MAP, map_markers
 from mapweave.wire.pose_messages import MergedPose
 from mapweave.wire.ros2.messages import decode, make
 from mapweave.wire.ros2.node import Arrival, Ros2Node
@@ -39,7 +37,7 @@ from mapweave.wire.ros2.settings import Ros2Link
 
 log = logging.getLogger(__name__)
 
-MAP, ODOM = "map", "odom"
+ODOM = "odom"
 AHEAD_NS = 300_000_000
 """The transform of map to odom is dated ahead by this much, for those who look it up a moment later."""
 PATIENCE = 2.0
@@ -52,8 +50,6 @@ LONGEST_PATH = 2000
 """Poses; the oldest are left out."""
 KEPT = 256
 """Odometry transforms; four seconds of the quickest robots."""
-SPHERES, LINES, ADD, DELETE = 7, 5, 0, 2
-"""Of visualization_msgs/msg/Marker."""
 
 
 @dataclass(frozen=True)
@@ -267,35 +263,7 @@ def _markers(
     points = {}
     for node in moment.nodes:
         placed = places[node.id]
-        at = merged_from_map @ node.map_from_robot.mean if placed is None else placed.merged_from_node
-        points[node.id] = make("geometry_msgs/msg/Point", x=at.x, y=at.y, z=0.0)
-    markers = [_marker("nodes", 0, SPHERES, 0.08, (0.9, 0.9, 0.9), list(points.values()))]
-    for number, (kind, colour) in enumerate(COLOURS.items(), 1):
-        ends = [
-            points[end]
-            for edge in moment.edges
-            if edge.kind is kind and edge.a in points and edge.b in points
-            for end in (edge.a, edge.b)
-        ]
-        markers.append(_marker(kind.name.lower(), number, LINES, 0.03, colour, ends))
-    return make("visualization_msgs/msg/MarkerArray", markers=markers)
-
-
-def _marker(
-    name: str, number: int, form: int, size: float, colour: tuple[float, float, float], points: list[Any]
-) -> Any:
-    red, green, blue = colour
-    nothing = make(
-        "sensor_msgs/msg/CompressedImage", header=making.header(make, 0, ""), format="",
-        data=np.zeros(0, np.uint8),
-    )  # fmt: skip
-    return make(
-        "visualization_msgs/msg/Marker",
-        header=making.header(make, 0, MAP), ns=name, id=number, type=form, action=ADD if points else DELETE,
-        pose=making.pose(make, Pose2()), scale=make("geometry_msgs/msg/Vector3", x=size, y=size, z=size),
-        color=make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=1.0),
-        lifetime=make("builtin_interfaces/msg/Duration", sec=0, nanosec=0), frame_locked=False,
-        points=points, colors=[], texture_resource="", texture=nothing, uv_coordinates=[], text="",
-        mesh_resource="", mesh_use_embedded_materials=False,
-        mesh_file=make("visualization_msgs/msg/MeshFile", filename="", data=np.zeros(0, np.uint8)),
-    )  # fmt: skip
+        points[node.id] = (
+            merged_from_map @ node.map_from_robot.mean if placed is None else placed.merged_from_node
+        )
+    return map_markers(make, points, moment.edges)

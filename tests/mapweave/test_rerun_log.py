@@ -189,7 +189,8 @@ def test_ellipsoids_have_the_covariance_and_the_floor_lies_where_it_was_seen() -
 
 def test_the_loop_never_waits_for_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A disk that stands still costs ticks of the log, and no time of the robot."""
-    from mapweave.processes.rerun_log import QUEUED, RerunLog
+    from mapweave.processes.rerun_log import RerunLog
+    from mapweave.processes.tick_log import QUEUED
 
     goes_on = threading.Event()
     monkeypatch.setattr(RerunLog, "_write_words", lambda self, moment: goes_on.wait(60.0))
@@ -221,14 +222,14 @@ def test_what_is_no_place_for_a_log_is_refused(
 
 
 def test_while_navigating_it_shows_the_landmarks_of_the_node_where_the_image_has_them() -> None:
-    from mapweave.processes.rerun_log import _tracked
+    from mapweave.processes.tick_log import tracked_of
 
     walls, start = PhotoWalls(), Pose2(0.25, -0.1, 0.08)
     node = walls.mapped(Mapper(MapId("r0", 1), DESCRIPTION))
     localizer = located(walls, DESCRIPTION, node, start)
     camera = DESCRIPTION.camera
     pipeline: Any = SimpleNamespace(lens=Lens(camera, DESCRIPTION.distortion), fix=Fix.of(localizer))
-    tracks, bearings, points, covariances = _tracked(pipeline)
+    tracks, bearings, points, covariances = tracked_of(pipeline)
     assert len(tracks) == len(points) > 10 and bearings == pytest.approx(camera.bearings(localizer.pixels))
     order = [np.argsort(ids) for ids in (localizer.visible, localizer.landmarks.ids)]
     off = camera.project(points[order[1]]) - localizer.pixels[order[0]]

@@ -19,8 +19,9 @@ from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Pipeline
-from mapweave.agent.recordings.mcap_writer import PART_S, McapWriter, _Part
+from mapweave.agent.recordings.mcap_writer import PART_S, McapWriter
 from mapweave.agent.recordings.options import RecordingOptions
+from mapweave.agent.ros_messages import making
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.hybridmap.ids import MapId
@@ -285,10 +286,10 @@ def test_a_mount_that_cannot_be_right_or_is_not_level_is_named(
     drive: Drive, height: float, pitch: float, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """A camera at the floor or below it was a traceback; one that looks down was mapped as if level."""
-    mount = _Part._mount
+    mount = making.mount
 
-    def mounted(part: _Part) -> Any:
-        made = mount(part)
+    def mounted(*of: Any) -> Any:
+        made = mount(*of)
         turn = made.transform.rotation
         # About the camera's x axis, to the right.
         x, w = -math.sin(pitch / 2), math.cos(pitch / 2)
@@ -298,7 +299,7 @@ def test_a_mount_that_cannot_be_right_or_is_not_level_is_named(
         made.transform.translation.z = height
         return made
 
-    monkeypatch.setattr(_Part, "_mount", mounted)
+    monkeypatch.setattr(making, "mount", mounted)
     record(drive, tmp_path / "walk")
     if height > 0.0:
         notes = Replay(tmp_path / "walk").recording.notes
