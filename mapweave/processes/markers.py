@@ -21,6 +21,7 @@ SPHERE, SPHERES, LINES = 2, 7, 5
 ADD, DELETE, DELETE_ALL = 0, 2, 3
 """Actions."""
 ORANGE = (0.94, 0.63, 0.16)
+"""Red, green and blue of landmarks."""
 
 
 def map_markers(make: Make, places: Mapping[NodeId, Pose2], edges: Iterable[Edge]) -> Any:
