@@ -122,11 +122,11 @@ class Kernel(Generic[P, R]):
         try:
             machine.compile(types)
         except Exception:  # noqa: BLE001 - what is unpickled of another version, or of a damaged file, raises anything
-            machine = self._anew(numba, machine)
+            machine = self._compiled_again(numba, machine)
             machine.compile(types)
         return machine
 
-    def _anew(self, numba: Any, machine: Any) -> Any:
+    def _compiled_again(self, numba: Any, machine: Any) -> Any:
         """The same without what is kept on disk.
 
         numba reads all of it before it looks whether it is of this source: that of an earlier version of this
