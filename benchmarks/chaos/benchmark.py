@@ -4,8 +4,10 @@
                                [--json]
 
 Real processes over TCP on loopback: agents (journal, replicator, fleet client), two map servers, two routers,
-and a link between each of them and each router that can be cut, slowed, frozen and half closed. The schedule
-is drawn with the seed and printed: at least 20 kill -9, a third as many SIGSTOP, two thirds as many links.
+and a link between each of them and each router that can be cut, slowed, frozen, half closed and made lossy.
+The schedule is drawn with the seed and printed: at least 20 kill -9, a third as many SIGSTOP, two thirds as
+many links. A lossy link loses a fifth of TCP's segments and delays each by 50 ms: what comes through stalls
+for 0.2 s, 0.6 s, 1.4 s and more, at 39 kB a second (`mapweave.scenarios.network_emulator`).
 With SQLite a server is also killed and its store deleted; it gets everything from the agents again. With
 PostgreSQL both servers share a database, which is killed as well. Without `--store` the fleet runs on both,
 one after the other, where there is a PostgreSQL: counts are summed, times are those of the worse store, and
@@ -52,7 +54,7 @@ from mapweave.scenarios.children import ChildFailed
 from synthetic.postgres_server import PostgresServer, binaries
 
 POSTGRESQL = "postgresql"
-COUNTED = ("kills", "lost_stores", "stops", "cuts")
+COUNTED = ("kills", "lost_stores", "stops", "cuts", "lossy")
 """Disturbances, in a report."""
 START = 120.0
 """Longest wait until both servers answer, s."""
@@ -183,7 +185,8 @@ def run(
         "recovery_s_p95": round(float(np.percentile(took, 95)), 2),
         "relocalize_gap_s": round(max(gaps), 2), "frozen_router_gap_s": round(frozen, 2),
         "kills": sum(kind in KILLS for kind in kinds), "lost_stores": kinds.count(Kind.LOSE_STORE),
-        "stops": kinds.count(Kind.STOP), "cuts": sum(kind in LINKS for kind in kinds),
+        "stops": kinds.count(Kind.STOP), "lossy": kinds.count(Kind.LOSSY),
+        "cuts": sum(kind in LINKS for kind in kinds) - kinds.count(Kind.LOSSY),
     }  # fmt: skip
 
 

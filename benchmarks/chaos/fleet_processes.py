@@ -29,6 +29,8 @@ SERVERS, ROUTERS, DATABASE = ("s0", "s1"), ("z0", "z1"), "pg"
 INTERVAL = 0.25
 """Between two steps of a robot, s."""
 SQLITE = "sqlite"
+LOST_SEGMENTS, LOSSY_DELAY = 0.2, 0.05
+"""Share of TCP's segments that a lossy link loses, and what each takes, s: 39 kB a second are left."""
 PATIENCE = 20.0
 """s for a process to end in order."""
 NO_DATABASE = "the map store cannot be used"
@@ -163,6 +165,8 @@ class FleetProcesses:
                     link.freeze()
                 case Kind.SLOW:
                     link.worsen(0.0, 0.3, 60e3)
+                case Kind.LOSSY:
+                    link.lose_segments(LOST_SEGMENTS, LOSSY_DELAY)
                 case Kind.HALF:
                     link.half_close()
 

@@ -24,6 +24,8 @@ class Kind(StrEnum):
     """Nothing comes through, and no end learns of it."""
     FLAP = "links cut again and again"
     HALF = "links half closed"
+    LOSSY = "links lossy"
+    """A share of TCP's segments is lost: stalls, and little throughput."""
 
 
 KILLS = (Kind.KILL, Kind.LOSE_STORE)
@@ -33,17 +35,19 @@ LINKS = (
     Kind.FROZEN,
     Kind.FLAP,
     Kind.HALF,
+    Kind.LOSSY,
 )
 LASTING = {
     Kind.KILL: (0.1, 1.5), Kind.LOSE_STORE: (0.1, 1.5), Kind.STOP: (0.5, 7.0), Kind.CUT: (0.2, 3.0),
     Kind.SLOW: (1.0, 4.0), Kind.FROZEN: (0.5, 7.0), Kind.FLAP: (1.0, 4.0), Kind.HALF: (0.1, 0.5),
+    Kind.LOSSY: (2.0, 7.0),
 }  # fmt: skip
 """Shortest and longest time between beginning and end, s. The lease of a connection is 5 s."""
 
 
 @dataclass(frozen=True)
 class Disturbance:
-    """One disturbance: what, to whom and when.
+    """One disturbance: what is disturbed, how and when.
 
     Attributes:
         at: s from the start.
@@ -89,7 +93,8 @@ def draw_schedule(
         victims.append((agents, servers, routers)[k % 3])
     for k in range(kills * 2 // 3):
         kinds.append(LINKS[k % len(LINKS)])
-        victims.append((agents, agents, servers)[k % 3])
+        # Each kind meets agents and servers.
+        victims.append((agents, agents, servers)[(k + k // len(LINKS)) % 3])
     order = rng.permutation(len(kinds))
     slot = seconds / len(kinds)
     free = dict.fromkeys((name for group in groups for name in group), 0.0)

@@ -1,6 +1,7 @@
 """A network cable between a robot and the router that can be cut: a TCP forwarder on loopback.
 
-TCP loses no single bytes, so a lossy radio looks like delays and broken connections: that is what this does.
+TCP loses no single bytes. What is seen of a lossy radio are delays, stalls, little throughput and broken
+connections: that is what this does.
 """
 
 from __future__ import annotations
@@ -16,6 +17,10 @@ import numpy as np
 RESEND = 0.2
 """What TCP loses it sends again after about this, s."""
 
+SEGMENT = 1448
+"""Bytes that TCP sends at once over Ethernet."""
+LEAST_RATE = 2000.0
+"""However many segments are lost, bytes a second."""
 CHUNK = 65536
 """Bytes that are read at once."""
 THAW = 0.05
@@ -45,6 +50,7 @@ class NetworkEmulator:
         self._loss = 0.0
         self._delay = 0.0
         self._rate = math.inf
+        self._lost_segments = 0.0
         self._frozen = False
         self.carried = 0
         self._listener = socket.create_server(("127.0.0.1", 0))
@@ -65,6 +71,21 @@ class NetworkEmulator:
         with self._lock:
             self._loss, self._delay, self._rate = loss, delay, rate
 
+    def lose_segments(self, share: float, delay: float) -> None:
+        """Lose a share of the segments, as on a lossy radio.
+
+        A lost segment holds up all that is behind it until it comes again: TCP waits `RESEND`, then each time
+        twice as long. And TCP takes losses for congestion: its rate is what Mathis et al. found (1997), 1.22
+        segments per time there and back and root of the share.
+
+        Args:
+            share: 0 to below 1.
+            delay: of each segment, one way, s.
+        """
+        rate = 1.22 * SEGMENT / (2.0 * delay * math.sqrt(share)) if share and delay else math.inf
+        with self._lock:
+            self._lost_segments, self._delay, self._rate = share, delay, max(rate, LEAST_RATE)
+
     def freeze(self) -> None:
         """Let nothing through; no end learns of it."""
         with self._lock:
@@ -83,6 +104,7 @@ class NetworkEmulator:
         with self._lock:
             self._cut = self._frozen = False
             self._loss, self._delay, self._rate = 0.0, 0.0, math.inf
+            self._lost_segments = 0.0
 
     def close(self) -> None:
         """Break everything for good."""
@@ -125,10 +147,7 @@ class NetworkEmulator:
                 break
             with self._lock:
                 self.carried += len(data)
-                pause = self._delay
-                if self._loss:
-                    pause += RESEND * float(self._random.geometric(1.0 - self._loss) - 1)
-                pause += len(data) / self._rate
+                pause = self._pause(len(data))
             if pause:
                 time.sleep(pause)
             while self._frozen and not self._cut:
@@ -141,6 +160,17 @@ class NetworkEmulator:
             self._open.discard(pair)
         for end in pair:
             _break(end)
+
+    def _pause(self, size: int) -> float:
+        """How long a piece of so many bytes takes, s; with the lock held."""
+        pause = self._delay + size / self._rate
+        if self._loss:
+            pause += RESEND * float(self._random.geometric(1.0 - self._loss) - 1)
+        if self._lost_segments:
+            # Lost ones of a piece are sent again side by side: it waits for the one that is lost most often.
+            tries = self._random.geometric(1.0 - self._lost_segments, math.ceil(size / SEGMENT))
+            pause += RESEND * (2.0 ** (int(tries.max()) - 1) - 1.0)
+        return pause
 
 
 def _break(end: socket.socket) -> None:

@@ -172,6 +172,8 @@ def test_a_schedule_is_that_of_its_seed_and_kills_often_enough() -> None:
     for seed in range(20):
         schedule = draw_schedule(60.0, GROUPS, seed, True)
         assert sum(one.kind in KILLS for one in schedule) >= LEAST_KILLS
+        lossy = {one.target[0] for one in schedule if one.kind is Kind.LOSSY}
+        assert lossy == {"r", "s"}, "links of robots and of servers"
         for name in ("r0", "s1", "z0"):
             mine = [one for one in schedule if one.target == name]
             assert mine and all(a.at + a.lasts <= b.at for a, b in pairwise(mine))
@@ -181,14 +183,14 @@ def test_what_is_lost_on_one_store_is_lost_on_both() -> None:
     one = {
         "store": "sqlite", "sent": 3, "stored": 3, "undone": 0, "lost": 0, "duplicated": 0, "out_of_order": 0,
         "maps_equal": True, "recovery_s_p50": 1.0, "recovery_s_p95": 2.0, "relocalize_gap_s": 0.3,
-        "frozen_router_gap_s": 5.0, "kills": 20, "lost_stores": 1, "stops": 7, "cuts": 13,
+        "frozen_router_gap_s": 5.0, "kills": 20, "lost_stores": 1, "stops": 7, "cuts": 11, "lossy": 2,
     }  # fmt: skip
     other = dict(one, store="postgresql", stored=2, lost=1, maps_equal=False, relocalize_gap_s=0.7)
     assert together([one]) == one and good(one)
     both = together([one, other])
     assert not good(both) and both["stores"] == [one, other] and both["store"] == "sqlite and postgresql"
     assert (both["sent"], both["stored"], both["lost"], both["maps_equal"]) == (6, 5, 1, False)
-    assert both["relocalize_gap_s"] == 0.7 and both["kills"] == 40
+    assert both["relocalize_gap_s"] == 0.7 and both["kills"] == 40 and both["lossy"] == 4
 
 
 @pytest.mark.slow
@@ -201,7 +203,7 @@ def test_nothing_is_lost_in_a_short_chaos() -> None:
     )  # fmt: skip
     assert ran.returncode == 0, ran.stderr[-2000:]
     report = json.loads(ran.stdout.splitlines()[-1])
-    assert report["kills"] >= LEAST_KILLS and report["lost_stores"] > 0
+    assert report["kills"] >= LEAST_KILLS and report["lost_stores"] > 0 and report["lossy"] > 0
     assert report["sent"] == report["stored"] + report["undone"] > 100
     assert (report["lost"], report["duplicated"], report["out_of_order"]) == (0, 0, 0)
     assert report["maps_equal"] is True

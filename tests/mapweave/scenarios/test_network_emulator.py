@@ -126,6 +126,29 @@ def test_a_slow_link_takes_its_time(cable):
         assert time.monotonic() - began > 0.3
 
 
+@pytest.mark.slow
+def test_a_lossy_link_stalls_and_carries_little_but_loses_nothing(cable):
+    """As TCP does: after a time that doubles with each loss, and with the throughput of Mathis' formula."""
+    cable.lose_segments(0.2, 0.02)
+    with socket.create_connection(("127.0.0.1", cable.port), 30) as one:
+        took = []
+        for number in range(40):
+            began = time.monotonic()
+            assert talk(one, b"%d" % number) == b"%d" % number
+            took.append(time.monotonic() - began)
+        # There and back is 0.04 s, and neither way is lost in 0.64 of the cases.
+        smooth = sum(seconds < 0.19 for seconds in took)
+        assert 15 <= smooth <= 35
+        assert min(took) > 0.04 and max(took) > 0.2
+        once = [seconds for seconds in took if 0.24 <= seconds < 0.4]
+        assert once, "a segment that is lost once comes after 0.2 s"
+        data = bytes(100_000)
+        began = time.monotonic()
+        assert talk(one, data) == data
+        # 1.22 * 1448 / (0.04 * sqrt(0.2)) = 98.8 kB a second, each way at the same time.
+        assert time.monotonic() - began > 0.8
+
+
 def test_without_a_router_connections_end(cable):
     lonely = NetworkEmulator(1, seed=0)
     try:
