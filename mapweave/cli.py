@@ -44,7 +44,7 @@ from mapweave.commands import (
 )
 from mapweave.commands.examples import add_examples
 from mapweave.commands.usage import UsageError
-from mapweave.early_interrupt import remember
+from mapweave.early_interrupt import came, remember
 from mapweave.exit_status import FAILED, INTERRUPTED, MISSING_EXTRA, NO, USAGE
 from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError, Refused
@@ -156,7 +156,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return MISSING_EXTRA
     except ModuleNotFoundError as error:
         extra = extra_of(error.name)
-        if extra is None:
+        if extra is None or came():
             raise
         print(f"{arguments.command} {MissingExtra([extra])}", file=sys.stderr)
         return MISSING_EXTRA

@@ -17,7 +17,7 @@ def main() -> int:
     """Run a command; returns its exit status."""
     _open_output()
     try:
-        from mapweave.early_interrupt import remember
+        from mapweave.early_interrupt import came, remember
 
         remember()
         from mapweave.cli import main as run
@@ -27,6 +27,11 @@ def main() -> int:
         except SystemExit as end:
             # Argparse's own, after --help and --version as well.
             status = end.code if isinstance(end.code, int) else 0
+        except ImportError:
+            # A library in C may make an error of its own of an interrupt: "initialization failed".
+            if came():
+                raise KeyboardInterrupt from None
+            raise
         return _flushed(status)
     except KeyboardInterrupt:
         print("mapweave: interrupted", file=sys.stderr)

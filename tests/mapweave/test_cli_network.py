@@ -362,6 +362,28 @@ Other()
     assert first == "interrupted" and rest[-1] == "ValueError: of its own", "others are printed as before"
 
 
+@pytest.mark.parametrize(
+    "error", ["ImportError('initialization failed')", "ModuleNotFoundError(name='scipy')"]
+)
+def test_an_interrupt_of_which_a_library_makes_another_error_is_one_line(error):
+    """While pybullet was imported, Ctrl-C ended with a traceback."""
+    program = f"""
+import signal, sys
+sys.stderr = sys.stdout
+sys.argv = ["mapweave", "robots"]
+from mapweave import start
+from mapweave.commands import robots
+def run(arguments):
+    try:
+        signal.raise_signal(signal.SIGINT)
+    except KeyboardInterrupt:
+        raise {error} from None
+robots.run = run
+print(start.main())
+"""
+    assert printed(program) == "mapweave: interrupted\n130\n"
+
+
 def test_a_signal_amid_another_stops_a_process():
     """Ctrl-C twice, or a signal to a process and its group: the second handler waited for the first."""
     program = """
