@@ -1,4 +1,4 @@
-"""Rules of merge and relocalization, each with what takes its place when it is switched off.
+"""Rules of mapping, merge and relocalization, each with what takes its place when it is switched off.
 
 No product code knows of these switches: a function is replaced for as long as something is measured.
 """
@@ -6,6 +6,7 @@ No product code knows of these switches: a function is replaced for as long as s
 from __future__ import annotations
 
 import contextlib
+import math
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 from unittest.mock import patch
@@ -13,13 +14,30 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.mapserver.relocalization import view_registration
+from mapweave.agent.mapping import image_acceptance, tracking
+from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector
+from mapweave.agent.mapping.odometry_consistency import OdometryConsistency
+from mapweave.hybridmap.pose import Array
+from mapweave.mapserver.relocalization import verdict, view_registration
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
+from mapweave.mapserver.relocalization.place_hypotheses import PlaceHypothesis
+from mapweave.mapserver.relocalization.verdict import HypothesisSelector
 from mapweave.merge import merging
 from mapweave.merge.mutual_exclusion.refutation import Refutation
-from mapweave.merge.outlier_rejection import agglomerative_joining, pairwise_consistency
+from mapweave.merge.outlier_rejection import (
+    agglomerative_joining,
+    closing_links,
+    loop_closures,
+    pairwise_consistency,
+    segmentation,
+)
 from mapweave.merge.outlier_rejection.pairwise_consistency import Sorted
+from mapweave.merge.pose_graph import verification
+from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.settings import ConsistencySettings
+from mapweave.registration import recognition
+from mapweave.registration.recognition import RecognitionSettings
 
 Switch = tuple[object, str, object]
 """Where a function stands, its name, and what takes its place."""
@@ -35,6 +53,46 @@ def _as_it_is(sorted_links: Sorted, *_: object) -> Sorted:
 
 def _nothing(*_: object, **__: object) -> list[Any]:
     return []
+
+
+def _all_kept(
+    links: Sequence[Link], first: Fragment, second: Fragment, s: ConsistencySettings | None = None
+) -> Sorted:
+    weight = float(sum(link.weight for link in links))
+    return Sorted(tuple(links), (), weight=weight, sets=(tuple(links), ()))
+
+
+def _no_misfits(links: Sequence[Link], *_: object) -> Array:
+    return np.zeros(len(links))
+
+
+def _first(_: object, places: Sequence[PlaceHypothesis]) -> Sequence[PlaceHypothesis]:
+    return places[:1]
+
+
+_compare = KidnapDetector.compare
+
+
+def _unnoticed(overlap: FrameOverlap) -> Switch:
+    """Images with this in common with the one before are used like any other."""
+
+    def compare(self: KidnapDetector, *images: Any) -> FrameOverlap:
+        found = _compare(self, *images)
+        return FrameOverlap.SAME if found is overlap else found
+
+    return KidnapDetector, "compare", compare
+
+
+_objection = recognition._objection
+
+
+def _good(**figures: float) -> tuple[Switch, ...]:
+    """Recognitions are judged as if these numbers of their evidence were good."""
+
+    def objection(evidence: dict[str, float], s: RecognitionSettings) -> str:
+        return _objection({**evidence, **figures}, s)
+
+    return ((recognition, "_objection", objection),)
 
 
 MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
@@ -55,11 +113,43 @@ TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {
     "aliased landmarks": ((merging, "weigh", lambda links, *_: list(links)),),
 }
 """Rules on links, for robots with images and bodies."""
+LOOP_RULES: Mapping[str, tuple[Switch, ...]] = {
+    "own way": ((pairwise_consistency, "_against_odometry", lambda links, *_: (list(links), [])),),
+    "own loops that agree": ((segmentation, "sort_links", _all_kept),),
+    "closing links": ((closing_links, "misfits", _no_misfits),),
+    "drives against loops": ((loop_closures, "distance2_of", lambda *_: 0.0),),
+}
+"""Rules on a robot's own loop closures, for maps without images."""
+RECOGNITION_RULES: Mapping[str, tuple[Switch, ...]] = {
+    "share of matches": _good(share=1.0),
+    "image cells": _good(cells=math.inf),
+    "landmarks in view": _good(seen=1.0),
+    "depths": _good(depths=1.0),
+    "mirrored pose": _good(rival=0.0),
+    "certain position": _good(sigma_xy=0.0),
+    "certain links": (
+        (verification, "MOST_SIGMA_XY", math.inf),
+        (verification, "MOST_SIGMA_HEADING", math.inf),
+    ),
+}
+"""Rules on the registration of nodes, and of views, with nodes."""
 PLACE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "aliased regions": ((AliasedRegions, "counterpart", lambda *_: None),),
     "lonely recognition": ((view_registration, "is_lonely", lambda *_: False),),
+    "one weak node": ((verdict, "ALONE", 0),),
+    "rivals": ((HypothesisSelector, "_rivals", _first),),
+    "rivals by what is seen": ((verdict, "SLIGHT", math.inf),),
 }
 """Rules on answers to lost robots."""
+FRAME_RULES: Mapping[str, tuple[Switch, ...]] = {
+    "repeated images": ((image_acceptance, "same_image", lambda *_: False),),
+    "strange images": (_unnoticed(FrameOverlap.STRANGE),),
+    "images that show nothing": (_unnoticed(FrameOverlap.BLANK),),
+    "images in another light": ((image_acceptance, "relit", lambda image, _: image),),
+    "odometry against images": ((OdometryConsistency, "compare", lambda *_: None),),
+    "tracks that are refused": ((tracking, "STRIKES", math.inf),),
+}
+"""Rules on images, and on what they show, while a robot maps."""
 
 
 @contextlib.contextmanager

@@ -13,7 +13,14 @@ from benchmarks.figures.page import filled
 from benchmarks.figures.readme import HEAD, with_table
 from benchmarks.figures.results import FOLDER, load, run, store
 from benchmarks.liar.benchmark import RULES as LIE_RULES
-from benchmarks.rules.switches import MERGE_RULES, PLACE_RULES, TRIAL_RULES
+from benchmarks.rules.switches import (
+    FRAME_RULES,
+    LOOP_RULES,
+    MERGE_RULES,
+    PLACE_RULES,
+    RECOGNITION_RULES,
+    TRIAL_RULES,
+)
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 
 
@@ -71,7 +78,9 @@ def test_a_command_without_figures_is_said(tmp_path: Path, text: str, why: str) 
 
 def test_what_is_switched_off_is_there() -> None:
     """A rule that has gone or was renamed is named here too, and one that takes more than its replacement."""
-    for name, switches in {**MERGE_RULES, **TRIAL_RULES, **PLACE_RULES, **LIE_RULES}.items():
+    tables = TRIAL_RULES, LOOP_RULES, RECOGNITION_RULES, PLACE_RULES, FRAME_RULES, LIE_RULES
+    rules = {**MERGE_RULES, **{name: rule for table in tables for name, rule in table.items()}}
+    for name, switches in rules.items():
         for where, function, instead in switches:
             assert hasattr(where, function), name
             if callable(instead):

@@ -4,10 +4,27 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
-from benchmarks.rules.switches import PLACE_RULES, TRIAL_RULES, Switch, switched_off
+from benchmarks.rules.drives import mapped, recorded
+from benchmarks.rules.frame_faults import FAULTS, Drive
+from benchmarks.rules.look_alikes import PAIRS, look_alikes
+from benchmarks.rules.own_loops import draw, own_loops
+from benchmarks.rules.switches import (
+    ALL,
+    FRAME_RULES,
+    LOOP_RULES,
+    PLACE_RULES,
+    RECOGNITION_RULES,
+    TRIAL_RULES,
+    Switch,
+    by_rule,
+    switched_off,
+)
+from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
@@ -32,3 +49,71 @@ def test_fleets_are_merged_and_answered_without_a_rule(rule: str, caplog: pytest
         view = View(first.landmarks.pixels, first.landmarks.codes, first.camera)
         assert Answers.of(merger, merged, merger.node).relocalizer.answer(view)
     assert "the merge fails" not in caplog.text
+
+
+def test_own_loop_closures_are_drawn_as_they_are_called() -> None:
+    fleet, own, true = draw(seed=3, run=0, share=50, resumed=3)
+    ways = [edge for edge in own.edges.values() if edge.kind is EdgeKind.MAPPED]
+    assert len(own.nodes) - len(ways) == 4
+    for edge_id, right in true.items():
+        edge = own.edges[edge_id]
+        off = (fleet.truth[edge.a].inverse() @ fleet.truth[edge.b]).inverse() @ edge.a_from_b.mean
+        assert right == (np.hypot(off.x, off.y) < 0.2)
+
+
+def test_without_a_rule_on_own_loop_closures_more_is_wrong() -> None:
+    found = by_rule(LOOP_RULES, lambda: own_loops(seed=4, count=1))
+    assert found["own loops that agree"]["whole"]["50"]["false_loops"] > 0
+    assert found[ALL]["whole"]["50"]["false_loops"] == 0
+    kept = {rule: figures["whole"]["20"]["true_loops"] for rule, figures in found.items()}
+    assert kept["drives against loops"] < kept[ALL] <= found[ALL]["whole"]["20"]["of_true"]
+
+
+def test_without_a_rule_of_recognition_what_it_is_against_is_linked() -> None:
+    found = by_rule(RECOGNITION_RULES, lambda: look_alikes(seed=4, count=12))
+    assert found[ALL]["larger copy"]["wrong"] == 0 < found["depths"]["larger copy"]["wrong"]
+    assert found[ALL]["picture"]["wrong"] < found["image cells"]["picture"]["wrong"]
+    for figures in found.values():
+        for kind, figure in figures.items():
+            assert found[ALL][kind]["links"] <= figure["links"] <= figure["pairs"] == 12
+            assert figure["wrong"] <= figure["links"]
+    assert set(found[ALL]) == set(PAIRS)
+
+
+@pytest.fixture(scope="module")
+def drive() -> tuple[RobotDescription, Drive]:
+    """The beginning of an exploration."""
+    return recorded(5, seconds=12.0)
+
+
+def test_a_drive_without_faults_is_mapped_well(drive: tuple[RobotDescription, Drive]) -> None:
+    found = mapped(*drive)
+    assert found["edges"] > 0 and found["wrong_edges"] == 0 and found["used"] > 0.9 * found["ticks"]
+    assert found["error_m"] < 0.05
+
+
+@pytest.mark.parametrize("rule", FRAME_RULES)
+def test_a_drive_is_mapped_without_a_rule_on_frames(rule: str, drive: tuple[RobotDescription, Drive]) -> None:
+    """Without faults it is as good as with it."""
+    with switched_off(FRAME_RULES[rule]):
+        found = mapped(drive[0], drive[1][:60])
+    assert found["wrong_edges"] == 0 and found["used"] > 50
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_spoils_images_or_wheels_and_nothing_else(
+    fault: str, drive: tuple[RobotDescription, Drive]
+) -> None:
+    spoiled = FAULTS[fault](drive[1], np.random.default_rng(0))
+    stamps = [one.observation.stamp_ns for one in spoiled]
+    assert len(set(stamps)) == len(stamps) and stamps == sorted(stamps)
+    if fault == "carried":
+        assert len(spoiled) > len(drive[1])
+        return
+    changed = [
+        not np.array_equal(np.asarray(one.observation.image), np.asarray(before.observation.image))
+        or one.observation.odometry != before.observation.odometry
+        for one, before in zip(spoiled, drive[1], strict=True)
+    ]
+    assert sum(changed) > 0 and not changed[0]
+    assert [one.truth for one in spoiled] == [one.truth for one in drive[1]]
