@@ -10,14 +10,17 @@ import pytest
 
 from mapweave.agent.mission import GoTo
 from mapweave.agent.pipeline import Pipeline
+from mapweave.agent.replication.journal import Journal
+from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodeRetired
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import Agent, AgentOptions
+from mapweave.wire.bus import Request
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import Ack
+from mapweave.wire.log_messages import Ack, KeptNodes, NewestMap
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.pose_messages import MergedPose, PoseNews
 from synthetic.own_map import SurveyedMap
@@ -93,3 +96,28 @@ def test_what_a_server_has_it_must_have_let_go(own: SurveyedMap, agent: tuple[Ag
     robot.missions.take(MissionOrder.new("r0", MissionKind.GO, "anna", old))
     assert not robot._released(old, new), "it is a goal"
     serving.close()
+
+
+def test_a_map_that_it_has_left_goes_when_its_server_has_pruned_all_of_it(
+    own: SurveyedMap, tmp_path: Path
+) -> None:
+    journal = Journal(tmp_path / "r0.sqlite", "r0")
+    journal.open_map(1)
+    journal.append(MAP, own.map.contents(), 0)
+    journal.acknowledge("s0", MAP, journal.head(MAP))
+    journal.close()
+    hub, asked = MemoryHub(), list[KeptNodes]()
+    server = MemoryBus(hub)
+
+    def answer(request: Request) -> None:
+        asked.append(KeptNodes.decode(request.payload))
+        request.reply(NewestMap(1, pruned=True).encode())
+
+    server.serve(KEYS.all_acks("s0"), answer)
+    server.announce(KEYS.server_alive("s0"))
+    options = AgentOptions("r0", tmp_path, fresh=True, patience=0.0)
+    robot = Agent(lambda: DESCRIPTION, MemoryBus(hub), KEYS, AgentSettings(), options)
+    eventually(lambda: not RetainedMap.of(robot.journal, MAP).contents)
+    assert asked == [KeptNodes(1, tuple(sorted(node.number for node in own.map.nodes)))]
+    robot.close()
+    server.close()
