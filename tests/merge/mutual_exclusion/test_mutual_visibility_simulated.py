@@ -121,7 +121,7 @@ def between_twins(seed: int) -> float:
 @pytest.mark.parametrize("seed", range(4))
 def test_twins_should_have_seen_each_other(seed: int) -> None:
     """Within five minutes, in any room: where little floor is free they rarely see each other."""
-    collision = walked("twins", seed, (0, 1), 150).clash(between_twins(seed))
+    collision = walked("twins", seed, (0, 1), 150).collision_on(between_twins(seed))
     assert collision is not None and collision.where and collision.evidence > 6.9
     assert f"{collision.first} would have seen {collision.second} " in collision.reason
     assert f"m {collision.where} at {collision.time:.1f} s of clock" in collision.reason
@@ -149,11 +149,11 @@ def with_segments(walks: Walks, every: int = 5) -> None:
 def test_twins_should_have_seen_each_other_on_the_way(seed: int) -> None:
     """Nodes alone do not refute the merge, or hardly, segments do; the same scans of another robot."""
     walks = walked("twins", seed, (0, 1), 150)
-    all_nodes = walks.clash(between_twins(seed))
+    all_nodes = walks.collision_on(between_twins(seed))
     with_segments(walks)
-    collision = walks.clash(between_twins(seed))
+    collision = walks.collision_on(between_twins(seed))
     walks.nodes = [replace(node, segment=TrajectorySegment()) for node in walks.nodes]
-    bare = walks.clash(between_twins(seed))
+    bare = walks.collision_on(between_twins(seed))
     assert all_nodes is not None and collision is not None and collision.evidence > 6.9
     assert bare is None or bare.moments < collision.moments / 2
 
@@ -165,9 +165,9 @@ def test_robots_in_one_room_are_not_refused_by_views_on_the_way(
     """Neither where they meet, nor where the second is taken to be elsewhere by a few centimetres."""
     walks = walked("arena", seed, (0, 0), 100, length=4.0, width=3.0)
     with_segments(walks)
-    assert walks.clash(moved=0.05) is None
+    assert walks.collision_on(moved=0.05) is None
     monkeypatch.setattr(encounter, "LEAST_WINDOWS", 1)
-    assert walks.clash(settings=ExclusionSettings(doubt=0.9)) is None
+    assert walks.collision_on(settings=ExclusionSettings(doubt=0.9)) is None
 
 
 @pytest.mark.parametrize("seed", range(3))
@@ -177,12 +177,12 @@ def test_robots_that_are_in_one_room_are_not_refused(
 ) -> None:
     """They come as near as they can, with furniture between, and rays that miss them."""
     walks = walked(kind, seed, (0, 0))
-    assert walks.clash() is None
+    assert walks.collision_on() is None
     # Not even nearly: the scans are evidence for the merge. There is no evidence where no robots meet.
     loose = ExclusionSettings(doubt=0.9)
     monkeypatch.setattr(encounter, "LEAST_WINDOWS", 1)
-    assert walks.clash(settings=loose) is None
-    assert walks.clash(moved=20.0, settings=loose) is None
+    assert walks.collision_on(settings=loose) is None
+    assert walks.collision_on(moved=20.0, settings=loose) is None
 
 
 @pytest.mark.parametrize("fails", ["all for a while", "most for ever"])
@@ -196,16 +196,16 @@ def test_broken_sensors_are_no_evidence(fails: str) -> None:
         distances = node.ranges.distances.copy()
         distances[broken] = node.ranges.reach
         walks.nodes[k] = replace(node, ranges=replace(node.ranges, distances=distances))
-    assert walks.clash() is None
+    assert walks.collision_on() is None
 
 
 def test_robots_without_a_radius_are_not_used_for_visibility(monkeypatch: pytest.MonkeyPatch) -> None:
     walks = walked("twins", 0, (0, 1))
     walks.nodes = [replace(node, radius=0.0) for node in walks.nodes]
-    seeing = walks.clash(between_twins(0))
+    seeing = walks.collision_on(between_twins(0))
     # Robots that see nothing of each other.
     monkeypatch.setattr("mapweave.merge.mutual_exclusion.mutual_visibility.CORE", 0.0)
-    assert seeing == walks.clash(between_twins(0))
+    assert seeing == walks.collision_on(between_twins(0))
 
 
 class Exploration:
