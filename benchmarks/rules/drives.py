@@ -17,7 +17,6 @@ from mapweave.evaluation.map_score import align
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
-from mapweave.sim.events import Walk
 from mapweave.sim.robots import RobotSetup
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
@@ -27,10 +26,6 @@ SECONDS = 90.0
 """Of a drive."""
 WRONG = 0.1, math.radians(3.0)
 """An edge that is off by more, m or rad, is wrong. Right ones are off by a few mm."""
-PEOPLE = "people"
-"""The drive in which people walk past: they are rendered, not made up afterwards."""
-WALK_EVERY, WALK = 15.0, 8.0
-"""s from one to the next, and how long one walks."""
 TRIALS: Mapping[str, Sequence[str]] = {
     "images that come twice": ("repeated images",),
     "other things": ("strange images",),
@@ -38,20 +33,17 @@ TRIALS: Mapping[str, Sequence[str]] = {
     "lamps": ("images in another light",),
     "spinning wheels": ("odometry against images",),
     "carried": ("strange images",),
-    PEOPLE: ("tracks that are refused",),
 }
 """Rules that each fault needs."""
 
 
-def recorded(seed: int, people: bool = False, seconds: float = SECONDS) -> tuple[RobotDescription, Drive]:
+def recorded(seed: int, seconds: float = SECONDS) -> tuple[RobotDescription, Drive]:
     """A robot explores an office."""
     robot, out = RobotSetup(ROBOT), list[Sensed]()
     with Simulation(make_world("office", seed), [robot], seed) as simulation:
         description, command = simulation.describe(ROBOT), Command()
         pipeline = _pipeline(Pipeline(MapId("map", 1), description), Explore())
-        for k in range(round(seconds / description.tick)):
-            if people and math.fmod((k + 50) * description.tick, WALK_EVERY) < 0.5 * description.tick:
-                simulation.apply(Walk(near=ROBOT, seconds=WALK))
+        for _ in range(round(seconds / description.tick)):
             out.append(Sensed(simulation.step({ROBOT: command})[ROBOT], simulation.truth(ROBOT)))
             if pipeline.lost:
                 pipeline = _pipeline(Pipeline(MapId("map", 1), description), Explore())
@@ -99,11 +91,9 @@ def drives(seed: int, count: int, step: Callable[[], None]) -> dict[str, dict[st
     """What comes of so many drives with each fault, with all rules and without those that it needs."""
     found: dict[str, dict[str, list[dict[str, float]]]] = {}
     for run in range(count):
-        plain = recorded(seed + run)
+        description, plain = recorded(seed + run)
         for fault, rules in TRIALS.items():
-            description, drive = recorded(seed + run, people=True) if fault == PEOPLE else plain
-            if fault in FAULTS:
-                drive = FAULTS[fault](drive, np.random.default_rng([seed, run]))
+            drive = FAULTS[fault](plain, np.random.default_rng([seed, run]))
             for name in (ALL, *rules):
                 with switched_off(FRAME_RULES.get(name, ())):
                     row = mapped(description, drive)

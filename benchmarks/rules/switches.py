@@ -14,7 +14,7 @@ from unittest.mock import patch
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.mapping import image_acceptance, tracking
+from mapweave.agent.mapping import image_acceptance
 from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector
 from mapweave.agent.mapping.odometry_consistency import OdometryConsistency
 from mapweave.hybridmap.pose import Array
@@ -147,7 +147,6 @@ FRAME_RULES: Mapping[str, tuple[Switch, ...]] = {
     "images that show nothing": (_unnoticed(FrameOverlap.BLANK),),
     "images in another light": ((image_acceptance, "relit", lambda image, _: image),),
     "odometry against images": ((OdometryConsistency, "compare", lambda *_: None),),
-    "tracks that are refused": ((tracking, "STRIKES", math.inf),),
 }
 """Rules on images, and on what they show, while a robot maps."""
 
