@@ -6,11 +6,13 @@ import random
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import cache
 
 import pytest
 
 from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.query import Certainty, View
 from mapweave.mapserver.cluster.sharded_index import ShardedIndex
@@ -94,6 +96,19 @@ def test_shards_answer_as_one_index_before_they_are_there_and_after() -> None:
     with shards(nodes) as cluster:
         assert cluster.index.status == "3 of 3 shards" and len(cluster.index) == len(nodes)
         assert_same(cluster.index, one_index(nodes), nodes)
+
+
+def test_copies_of_a_place_take_no_votes_once_they_are_hidden() -> None:
+    """All nearest landmarks of each shard may be copies: then more are asked for."""
+    nodes = fleet()
+    copies = tuple(
+        replace(node, id=NodeId(f"liar{k}", 1, node.id.number)) for node in nodes[:2] for k in range(60)
+    )
+    with shards((*nodes, *copies)) as cluster:
+        for node in nodes[:2]:
+            ranked = cluster.index.query(view_of(node), 16, [copy.id for copy in copies])
+            assert not ranked.missing
+            assert_alike(ranked, one_index(nodes).query(view_of(node), 16))
 
 
 def test_a_map_stays_whole_in_one_shard() -> None:
