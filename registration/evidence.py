@@ -81,7 +81,7 @@ def depth_agreement(forward: Sightings, fix: PlanarFix) -> float:
     """Share of the landmarks whose pixels fit the pose that fit in depth too; 1 if few have two depths."""
     both = forward.depth_measured
     nothing = np.full(len(forward), np.nan)
-    pixels_only = replace(forward, depths=nothing, depth_sigmas=nothing)
+    pixels_only = replace(forward.levelled(fix.pitch), depths=nothing, depth_sigmas=nothing)
     pose = fix.node_from_robot.mean.vector[None]
     fits = (pixels_only.log_ratios(pose)[0] > 0) & both
     if fits.sum() < 5:

@@ -1,5 +1,6 @@
 """The best pose near a first one, by iterated Gauss-Newton, and how certain it is.
 
+A pitch of the camera is one more variable, with a prior; what is said of the pose holds whatever it is.
 The points may move within their own uncertainty. They are variables that are eliminated in closed form: each
 round linearises at the points' present estimates, the residual refers back to where they were given, and
 their covariance is part of the residual's (the iterated extended Kalman filter's form of a Schur complement).
@@ -24,6 +25,7 @@ from mapweave.registration.projection import (
     determined,
     linearise,
     normal_equations,
+    of_pose_alone,
 )
 from mapweave.registration.sightings import Sightings
 
@@ -46,9 +48,11 @@ class PlanarFix:
         inliers: (N,) which sightings agree with it.
         mean_square: mean squared normalised residual of the inliers; 1 when the uncertainties are right.
         rms_px: of the inliers' residuals, px, after the points moved within their uncertainty.
-        log_evidence: sum over the inliers of how much likelier they are than wrong matches, nats.
+        log_evidence: sum over the inliers of how much likelier they are than wrong matches, nats; with
+            the pitch's prior, and marginalised over it.
         rival: what the mirrored pose explains (see planar_ambiguity.py), as a share of what this one does; 0
             if there is no other.
+        pitch: by which the camera looks up against the points' frame, rad.
     """
 
     node_from_robot: PoseGaussian
@@ -57,10 +61,11 @@ class PlanarFix:
     rms_px: float
     log_evidence: float
     rival: float = 0.0
+    pitch: float = 0.0
 
 
-def stack_sightings(parts: Sequence[Sightings]) -> Stack:
-    """Concatenate the sightings of one problem."""
+def stack_sightings(parts: Sequence[Sightings], pitch_sigma: float = 0.0) -> Stack:
+    """Concatenate the sightings of one problem, with the prior of its pitch, rad."""
     measured = np.concatenate([part.depth_measured for part in parts])
     depths = np.where(measured, np.concatenate([part.depths for part in parts]), 0.0)
     sigmas = np.where(measured, np.concatenate([part.depth_sigmas for part in parts]), NO_DEPTH_SIGMA)
@@ -80,66 +85,71 @@ def stack_sightings(parts: Sequence[Sightings]) -> Stack:
         log_area + np.where(measured, log_depth, math.log(NO_DEPTH_SIGMA)),
         np.repeat([part.inverted for part in parts], counts),
         np.repeat(np.array(optics, np.float64), counts, axis=0),
+        float(pitch_sigma),
     )
 
 
-def improve(stack: Stack, pose: Pose2, rounds: int) -> tuple[Pose2, Array] | None:
+def improve(stack: Stack, start: Array, rounds: int) -> tuple[Array, Array] | None:
     """Bring a pose to its best.
 
     Args:
         stack: the sightings.
-        pose: where to start.
+        start: (4,) pose m, m, rad, and pitch in sigmas.
         rounds: of Gauss-Newton at most.
 
     Returns:
-        The pose and the points (N, 3) m at their best for it; None if the inliers do not determine a
-        pose.
+        Pose and pitch (4,) and the points (N, 3) m at their best for them; None if the inliers do not
+        determine a pose.
     """
-    sure, pose_vector, points = projection.improve(stack, pose.vector, rounds)
-    return (Pose2.from_vector(pose_vector), points) if sure else None
+    sure, state, points = projection.improve(stack, start, rounds)
+    return (state, points) if sure else None
 
 
-def refine(stack: Stack, pose: Pose2, scale_sigma: float, shift_sigma: float = 0.0) -> PlanarFix | None:
+def refine(stack: Stack, start: Array, scale_sigma: float, shift_sigma: float = 0.0) -> PlanarFix | None:
     """Refine a pose and compute its covariance.
 
     The covariance is the inverse information, larger where the residuals are larger than they should be,
     and larger by what does not average out: a common scale error of the points, or of the measured depths,
-    which come from one drive with one set of wheels, and a shift of all pixels.
+    which come from one drive with one set of wheels, and a shift of all pixels. The pitch is marginalised
+    out.
 
     Args:
         stack: the sightings.
-        pose: where to start.
+        start: (4,) pose m, m, rad, and pitch in sigmas.
         scale_sigma: share by which all points, or all measured depths, may be wrong together.
         shift_sigma: px by which all pixels may be off together, to either side.
 
     Returns:
         The pose, or None if the inliers do not determine one.
     """
-    improved = improve(stack, pose, GAUSS_NEWTON_STEPS)
+    improved = improve(stack, start, GAUSS_NEWTON_STEPS)
     if improved is None:
         return None
-    pose, moved = improved
-    linear = linearise(stack, pose.vector, moved)
-    information = normal_equations(linear)[1:, 1:].copy()
+    state, moved = improved
+    linear = linearise(stack, state, moved)
+    products = normal_equations(linear, state[3])
     inliers = linear.inliers
-    if not inliers.any() or not determined(information):
+    if not inliers.any() or not determined(of_pose_alone(products)):
         return None
-    covariance = np.linalg.inv(information)
+    # (3, 4): of the pose, with itself and with the pitch.
+    covariance = np.linalg.inv(products[1:, 1:])[:3]
     freedom = max(int(np.where(stack.measured, 3, 2)[inliers].sum()) - 3, 1)
     mean_square = float(linear.distance2[inliers].sum()) / freedom
     alone = covariance = covariance * max(1.0, mean_square)
     common = [scale_sigma * share for share in _common_scales(stack, linear, moved)]
     if shift_sigma:
         common += [shift_sigma * np.tile(side, (len(moved), 1)) for side in np.eye(3)[:2]]
+    covariance = covariance[:, :3]
     for change in common:
         drift = alone @ _gradient(linear, change)
         covariance = covariance + np.outer(drift, drift)
     return PlanarFix(
-        PoseGaussian(pose, 0.5 * (covariance + covariance.T)),
+        PoseGaussian(Pose2.from_vector(state[:3]), 0.5 * (covariance + covariance.T)),
         inliers,
         mean_square,
         float(np.sqrt((linear.reprojection_px[inliers] ** 2).sum(axis=1).mean())),
-        float(linear.log_ratios[inliers].sum()),
+        float(linear.log_ratios[inliers].sum()) - 0.5 * float(state[3] ** 2 + np.log(products[4, 4])),
+        pitch=float(stack.pitch_sigma * state[3]),
     )
 
 
@@ -159,11 +169,11 @@ def _common_scales(stack: Stack, linear: Linear, points: Array) -> list[Array]:
 
 
 def _gradient(linear: Linear, residuals: Array) -> Array:
-    """(3,) gradient of the pose by other residuals (N, 3), with the same weights."""
+    """(4,) gradient of pose and pitch by other residuals (N, 3), with the same weights."""
     f00, f10, f11, f20, f21, f22 = linear.factor.T
     white = np.empty_like(residuals)
     white[:, 0] = residuals[:, 0] / f00
     white[:, 1] = (residuals[:, 1] - f10 * white[:, 0]) / f11
     white[:, 2] = (residuals[:, 2] - f20 * white[:, 0] - f21 * white[:, 1]) / f22
     white *= linear.weights[:, None]
-    return np.asarray(white.ravel() @ linear.white[:, :, 1:].reshape(-1, 3), np.float64)
+    return np.asarray(white.ravel() @ linear.white[:, :, 1:].reshape(-1, 4), np.float64)

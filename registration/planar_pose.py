@@ -2,6 +2,9 @@
 
 Static localization of the paper's section 6 (least squares on n >= 4 known points), made robust: many
 poses are solved at once from two or three sightings each, scored by likelihood, and the best refined.
+
+Two cameras never look equally far up. By how much they differ is estimated with the pose, as a nuisance
+parameter with a Gaussian prior, if a setting says how much it may be.
 """
 
 from __future__ import annotations
@@ -34,11 +37,13 @@ class PlanarPoseSettings:
             is off by about one pixel.
         scale_sigma: share by which all points of one frame may be too near or too far together; they come
             from one drive with one set of wheels, so their errors are not independent.
+        pitch_sigma: by which the one camera may look further up than the other, rad.
         least_inliers: fewer give no pose.
     """
 
     pixel_sigma: float = 1.0
     scale_sigma: float = 0.01
+    pitch_sigma: float = 0.0
     least_inliers: int = 4
 
 
@@ -107,21 +112,46 @@ def solve_sightings(
     poses = np.concatenate([hypotheses(part, n, rng) for part, n in zip(parts, counts, strict=True)])
     if len(poses) == 0:
         return None
-    stack = stack_sightings(parts)
+    sigma = settings.pitch_sigma
+    stack = stack_sightings(parts, sigma)
     if total > 2 * PREVIEW:
         # Most hypotheses are wrong, and a part of the sightings is enough to reject them.
         few = [part.take(slice(None, None, total // PREVIEW)) for part in parts]
-        poses = poses[np.argsort(-_scores(few, poses), kind="stable")[: max(len(poses) // 5, 10)]]
-    finalists = np.argsort(-_scores(parts, poses), kind="stable")[:FINALISTS]
-    improved = [improve(stack, Pose2.from_vector(poses[k]), rounds=2) for k in finalists]
-    kept = [candidate[0] for candidate in improved if candidate is not None]
+        poses = poses[np.argsort(-_scores(few, poses, sigma), kind="stable")[: max(len(poses) // 5, 10)]]
+    finalists = np.argsort(-_scores(parts, poses, sigma), kind="stable")[:FINALISTS]
+    kept = [state for k in finalists if (state := _improved(stack, poses[k])) is not None]
     if not kept:
         return None
-    best = kept[int(_scores(parts, np.stack([pose.vector for pose in kept])).argmax())]
+    best = max(kept, key=lambda state: _score(parts, state, sigma))
     fix = refine(stack, best, settings.scale_sigma)
     if fix is None or int(fix.inliers.sum()) < settings.least_inliers:
         return None
     return _weighed(fix, parts, stack, settings)
+
+
+def _improved(stack: Stack, pose: Array) -> Array | None:
+    """Pose and pitch (4,) after some steps from a pose (3,); None if the inliers do not determine one.
+
+    Before the first step nothing is known of the pitch: it may put all right matches outside their gates. So
+    that step takes it for noise as well.
+    """
+    state = np.append(pose, 0.0)
+    if stack.pitch_sigma:
+        first = improve(_with_pitch_as_noise(stack), state, rounds=1)
+        if first is None:
+            return None
+        state = first[0]
+    improved = improve(stack, state, rounds=2)
+    return None if improved is None else improved[0]
+
+
+def _with_pitch_as_noise(stack: Stack) -> Stack:
+    """The same pixels, each as uncertain as an unknown pitch makes it."""
+    focal, centre = stack.optics[:, :2], stack.optics[:, 2:4]
+    a, b = ((centre - stack.observed[:, :2]) / focal).T
+    noise = stack.noise.copy()
+    noise[:, :2] += (stack.pitch_sigma * focal * np.column_stack([a * b, 1.0 + b**2])) ** 2
+    return stack._replace(noise=noise)
 
 
 APART = 0.3
@@ -138,11 +168,13 @@ def _weighed(
     inliers = fix.inliers & ~stack.inverted
     if int(inliers.sum()) < s.least_inliers:
         return fix
-    mean = fix.node_from_robot.mean
-    mirror = improve(stack, mirrored(mean, stack.points[inliers, :2]), rounds=GAUSS_NEWTON_STEPS)
-    if mirror is None or mirror[0].distance(mean) < APART:
+    mean, pitch = fix.node_from_robot.mean, fix.pitch / s.pitch_sigma if s.pitch_sigma else 0.0
+    start = mirrored(mean, stack.points[inliers, :2])
+    mirror = improve(stack, np.append(start.vector, pitch), rounds=GAUSS_NEWTON_STEPS)
+    if mirror is None or Pose2.from_vector(mirror[0][:3]).distance(mean) < APART:
         return fix
-    score, mirror_score = _scores(parts, np.stack([mean.vector, mirror[0].vector])).tolist()
+    states = np.append(mean.vector, pitch), mirror[0]
+    score, mirror_score = (_score(parts, state, s.pitch_sigma) for state in states)
     if mirror_score <= score:
         return replace(fix, rival=max(mirror_score, 0.0) / score if score > 0.0 else 1.0)
     better = refine(stack, mirror[0], s.scale_sigma)
@@ -151,9 +183,15 @@ def _weighed(
     return replace(better, rival=max(score, 0.0) / mirror_score)
 
 
-def _scores(parts: Sequence[Sightings], poses: Array) -> Array:
-    """(H,) nats: log likelihood ratio of each of the (H, 3) poses against chance."""
+def _score(parts: Sequence[Sightings], state: Array, pitch_sigma: float) -> float:
+    """Nats: log likelihood ratio of a pose and a pitch (4,) against chance, with the pitch's prior."""
+    levelled = [part.levelled(pitch_sigma * float(state[3])) for part in parts]
+    return float(_scores(levelled, state[None, :3])[0] - 0.5 * state[3] ** 2)
+
+
+def _scores(parts: Sequence[Sightings], poses: Array, pitch_sigma: float = 0.0) -> Array:
+    """(H,) nats: log likelihood ratio of each of the (H, 3) poses against chance, whatever the pitch is."""
     scores = np.zeros(len(poses))
     for part in parts:
-        scores += part.log_ratios(poses).sum(axis=1)
+        scores += part.log_ratios(poses, pitch_sigma).sum(axis=1)
     return scores

@@ -54,16 +54,19 @@ def refine_pose(node: Node, view: View, recognition: Recognition, pose: PlanarPo
         return recognition.node_from_robot
     landmarks, pixels = landmarks.take(has_depth), pixels[has_depth]
     points = landmarks.points_in_robot(node.camera)
-    best, sigma = recognition.node_from_robot, pose.pixel_sigma
+    best, sigma, pitch = recognition.node_from_robot, pose.pixel_sigma, recognition.pitch
     scale_share, tilt_sigma = node.landmarks.scale_share, node.landmarks.tilt_sigma
     for _ in range(ROUNDS):
-        fresh = min(max(_noise(points, pixels, view, best), LEAST_SIGMA), pose.pixel_sigma)
+        level = Sightings.build(points, pixels, view.camera).levelled(pitch).pixels
+        fresh = min(max(_noise(points, level, view, best), LEAST_SIGMA), pose.pixel_sigma)
         if fresh > 0.95 * sigma:
             break
         sigma = fresh
         covariances = landmarks.covariances_in_robot(node.camera, sigma, scale_share, tilt_sigma)
         sightings = Sightings.build(points, pixels, view.camera, covariances=covariances, pixel_sigma=sigma)
-        fix = refine(stack_sightings([sightings]), best.mean, pose.scale_sigma, SHIFT_SIGMA)
+        stack = stack_sightings([sightings], pose.pitch_sigma)
+        start = np.append(best.mean.vector, pitch / pose.pitch_sigma if pose.pitch_sigma else 0.0)
+        fix = refine(stack, start, pose.scale_sigma, SHIFT_SIGMA)
         if fix is None or int(fix.inliers.sum()) < pose.least_inliers:
             break
         refined = of_unknown_scale(fix.node_from_robot, scale_share, node.camera, view.camera)
@@ -71,7 +74,7 @@ def refine_pose(node: Node, view: View, recognition: Recognition, pose: PlanarPo
         # not better: with landmarks 50 to 300 m away, on a street, it was off by up to 21 m, not by 0.1.
         if np.trace(refined.covariance[:2, :2]) >= np.trace(best.covariance[:2, :2]):
             break
-        best = refined
+        best, pitch = refined, fix.pitch
     return best
 
 

@@ -5,6 +5,12 @@ With q the point in the axes of a robot at (x, y, heading), forward, left and up
     X = q_x - mount_forward,  a = q_y / X,  b = (q_z - mount_height) / X,  u = cx - fx a,  v = cy - fy b.
 By the point, in the robot's axes, du = (fx a, -fx, 0) / X and dv = (fy b, 0, -fy) / X.
 
+The camera may look up by an angle t against the points' frame, unknown but small. To a level camera, a pixel
+with slopes (a', b') is then the one with
+    a = a' / r,  b = (sin t + b' cos t) / r,  r = cos t - b' sin t;  da/dt = a b,  db/dt = 1 + b^2.
+t is estimated with the pose, in units of its prior's standard deviation, so that a sigma of 0 holds it at 0.
+Where inverted, the pixel's camera is the other one, and looks down by t against the first.
+
 These are kernels (mapweave.hybridmap.jit): the code for sighting n runs for each in turn or for all
 at once.
 """
@@ -54,6 +60,7 @@ class CameraSightings(NamedTuple):
         depth_variances: (N,) m^2; 1 where not measured.
         measured: (N,) where the image gives a depth too.
         pixel_variance: px^2.
+        pitch_variance: rad^2, by which the camera may be pitched; counts as noise of each pixel alone.
         optics: of the camera.
     """
 
@@ -64,6 +71,7 @@ class CameraSightings(NamedTuple):
     depth_variances: Vector
     measured: Flags
     pixel_variance: float
+    pitch_variance: float
     optics: Optics
 
 
@@ -97,6 +105,11 @@ def _log_ratio(h: Index, n: Index, seen: CameraSightings, poses: PoseHypotheses)
     uu = fu * fu * (a * (a * xx - 2.0 * xy) + yy) + seen.pixel_variance
     vv = fv * fv * (b * (b * xx - 2.0 * xz) + p[n, 2, 2]) + seen.pixel_variance
     uv = fu * fv * (b * (a * xx - xy) - a * xz + yz)
+    pitch_u = optics.fx * seen.slopes[n, 0] * seen.slopes[n, 1]
+    pitch_v = optics.fy * (1.0 + seen.slopes[n, 1] * seen.slopes[n, 1])
+    uu = uu + seen.pitch_variance * pitch_u * pitch_u
+    vv = vv + seen.pitch_variance * pitch_v * pitch_v
+    uv = uv + seen.pitch_variance * pitch_u * pitch_v
     determinant = uu * vv - uv * uv
     distance2 = (ru * (vv * ru - 2.0 * uv * rv) + uu * rv * rv) / determinant
     # The depth is treated as independent of the pixel here; the refinement does not.
@@ -132,6 +145,7 @@ class Stack(NamedTuple):
         inverted: (N,) the point is in the robot's frame, and the image was taken where the wanted pose's
             frame has its origin.
         optics: (N, 6) fx, fy, cx, cy px, mount_height, mount_forward m.
+        pitch_sigma: rad, prior of the pitch.
     """
 
     points: Matrix
@@ -143,16 +157,17 @@ class Stack(NamedTuple):
     log_wrong: Vector
     inverted: Flags
     optics: Matrix
+    pitch_sigma: float
 
 
 class Linear(NamedTuple):
     """A stack linearised at a pose and at points.
 
     Attributes:
-        reprojection_px: (N, 2) observed minus predicted, against the points where they are now.
-        white: (N, 3, 4) for u px, v px and depth m the residual against the point where it was given, and the
-            derivatives of the prediction by the pose's x, y and heading, perturbed on the right as in
-            PoseGaussian; whitened by the inverse of the residuals' Cholesky factor. 0 where not visible.
+        reprojection_px: (N, 2) observed, levelled, minus predicted, against the points where they are now.
+        white: (N, 3, 5) for u px, v px and depth m the residual against the point where it was given, and how
+            it shrinks by the pose's x, y and heading, perturbed on the right as in PoseGaussian, and by the
+            pitch, in sigmas; whitened by the inverse of the residuals' Cholesky factor. 0 where not visible.
         factor: (N, 6) Cholesky's, 00 10 11 20 21 22, of the covariance of the residuals.
         by_point: (N, 4) du by forward and left, dv by forward and up, px/m, in the axes of the robot whose
             camera it is. The depth's derivative is forward.
@@ -191,8 +206,15 @@ def _linearise(n: Index, stack: Stack, pose: Vector, points: Matrix, out: Linear
     a, b = left / ahead, (points[n, 2] - stack.optics[n, 4]) / ahead
     u_x, u_y, v_x, v_z = fx * a / ahead, -fx / ahead, fy * b / ahead, -fy / ahead
 
+    # The pixel levelled. The depth stays: it changes by less than its uncertainty, a share of b t.
+    by_sigma = (direct - inverse) * stack.pitch_sigma
+    up, down = np.cos(by_sigma * pose[3]), np.sin(by_sigma * pose[3])
+    seen_b = (cy - stack.observed[n, 1]) / fy
+    ray = up - seen_b * down
+    level_a, level_b = (cx - stack.observed[n, 0]) / fx / ray, (down + seen_b * up) / ray
+
     # Observed minus predicted; and back from where the point is now to where it was given.
-    off_u, off_v = stack.observed[n, 0] - cx + fx * a, stack.observed[n, 1] - cy + fy * b
+    off_u, off_v = fx * (a - level_a), fy * (b - level_b)
     off_d = stack.observed[n, 2] - depth
     bx, by = stack.points[n, 0] - points[n, 0], stack.points[n, 1] - points[n, 1]
     back_x, back_y, back_z = c * bx + s * by, c * by - s * bx, stack.points[n, 2] - points[n, 2]
@@ -214,11 +236,14 @@ def _linearise(n: Index, stack: Stack, pose: Vector, points: Matrix, out: Linear
     # inverted, inverse(pose @ d) = inverse(pose) @ (-Ad(pose) d) to first order.
     visible = depth > NEAREST
     white = out.white
-    for k in range(4):
+    for k in range(5):
         if k == 0:
             u = off_u - u_x * back_x - u_y * back_y
             v = off_v - v_x * back_x - v_z * back_z
             d = stack.measured[n] * (off_d - back_x)
+        elif k == 4:
+            u, v = by_sigma * fx * level_a * level_b, by_sigma * fy * (1.0 + level_b * level_b)
+            d = 0.0 * depth
         else:
             if k == 1:
                 along, aside = inverse * cos - direct, inverse * sin
@@ -248,10 +273,10 @@ def _linearise(n: Index, stack: Stack, pose: Vector, points: Matrix, out: Linear
 
 @compiled
 def linearise(stack: Stack, pose: Vector, points: Matrix) -> Linear:
-    """Linearise sightings at a pose (3,) and at points (N, 3) m near those of the stack."""
+    """Linearise sightings at pose and pitch (4,), see `improve`, and at points (N, 3) m near the stack's."""
     count = len(stack.points)
     out = Linear(
-        np.empty((count, 2)), np.empty((count, 3, 4)), np.empty((count, 6)), np.empty((count, 4)),
+        np.empty((count, 2)), np.empty((count, 3, 5)), np.empty((count, 6)), np.empty((count, 4)),
         np.empty((count, 2)), np.empty(count), np.empty(count), np.empty(count, np.bool_), np.empty(count),
     )  # fmt: skip
     _linearise(count, stack, pose, points, out)
@@ -259,13 +284,28 @@ def linearise(stack: Stack, pose: Vector, points: Matrix) -> Linear:
 
 
 @compiled
-def normal_equations(linear: Linear) -> Matrix:
-    """(4, 4) products of the columns of all white rows, each counted by its weight.
+def normal_equations(linear: Linear, pitch: float) -> Matrix:
+    """(5, 5) products of the columns of all white rows, each counted by its weight, with the pitch's prior.
 
-    Of the pose, [1:, 1:] is the information and [1:, 0] the gradient.
+    Of pose and pitch, [1:, 1:] is the information and [1:, 0] the gradient.
+
+    Args:
+        linear: the rows.
+        pitch: at which they were linearised, in sigmas.
     """
-    rows = (linear.white * np.sqrt(linear.weights)[:, None, None]).reshape(-1, 4)
-    return rows.T @ rows
+    rows = (linear.white * np.sqrt(linear.weights)[:, None, None]).reshape(-1, 5)
+    products = rows.T @ rows
+    products[4, 4] += 1.0
+    products[4, 0] -= pitch
+    products[0, 4] -= pitch
+    return products
+
+
+@compiled
+def of_pose_alone(products: Matrix) -> Matrix:
+    """(3, 3) information of the pose, the pitch marginalised out of the normal equations."""
+    information: Matrix = products[1:4, 1:4] - np.outer(products[1:4, 4], products[4, 1:4]) / products[4, 4]
+    return information
 
 
 @compiled
@@ -285,6 +325,8 @@ def _move_point(n: Index, stack: Stack, linear: Linear, step: Vector, out: Matri
     left0 = white[n, 0, 0] - white[n, 0, 1] * step[0] - white[n, 0, 2] * step[1] - white[n, 0, 3] * step[2]
     left1 = white[n, 1, 0] - white[n, 1, 1] * step[0] - white[n, 1, 2] * step[1] - white[n, 1, 3] * step[2]
     left2 = white[n, 2, 0] - white[n, 2, 1] * step[0] - white[n, 2, 2] * step[1] - white[n, 2, 3] * step[2]
+    left0, left1 = left0 - white[n, 0, 4] * step[3], left1 - white[n, 1, 4] * step[3]
+    left2 = left2 - white[n, 2, 4] * step[3]
     d = left2 / factor[n, 5]
     v = (left1 - factor[n, 4] * d) / factor[n, 2]
     u = (left0 - factor[n, 1] * v - factor[n, 3] * d) / factor[n, 0]
@@ -304,25 +346,26 @@ def improve(stack: Stack, start: Vector, rounds: int) -> tuple[bool, Vector, Mat
 
     Args:
         stack: the sightings.
-        start: (3,) m, m, rad.
+        start: (4,) m, m, rad, and the pitch in sigmas.
         rounds: at most.
 
     Returns:
-        Whether the inliers determine a pose; the pose (3,); and the points (N, 3) m that fit it best.
+        Whether the inliers determine a pose; pose and pitch (4,); and the points (N, 3) m that fit them best.
     """
     pose, points = start.copy(), stack.points.copy()
     for _ in range(rounds):
         linear = linearise(stack, pose, points)
-        products = normal_equations(linear)
+        products = normal_equations(linear, pose[3])
         # Copies: a compiled kernel takes and solves dense arrays.
         information, gradient = products[1:, 1:].copy(), products[1:, 0].copy()
         c, s = math.cos(pose[2]), math.sin(pose[2])
-        if not determined(information):
+        if not determined(of_pose_alone(products)):
             return False, pose, points
         step = np.linalg.solve(information, gradient).astype(np.float64)
         pose[0] += c * step[0] - s * step[1]
         pose[1] += s * step[0] + c * step[1]
         pose[2] = (pose[2] + step[2] + math.pi) % (2.0 * math.pi) - math.pi
+        pose[3] += step[3]
         _move_point(len(points), stack, linear, step, points)
         if np.abs(step).max() < SMALL_STEP:
             break

@@ -25,6 +25,10 @@ from mapweave.registration.matching import MatchSettings, match
 from mapweave.registration.planar_pose import PlanarPoseSettings, solve_sightings
 from mapweave.registration.sightings import Sightings
 
+PITCH_SIGMA = 0.01
+"""rad, by which one camera of a fleet looks further up than another. Calibration takes 0.01 for what does not
+show in a map (agent/calibration/parameter_sigmas.py), and no robot corrects what is less."""
+
 
 @dataclass(frozen=True)
 class RecognitionSettings:
@@ -46,7 +50,7 @@ class RecognitionSettings:
     """
 
     matching: MatchSettings = field(default_factory=MatchSettings)
-    pose: PlanarPoseSettings = field(default_factory=PlanarPoseSettings)
+    pose: PlanarPoseSettings = field(default_factory=lambda: PlanarPoseSettings(pitch_sigma=PITCH_SIGMA))
     least_inliers: int = 10
     least_cells: int = 5
     least_seen: float = 0.12
@@ -67,6 +71,7 @@ class Recognition:
         matches: mutual matches, with or without depth.
         usable: matches with a depth on either side, which could have been inliers.
         evidence: the numbers that support it, for an edge's `evidence`.
+        pitch: by which the view's camera looks further up than the node's, rad.
     """
 
     node_from_robot: PoseGaussian
@@ -74,6 +79,7 @@ class Recognition:
     matches: int
     usable: int
     evidence: dict[str, float]
+    pitch: float = 0.0
 
     @property
     def inliers(self) -> int:
@@ -221,7 +227,7 @@ def _examine(
         return RecognitionFailure(reason, len(pairs), inliers, fix.node_from_robot, evidence)
     unknown = min(a.scale_share, b.scale_share) if measured else a.scale_share
     pose = of_unknown_scale(fix.node_from_robot, unknown, camera_a, camera_b)
-    return Recognition(pose, inliers, len(pairs), len(usable), evidence)
+    return Recognition(pose, inliers, len(pairs), len(usable), evidence, fix.pitch)
 
 
 def of_unknown_scale(pose: PoseGaussian, share: float, of_node: Camera, of_view: Camera) -> PoseGaussian:

@@ -7,6 +7,7 @@ axle and faces along the robot's x axis: with q the point in the robot frame,
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -97,7 +98,21 @@ class Sightings:
         """(N,) where the image gives a depth too."""
         return np.isfinite(self.depths) & np.isfinite(self.depth_sigmas)
 
-    def log_ratios(self, poses: Array) -> Array:
+    def levelled(self, pitch: float) -> Sightings:
+        """As a level camera would have seen them, see projection.py.
+
+        Args:
+            pitch: by which the camera looks up against the points' frame, rad; where inverted, the robot's.
+        """
+        if not pitch:
+            return self
+        camera, (a, b) = self.camera, self.slopes.T
+        up, down = math.cos(pitch), math.sin(-pitch if self.inverted else pitch)
+        ray = up - b * down
+        level = np.column_stack([a / ray, (down + b * up) / ray])
+        return replace(self, pixels=[camera.cx, camera.cy] - np.array([camera.fx, camera.fy]) * level)
+
+    def log_ratios(self, poses: Array, pitch_sigma: float = 0.0) -> Array:
         """Log likelihood ratio of each sighting under each pose against a wrong match.
 
         A right match is Gaussian around the point's projection, with the point's covariance carried into
@@ -106,6 +121,8 @@ class Sightings:
 
         Args:
             poses: (H, 3) m, m, rad, wanted poses.
+            pitch_sigma: rad, by which the camera may be pitched; as noise of each pixel, which is what it is
+                as long as nothing is known of it.
 
         Returns:
             (H, N) nats; 0 for sightings outside the 99 % gate or behind the camera.
@@ -122,6 +139,7 @@ class Sightings:
             np.where(measured, self.depth_sigmas, 1.0) ** 2,
             measured,
             float(self.pixel_sigma**2),
+            float(pitch_sigma**2),
             Optics(camera.fx, camera.fy, camera.mount_height, camera.mount_forward, area),
         )
         heading = poses[:, 2]

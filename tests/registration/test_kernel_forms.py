@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from mapweave.hybridmap.jit import KERNELS
 from mapweave.registration.gauss_newton import stack_sightings
-from mapweave.registration.projection import improve, linearise, normal_equations
+from mapweave.registration.projection import improve, linearise, normal_equations, of_pose_alone
 from tests.hybridmap.kernel_forms import in_numpy
 from tests.registration.test_projection import scene
 
@@ -22,13 +22,15 @@ LEAST_SOLVED = 10
 def test_both_forms_are_the_same_to_rounding(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)
     (forward, true), (backward, _) = scene(n, rng, False), scene(max(n // 2, 1), rng, True)
-    stack = stack_sightings([forward, backward])
-    near = true.vector + rng.normal(0, 0.02, 3)
+    stack = stack_sightings([forward, backward], 0.01)
+    near = np.append(true.vector + rng.normal(0, 0.02, 3), rng.normal())
     poses = true.vector + rng.normal(0, 0.2, (20, 3))
 
     def everything() -> list[np.ndarray]:
         linear = linearise(stack, near, stack.points)
-        arrays = [forward.log_ratios(poses), backward.log_ratios(poses), *linear, normal_equations(linear)]
+        arrays = [forward.log_ratios(poses), backward.log_ratios(poses, 0.01), *linear]
+        products = normal_equations(linear, near[3])
+        arrays += [products, of_pose_alone(products)]
         # Fewer leave a pose that rounding decides.
         if n >= LEAST_SOLVED:
             improved = improve(stack, near, 3)
@@ -52,7 +54,7 @@ def test_nothing_is_compiled_while_a_robot_drives() -> None:
     for sightings in (forward, backward, part):
         sightings.log_ratios(true.vector[None])
         sightings.log_ratios(np.stack([true.vector, true.vector])[::2])
-    improve(stack_sightings([part, backward]), true.vector, 2)
+    improve(stack_sightings([part, backward]), np.append(true.vector, 0.0), 2)
     counts = {
         kernel.__name__: len(kernel.machine.signatures)
         for kernel in KERNELS

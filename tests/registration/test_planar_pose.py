@@ -1,6 +1,7 @@
 """Poses from sightings: Jacobians, likelihood, optimum and covariance against independent computations."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ from mapweave.registration.minimal_poses import hypotheses
 from mapweave.registration.planar_pose import PlanarPoseSettings, solve_planar_pose, solve_sightings
 from mapweave.registration.sightings import Sightings
 from tests.hybridmap.kernel_forms import form
+from tests.registration.test_projection import levelled
 
 __all__ = ["form"]
 
@@ -145,6 +147,79 @@ def test_optimum_against_scipy_with_points_as_variables() -> None:
     rotation[:2, :2] = Pose2.from_vector(optimum.x[:3]).rotation
     sigmas = np.sqrt(np.diag(rotation.T @ full @ rotation)) * max(1.0, fix.mean_square) ** 0.5
     assert np.allclose(np.sqrt(np.diag(fix.node_from_robot.covariance)), sigmas, rtol=0.05)
+
+
+def pitched(pixels: np.ndarray, pitch: float) -> np.ndarray:
+    """(N, 2) px, in a camera that looks up by so much, of what a level one sees there."""
+    return levelled(pixels, np.full(len(pixels), -pitch))
+
+
+@settings(max_examples=12, deadline=None)
+@given(st.integers(0, 10**6), st.floats(-0.03, 0.03))
+def test_pitch_against_scipy_with_points_and_pitch_as_variables(seed: int, pitch: float) -> None:
+    """Pose, pitch and covariance are those of a full least squares with the pitch's prior."""
+    rng = np.random.default_rng(seed)
+    true, points, covariances, pixels = noisy_problem(rng, n=24, depth_share=0.05)
+    pixels = pitched(pixels, pitch)
+    model = replace(HONEST, pitch_sigma=0.015)
+    fix = solve_planar_pose(points, pixels, CAMERA, rng=rng, point_covariances=covariances, settings=model)
+    assert fix is not None
+    # One that lies outside its gate by chance is left out on both sides.
+    kept = fix.inliers
+    assert kept.sum() >= len(points) - 2
+    points, pixels, roots = points[kept], pixels[kept], np.linalg.inv(np.linalg.cholesky(covariances[kept]))
+
+    def residuals(x: np.ndarray) -> np.ndarray:
+        moved = x[4:].reshape(-1, 3)
+        level = CAMERA.project(Pose2.from_vector(x[:3]).inverse().apply(moved))
+        prior = np.einsum("nij,nj->ni", roots, moved - points)
+        seen = (pixels - pitched(level, x[3])) / 0.7
+        return np.concatenate([seen.ravel(), prior.ravel(), [x[3] / 0.015]])
+
+    start = np.concatenate([true.vector, [0.0], points.ravel()])
+    optimum = scipy.optimize.least_squares(residuals, start, x_scale="jac")
+    full = np.linalg.inv(optimum.jac.T @ optimum.jac)[:4, :4]
+    # The estimator weighs each sighting by its probability, hence not to the last digit.
+    sigmas = np.sqrt(np.diag(full))
+    off = np.append(fix.node_from_robot.mean.vector, fix.pitch) - optimum.x[:4]
+    assert (np.abs(off) < 0.1 * sigmas).all()
+    rotation = np.eye(3)
+    rotation[:2, :2] = Pose2.from_vector(optimum.x[:3]).rotation
+    expected = np.sqrt(np.diag(rotation.T @ full[:3, :3] @ rotation)) * max(1.0, fix.mean_square) ** 0.5
+    assert np.allclose(np.sqrt(np.diag(fix.node_from_robot.covariance)), expected, rtol=0.08)
+
+
+def test_covariance_is_calibrated_where_cameras_look_differently_far_up() -> None:
+    """Pitch differences are drawn from the prior; a planar pose loses landmarks then, and is too sure."""
+    rng = np.random.default_rng(16)
+    distances: dict[float, list[float]] = {0.0: [], 0.01: []}
+    inliers: dict[float, list[float]] = {0.0: [], 0.01: []}
+    for _ in range(150):
+        true, points, covariances, pixels = noisy_problem(rng)
+        pixels = pitched(pixels, rng.normal(0.0, 0.01))
+        for sigma, found in distances.items():
+            model = replace(HONEST, pitch_sigma=sigma)
+            fix = solve_planar_pose(
+                points, pixels, CAMERA, rng=rng, point_covariances=covariances, settings=model
+            )
+            assert fix is not None
+            found.append(fix.node_from_robot.mahalanobis2(true))
+            inliers[sigma].append(float(fix.inliers.mean()))
+    # 3 degrees of freedom; the mean of 150 has a standard deviation of 0.2.
+    assert 2.3 < np.mean(distances[0.01]) < 3.7 < np.mean(distances[0.0])
+    assert np.mean(inliers[0.01]) > 0.95 > np.mean(inliers[0.0])
+
+
+def test_pitch_is_the_same_seen_from_either_side() -> None:
+    """Points of the robot's own frame in the other camera's image show its pitch with the other sign."""
+    rng = np.random.default_rng(17)
+    true = Pose2(0.3, -0.1, 0.05)
+    points, pixels = seen_points(true.inverse(), 40, rng)
+    seen = Sightings.build(points, pitched(pixels, -0.012), CAMERA, inverted=True)
+    fix = solve_sightings([seen], rng=rng, settings=replace(HONEST, pitch_sigma=0.05))
+    assert fix is not None and fix.inliers.all()
+    assert fix.pitch == pytest.approx(0.012, abs=2e-4)
+    assert error(fix.node_from_robot.mean, true) < 2e-3
 
 
 @pytest.mark.parametrize("wrong_share", [0.3, 0.6])

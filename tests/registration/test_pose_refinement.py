@@ -11,12 +11,12 @@ from scipy.optimize import minimize
 
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, averaged
-from mapweave.registration.planar_pose import PlanarPoseSettings
 from mapweave.registration.pose_refinement import refine_pose
-from mapweave.registration.recognition import recognise
+from mapweave.registration.recognition import RecognitionSettings, recognise
 from synthetic.world import Sensing, room, take_node, take_view
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
+SETTINGS = RecognitionSettings()
 WORLD = room(0, 0, 5, 4, 700, np.random.default_rng(1))
 
 
@@ -30,10 +30,10 @@ def looks(pixel_sigma: float, count: int = 60) -> tuple[np.ndarray, np.ndarray, 
         b = a @ Pose2(*rng.uniform(-0.05, 0.05, 3))
         node = take_node(WORLD, NodeId("r0", 1, number), a, HERE, rng, node_sensing)
         view, _ = take_view(WORLD, b, rng, Sensing(pixel_sigma=pixel_sigma))
-        recognition = recognise(node, view, None, rng)
+        recognition = recognise(node, view, SETTINGS, rng)
         if recognition is None:
             continue
-        best, true = refine_pose(node, view, recognition, PlanarPoseSettings()), a.inverse() @ b
+        best, true = refine_pose(node, view, recognition, SETTINGS.pose), a.inverse() @ b
         first.append(recognition.node_from_robot.mean.distance(true))
         closer.append(best.mean.distance(true))
         squared.append(best.mahalanobis2(true))
@@ -67,10 +67,10 @@ def test_a_refinement_that_leaves_most_landmarks_out_is_not_taken() -> None:
         blurred = rng.random(len(view)) < 0.35
         pixels = view.pixels + np.where(blurred[:, None], rng.normal(0.0, 1.5, view.pixels.shape), 0.0)
         view = replace(view, pixels=pixels.astype(np.float32))
-        recognition = recognise(node, view, None, rng)
+        recognition = recognise(node, view, SETTINGS, rng)
         if recognition is None:
             continue
-        best, true = refine_pose(node, view, recognition, PlanarPoseSettings()), a.inverse() @ b
+        best, true = refine_pose(node, view, recognition, SETTINGS.pose), a.inverse() @ b
         first.append(recognition.node_from_robot.mean.distance(true))
         closer.append(best.mean.distance(true))
     assert len(first) > 40
