@@ -2,6 +2,7 @@
 
     python -m benchmarks.rules --fleets N [--g2o FILE ...] [--seed N] [--json]
     python -m benchmarks.rules --twins N [--seed N] [--json]
+    python -m benchmarks.rules --singles N [--seed N] [--json]
     python -m benchmarks.rules --trials SCENARIO ... [--runs N] [--seed N] [--json]
     python -m benchmarks.rules --places N [--seed N] [--json]
     python -m benchmarks.rules --loops N [--seed N] [--json]
@@ -11,12 +12,13 @@
 Each rule is switched off by itself, and the same is measured as with all rules. Fleets are those of
 `benchmarks.merge`, 50, 80 and 90 % of their links false: how many are as good as least squares with the true
 links alone (`good`), joined by no true link (`joined_falsely`), and how many false links are believed. Twins
-are pairs of robots where another place may give as many links, which agree, as the right one. Graphs in files
-are split among four robots: chi-square over the batch optimum. Trials are those of
-`benchmarks.merge_sim`; what their robots mapped is merged once more without each rule. Places are those of
-`benchmarks.relocalize`: recall of near views, and the share of views of twin rooms and of unknown buildings
-that are answered with a place. Loops are those of one robot, 20, 50 and 80 % of them false, in a map of one
-piece and in one that was resumed elsewhere three times: how many are believed, and the error of the map.
+are pairs of robots where another place may give as many links, which agree, as the right one. Singles are
+pairs of robots with one true link, or that and a false one as strong. Graphs in files are split among four
+robots: chi-square over the batch optimum. Trials are those of `benchmarks.merge_sim`; what their robots
+mapped is merged once more without each rule. Places are those of `benchmarks.relocalize`: recall of near
+views, and the share of views of twin rooms and of unknown buildings that are answered with a place.
+Loops are those of one robot, 20, 50 and 80 % of them false, in a map of one piece and in one that was resumed
+elsewhere three times: how many are believed, and the error of the map.
 Pairs are nodes that are compared, of one place and of two that look alike: how many are linked, and wrongly.
 Drives are explorations of offices, 90 s each; images or wheels are spoiled, and the drive is mapped with all
 rules, and without those that the fault needs: how many edges are wrong, maps begun, ticks used.
@@ -40,10 +42,17 @@ from benchmarks.merge_sim.benchmark import SCENARIOS, SEEDS_APART
 from benchmarks.relocalize.fleet import Bench
 from benchmarks.relocalize.score import figures, wrong_by_kind
 from benchmarks.rules.drives import TRIALS, drives
-from benchmarks.rules.fleets import SHARES, fleets, public_graphs, twins
+from benchmarks.rules.fleets import SHARES, fleets, public_graphs, single_links, twins
 from benchmarks.rules.look_alikes import look_alikes
 from benchmarks.rules.own_loops import own_loops
-from benchmarks.rules.switches import LOOP_RULES, MERGE_RULES, PLACE_RULES, RECOGNITION_RULES, by_rule
+from benchmarks.rules.switches import (
+    LOOP_RULES,
+    MERGE_RULES,
+    PLACE_RULES,
+    RECOGNITION_RULES,
+    SINGLE_RULES,
+    by_rule,
+)
 from benchmarks.rules.trials import total, trial
 from mapweave.formats.g2o import read_g2o
 from mapweave.hybridmap.errors import MapweaveError
@@ -77,6 +86,7 @@ def main() -> None:
     parser = command_line("rules", __doc__)
     parser.add_argument("--fleets", type=int, default=0, metavar="N", help="of each share of false links")
     parser.add_argument("--twins", type=int, default=0, metavar="N", help="pairs of robots")
+    parser.add_argument("--singles", type=int, default=0, metavar="N", help="pairs of robots with one link")
     parser.add_argument("--g2o", type=Path, nargs="*", default=[], metavar="FILE", help="planar pose graphs")
     parser.add_argument("--trials", nargs="+", default=[], choices=list(SCENARIOS), metavar="SCENARIO")
     parser.add_argument("--runs", type=int, default=1, help="of each scenario (default 1)")
@@ -87,7 +97,7 @@ def main() -> None:
     parser.add_argument("--pairs", type=int, default=0, metavar="N", help="of nodes, of each kind")
     parser.add_argument("--drives", type=int, default=0, metavar="N", help="of each fault")
     arguments = parser.parse_args()
-    counts = ("fleets", "twins", "places", "loops", "pairs", "drives")
+    counts = ("fleets", "twins", "singles", "places", "loops", "pairs", "drives")
     if min(getattr(arguments, name) for name in counts) < 0 or arguments.runs < 1:
         parser.error("--runs must be at least 1, all other numbers at least 0")
     console = Console(stderr=True)
@@ -104,6 +114,10 @@ def main() -> None:
                 )
             if arguments.twins:
                 found["twins"] = by_rule(MERGE_RULES, lambda: twins(arguments.seed, arguments.twins))
+            if arguments.singles:
+                found["singles"] = by_rule(
+                    SINGLE_RULES, lambda: single_links(arguments.seed, arguments.singles)
+                )
             if graphs:
                 found["graphs"] = by_rule(MERGE_RULES, lambda: public_graphs(graphs, ROBOTS))
             if arguments.places:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +19,10 @@ SHARES = (50, 80, 90)
 """Of false links, per cent."""
 TWINS = FleetSettings(robots=2, nodes=40, true_links=8, most_alike=8)
 """Two robots with few links in a building in which another place may give as many."""
+SINGLE = FleetSettings(robots=2, nodes=40, true_links=1, most_alike=1)
+"""Two robots with one link."""
+STRENGTH = 15, 90
+"""Landmarks of links between views of one place from near and from far, and of as strong false ones."""
 GOOD = 1.1
 """An error over that of least squares with the true links alone that is as good."""
 
@@ -56,6 +61,25 @@ def twins(seed: int, count: int) -> dict[str, int]:
         right = sum(link.pair in fleet.true for link in merged.links)
         true, false = true + right, false + len(merged.links) - right
     return {"fleets": count, "joined_falsely": falsely, "false_links": false, "true_links": true}
+
+
+def single_links(seed: int, count: int) -> dict[str, int]:
+    """What comes of so many pairs of robots with one true link, and of as many with a false one beside it."""
+    out = {"fleets": count}
+    for name, share in (("alone", 0.0), ("contradicted", 0.5)):
+        rightly = falsely = 0
+        for run in range(count):
+            rng = np.random.default_rng([seed, run])
+            fleet = draw_fleet(share, rng, SINGLE)
+            links = [
+                replace(link, evidence={**link.evidence, "inliers": float(rng.integers(*STRENGTH))})
+                for link in fleet.links
+            ]
+            merged = merge_maps(fleet.maps, links)
+            rightly += any(link.pair in fleet.true for link in merged.links)
+            falsely += joined_falsely(merged, fleet)
+        out |= {f"joined_{name}": rightly, f"joined_falsely_{name}": falsely}
+    return out
 
 
 def public_graphs(graphs: dict[str, G2oGraph], robots: int) -> dict[str, Any]:

@@ -104,6 +104,10 @@ MERGE_RULES: Mapping[str, tuple[Switch, ...]] = {
     ),
 }
 """Rules on links, for fleets without images."""
+SINGLE_RULES: Mapping[str, tuple[Switch, ...]] = {
+    "one strong link": ((pairwise_consistency, "OVERWHELMING_INLIERS", math.inf),),
+}
+"""Exceptions from the rule that one link joins nothing."""
 TRIAL_RULES: Mapping[str, tuple[Switch, ...]] = {
     **MERGE_RULES,
     "mutual exclusion": (

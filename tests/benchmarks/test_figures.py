@@ -19,6 +19,7 @@ from benchmarks.rules.switches import (
     MERGE_RULES,
     PLACE_RULES,
     RECOGNITION_RULES,
+    SINGLE_RULES,
     TRIAL_RULES,
 )
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
@@ -79,7 +80,11 @@ def test_a_command_without_figures_is_said(tmp_path: Path, text: str, why: str) 
 def test_what_is_switched_off_is_there() -> None:
     """A rule that has gone or was renamed is named here too, and one that takes more than its replacement."""
     tables = TRIAL_RULES, LOOP_RULES, RECOGNITION_RULES, PLACE_RULES, FRAME_RULES, LIE_RULES
-    rules = {**MERGE_RULES, **{name: rule for table in tables for name, rule in table.items()}}
+    rules = {
+        **MERGE_RULES,
+        **SINGLE_RULES,
+        **{name: rule for table in tables for name, rule in table.items()},
+    }
     for name, switches in rules.items():
         for where, function, instead in switches:
             assert hasattr(where, function), name

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from benchmarks.rules.drives import mapped, recorded
+from benchmarks.rules.fleets import single_links
 from benchmarks.rules.frame_faults import FAULTS, Drive
 from benchmarks.rules.look_alikes import PAIRS, look_alikes
 from benchmarks.rules.own_loops import draw, own_loops
@@ -17,6 +18,7 @@ from benchmarks.rules.switches import (
     LOOP_RULES,
     PLACE_RULES,
     RECOGNITION_RULES,
+    SINGLE_RULES,
     TRIAL_RULES,
     Switch,
     by_rule,
@@ -49,6 +51,11 @@ def test_fleets_are_merged_and_answered_without_a_rule(rule: str, caplog: pytest
         view = View(first.landmarks.pixels, first.landmarks.codes, first.camera)
         assert Answers.of(merger, merged, merger.node).relocalizer.answer(view)
     assert "the merge fails" not in caplog.text
+
+
+def test_one_link_joins_two_maps_only_if_it_is_strong() -> None:
+    found = by_rule(SINGLE_RULES, lambda: single_links(seed=4, count=30))
+    assert found["one strong link"]["joined_alone"] < found[ALL]["joined_alone"] < found[ALL]["fleets"] == 30
 
 
 def test_own_loop_closures_are_drawn_as_they_are_called() -> None:
