@@ -20,13 +20,14 @@ READ_TESTS := $(BIN)/python -m pytest --collect-only --quiet > /dev/null 2>&1
 
 setup: $(STAMP)
 
+# Without its package for environments Debian's Python leaves one without pip, which is completed once that is there.
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "Mapweave needs Python 3.11 or newer; try: make PYTHON=python3.11 $(MAKECMDGOALS)"; exit 1; }
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip --version > /dev/null 2>&1 || $(PYTHON) -m venv $(VENV)
 	@echo "installing into $(VENV), 2 GB (a minute or two) ..."
 ifeq ($(EXTRA),dev)
-	@$(PIP) --only-binary :all: pybullet 2>/dev/null || \
+	@$(PIP) --only-binary :all: pybullet 2>$(VENV)/pip.log || grep -q "connection broken" $(VENV)/pip.log || \
 	  echo "there is no wheel of pybullet for $$($(BIN)/python -V) on $$(uname -m): compiling it takes ten minutes" \
 	  "or more; with python3.11 on x86-64 it takes seconds, and make EXTRA=test does without the simulator"
 endif

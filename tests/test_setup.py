@@ -1,0 +1,72 @@
+"""`make setup` where something is missing, with scripts in the place of Python and pip."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+MAKEFILE = Path(__file__).parents[1] / "Makefile"
+
+PYTHON = """#!/bin/sh
+# Makes environments; those without pip where there is a file `lacking`, as Debian's without its package.
+case "$2" in venv)
+  mkdir -p "$3/bin"
+  if test -e lacking; then what="No module named pip"; else what=""; fi
+  printf '#!/bin/sh\\nwhat="%s"\\n. ./environment\\n' "$what" > "$3/bin/python"
+  chmod +x "$3/bin/python"
+  test -z "$what"
+esac
+"""
+
+ENVIRONMENT = """
+if test -n "$what"; then echo "$what" >&2; exit 1; fi
+case "$*" in
+  *only-binary*) test -e offline && echo "WARNING: Retrying after connection broken" >&2; test -e wheel;;
+  *install*) if test -e offline; then exit 1; fi;;
+esac
+"""
+
+
+@pytest.fixture
+def checkout(tmp_path: Path) -> Path:
+    shutil.copy(MAKEFILE, tmp_path)
+    for name, text in (("python", PYTHON), ("environment", ENVIRONMENT)):
+        (tmp_path / name).write_text(text)
+        (tmp_path / name).chmod(0o755)
+    for name in ("pyproject.toml", "constraints.txt", "wheel"):
+        (tmp_path / name).touch()
+    return tmp_path
+
+
+def setup(checkout: Path) -> tuple[int, str]:
+    """Exit status and output."""
+    environment = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+    ran = subprocess.run(
+        ["make", "setup", f"PYTHON={checkout / 'python'}"],
+        cwd=checkout, env=environment, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    return ran.returncode, ran.stdout + ran.stderr
+
+
+def test_an_environment_that_was_left_without_pip_is_completed(checkout: Path) -> None:
+    """Debian's Python said which package to install. When that was there, make said: No module named pip."""
+    (checkout / "lacking").touch()
+    assert setup(checkout)[0] != 0
+    (checkout / "lacking").unlink()
+    status, said = setup(checkout)
+    assert status == 0, said
+
+
+def test_a_missing_network_is_not_taken_for_a_missing_wheel(checkout: Path) -> None:
+    (checkout / "wheel").unlink()
+    status, said = setup(checkout)
+    assert status == 0 and "there is no wheel of pybullet" in said, said
+    for path in checkout.glob(".venv/.installed*"):
+        path.unlink()
+    (checkout / "offline").touch()
+    status, said = setup(checkout)
+    assert status != 0 and "wheel" not in said, said
