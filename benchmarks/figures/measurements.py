@@ -22,10 +22,14 @@ MEASUREMENTS: dict[str, str] = {
     "kitti_three": "mapweave eval merge DATA/kitti03 --robots 3 --json",
     "rules_fleets": "python -m benchmarks.rules --fleets 30 --seed 721 --json",
     "rules_twins": "python -m benchmarks.rules --twins 100 --seed 752 --json",
+    "rules_singles": "python -m benchmarks.rules --singles 200 --seed 864 --json",
     "rules_graphs": "python -m benchmarks.rules --g2o DATA/posegraph/intel.g2o DATA/posegraph/manhattan.g2o "
     "--json",
     "rules_trials": "python -m benchmarks.rules --trials warehouse twin-corridor --runs 2 --seed 722 --json",
     "rules_places": "python -m benchmarks.rules --places 1000 --seed 708 --json",
+    "rules_loops": "python -m benchmarks.rules --loops 10 --seed 861 --json",
+    "rules_pairs": "python -m benchmarks.rules --pairs 400 --seed 863 --json",
+    "rules_drives": "python -m benchmarks.rules --drives 2 --seed 862 --json",
     "rules_lies": "python -m benchmarks.liar --rules --jobs 2 --seed 757 --ways 'node at 1e9 m' "
     "'edges of 1e5 m' 'covariance of zero' 'greatest covariance' 'contradicting clocks' 'many epochs' "
     "'shuffled maps' 'copied places' 'half copied landmarks' --json",

@@ -53,6 +53,15 @@ def _places(rule: str) -> tuple[str, str]:
     return words, "rules_places"
 
 
+def _wrong_places(rule: str) -> tuple[str, str]:
+    """Wrong answers to views of known places without a rule, and with all."""
+    words = (
+        f"known places that are answered with another one: {{places/{rule}/wrong_place:.2%}} instead "
+        "of {places/all rules/wrong_place:.2%}"
+    )
+    return words, "rules_places"
+
+
 def _lies(rule: str) -> tuple[str, str]:
     """The ways to lie that a rule contains, and those for which it names the robot."""
     words = (
@@ -62,6 +71,67 @@ def _lies(rule: str) -> tuple[str, str]:
     return words, "rules_lies"
 
 
+def _loops(rule: str, way: str, figure: str, of: str = "") -> tuple[str, str]:
+    """A figure of a robot's own loop closures without a rule, and with all, by the share of false ones.
+
+    Args:
+        rule: which.
+        way: whole or resumed.
+        figure: of the results, with its format.
+        of: likewise, what it is a share of; empty if of nothing.
+    """
+    without, whole = (
+        ", ".join(f"{{loops/{one}/{way}/{share}/{figure}}}" for share in (20, 50, 80))
+        for one in (rule, "all rules")
+    )
+    every = ", ".join(f"{{loops/all rules/{way}/{share}/{of}}}" for share in (20, 50, 80))
+    return f"{without} instead of {whole}{f' of {every}' if of else ''}", "rules_loops"
+
+
+def _own_loops(rule: str, *figures: tuple[str, str, str, str]) -> tuple[tuple[str, str], ...]:
+    """What comes of a robot's own loop closures, 20, 50 and 80 % of them false, without a rule.
+
+    Args:
+        rule: which.
+        figures: words before a figure, and the last three arguments of `_loops`.
+    """
+    rows = [(words, _loops(rule, way, figure, of)) for words, way, figure, of in figures]
+    return tuple((f"{words} {figure}", source) for words, (figure, source) in rows)
+
+
+def _pairs(rule: str, kind: str) -> tuple[str, str]:
+    """Links between nodes that are compared without a rule, and with all."""
+    found, whole = (
+        f"{{pairs/{way}/{kind}/wrong}} of {{pairs/{way}/{kind}/links}}" for way in (rule, "all rules")
+    )
+    return (
+        f"{kind}, {{pairs/{rule}/{kind}/pairs}} pairs: wrong links {found} instead of {whole}",
+        "rules_pairs",
+    )
+
+
+def _drives(rule: str, fault: str, *figures: str) -> tuple[str, str]:
+    """What comes of drives with a fault without a rule, and with all."""
+    words = {
+        "wrong": "wrong edges {WAY/wrong_edges} of {WAY/edges}",
+        "used": "images used {WAY/used_share:.0%}",
+        "maps": "maps begun {WAY/maps}",
+        "error": "error {WAY/error_m:.3f} m",
+    }
+    shown = ", ".join(words[figure] for figure in figures)
+    without, whole = (shown.replace("WAY", f"drives/{fault}/{way}") for way in (rule, "all rules"))
+    return f"{fault}: {without} instead of {whole}", "rules_drives"
+
+
+OF_RECOGNITION = {
+    "share of matches": ("poor camera",),
+    "image cells": ("picture",),
+    "landmarks in view": ("picture",),
+    "depths": ("larger copy",),
+    "mirrored pose": ("poor camera", "flat thing"),
+    "certain position": ("picture",),
+}
+"""What shows each rule of recognition."""
 AGAINST_LIES = {
     "copies": "mapserver/merging/copies.py",
     "refused changes": "mapserver/merging/implausible_maps.py",
@@ -105,6 +175,20 @@ RULES = (
         ),
     ),
     Rule(
+        "one strong link joins",
+        "merge/outlier_rejection/pairwise_consistency.py",
+        (
+            (
+                "pairs of robots with one true link that are joined: {singles/one strong link/joined_alone} "
+                "instead of {singles/all rules/joined_alone} of {singles/all rules/fleets}; its price, where "
+                "a false link is as strong, joined falsely: "
+                "{singles/one strong link/joined_falsely_contradicted} instead of "
+                "{singles/all rules/joined_falsely_contradicted}",
+                "rules_singles",
+            ),
+        ),
+    ),
+    Rule(
         "refused links heard again",
         "merge/outlier_rejection/agglomerative_joining.py",
         (
@@ -144,13 +228,7 @@ RULES = (
     Rule(
         "lonely recognition",
         "mapserver/relocalization/place_hypotheses.py",
-        (
-            (
-                "views of known places that are answered with another one: "
-                "{places/lonely recognition/wrong_place:.2%} instead of {places/all rules/wrong_place:.2%}",
-                "rules_places",
-            ),
-        ),
+        (_wrong_places("lonely recognition"),),
     ),
     Rule(
         "wrong geometry",
@@ -166,4 +244,70 @@ RULES = (
         ),
     ),
     *(Rule(name, file, (_lies(name),)) for name, file in AGAINST_LIES.items()),
+    Rule(
+        "own loop closures agree with the way",
+        "merge/outlier_rejection/pairwise_consistency.py",
+        _own_loops(
+            "own way",
+            (
+                "one robot, 20, 50, 80 % of its own loop closures false: true ones kept",
+                "whole",
+                "true_loops",
+                "of_true",
+            ),
+            ("resumed three times: false ones kept", "resumed", "false_loops", ""),
+        ),
+    ),
+    Rule(
+        "own loop closures agree with each other",
+        "merge/outlier_rejection/pairwise_consistency.py",
+        _own_loops(
+            "own loops that agree",
+            ("false ones kept", "whole", "false_loops", ""),
+            ("error, m", "whole", "error_m_median:.2f", ""),
+        ),
+    ),
+    Rule(
+        "closing links",
+        "merge/outlier_rejection/closing_links.py",
+        _own_loops("closing links", ("resumed three times: false ones kept", "resumed", "false_loops", "")),
+    ),
+    Rule(
+        "drives that contradict loop closures",
+        "merge/outlier_rejection/loop_closures.py",
+        _own_loops("drives against loops", ("true ones kept", "whole", "true_loops", "of_true")),
+    ),
+    *(
+        Rule(name, "registration/recognition.py", tuple(_pairs(name, kind) for kind in kinds))
+        for name, kinds in OF_RECOGNITION.items()
+    ),
+    Rule("certain links", "merge/pose_graph/verification.py", (_pairs("certain links", "poor camera"),)),
+    Rule(
+        "repeated images",
+        "agent/mapping/image_acceptance.py",
+        (_drives("repeated images", "images that come twice", "error"),),
+    ),
+    Rule(
+        "strange images",
+        "agent/mapping/kidnap_detection.py",
+        (
+            _drives("strange images", "other things", "wrong", "maps", "error"),
+            _drives("strange images", "carried", "wrong"),
+        ),
+    ),
+    Rule(
+        "images that show nothing",
+        "agent/mapping/kidnap_detection.py",
+        (_drives("images that show nothing", "black images", "used", "maps", "error"),),
+    ),
+    Rule(
+        "images in another light",
+        "agent/mapping/image_acceptance.py",
+        (_drives("images in another light", "lamps", "used", "maps"),),
+    ),
+    Rule(
+        "odometry against images",
+        "agent/mapping/odometry_consistency.py",
+        (_drives("odometry against images", "spinning wheels", "wrong", "maps"),),
+    ),
 )
