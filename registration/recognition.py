@@ -41,10 +41,8 @@ class RecognitionSettings:
         least_cells: cells of the 6 x 4 grid with an inlier, in either image.
         least_seen: of the landmarks that should be in the image by the pose found, on the side where it
             is more. A poster that hangs in two rooms explains few of what else should be there.
-        least_evidence: how much likelier the inliers are than wrong matches, nats.
         most_position_share: largest standard deviation of the position as a share of the median depth of
             the inliers.
-        most_heading_sigma: rad.
         most_rival: what the pose mirrored in what is seen may explain, as a share of what the best does:
             a flat thing from afar looks almost the same from two sides.
     """
@@ -54,9 +52,7 @@ class RecognitionSettings:
     least_inliers: int = 10
     least_cells: int = 5
     least_seen: float = 0.12
-    least_evidence: float = 40.0
     most_position_share: float = 0.06
-    most_heading_sigma: float = math.radians(4.0)
     most_rival: float = 0.8
 
 
@@ -278,8 +274,6 @@ LEAST_SHARE = 0.35
 LEAST_DEPTHS = 0.5
 """Share of the landmarks that fit by their pixels and have a depth on both sides which must agree in depth
 too."""
-MOST_MEAN_SQUARE = 3.0
-"""Largest mean squared normalised residual; 1 is expected."""
 
 
 def _objection(evidence: dict[str, float], s: RecognitionSettings) -> str:
@@ -296,14 +290,8 @@ def _objection(evidence: dict[str, float], s: RecognitionSettings) -> str:
         return f"only {e['seen']:.0%} of the landmarks that should be in the image are"
     if e["depths"] < LEAST_DEPTHS:
         return f"only {e['depths']:.0%} of the landmarks that fit lie at the same depth"
-    if e["log_evidence"] < s.least_evidence:
-        return f"the {inliers} landmarks that agree are hardly better than chance"
     if e["rival"] > s.most_rival:
         return f"a pose on the other side of what is seen explains {e['rival']:.0%} as much"
-    if e["mean_square"] > MOST_MEAN_SQUARE:
-        return f"the residuals are {math.sqrt(e['mean_square']):.1f} times what they should be"
     if e["sigma_xy"] > s.most_position_share * e["depth"]:
         return f"the position is uncertain by {e['sigma_xy']:.2f} m at landmarks {e['depth']:.1f} m away"
-    if e["sigma_heading"] > s.most_heading_sigma:
-        return f"the heading is uncertain by {math.degrees(e['sigma_heading']):.1f} degrees"
     return ""

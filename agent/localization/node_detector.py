@@ -39,7 +39,7 @@ class Expected(NamedTuple):
     tracked: int = 0
 
 
-EXPECTED = RecognitionSettings(least_inliers=7, least_cells=2, least_seen=0.05, least_evidence=20.0)
+EXPECTED = RecognitionSettings(least_inliers=7, least_cells=2, least_seen=0.05)
 """Less is asked than of a lost robot, because the pose must also be the expected one."""
 PLAUSIBLE = 0.3
 """A recognition this far from where the robot believes to be is not believed, m."""

@@ -7,7 +7,6 @@ best landmarks, with depths.
 
 from __future__ import annotations
 
-import math
 from collections import OrderedDict
 from dataclasses import replace
 from typing import Any
@@ -25,9 +24,7 @@ from mapweave.registration.recognition import Recognition, RecognitionSettings, 
 REMEMBERED = 20_000
 """Pairs of nodes whose verdict is kept, the last ones asked about."""
 
-VAGUE: dict[str, Any] = {
-    "least_cells": 2, "most_position_share": 0.5, "most_heading_sigma": math.radians(20.0), "most_rival": 1.0,
-}  # fmt: skip
+VAGUE: dict[str, Any] = {"least_cells": 2, "most_position_share": 0.5, "most_rival": 1.0}
 """Looser thresholds for an alias: a poster seen from near fills few cells and gives an imprecise pose, and
 its copy in the next room is an alias all the same."""
 

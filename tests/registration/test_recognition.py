@@ -171,10 +171,7 @@ def test_depths_that_do_not_agree_are_refused() -> None:
         ({"least_inliers": 200}, "are needed"),
         ({"least_cells": 24}, "image cells"),
         ({"least_seen": 1.01}, "should be in the image"),
-        ({"least_evidence": 1e6}, "chance"),
         ({"most_position_share": 1e-6}, "position is uncertain"),
-        ({"most_heading_sigma": 1e-9}, "heading is uncertain"),
-        ({"MOST_MEAN_SQUARE": 0.01}, "residuals"),
         ({"LEAST_SHARE": 1.01}, "of the matches agree"),
     ],
 )
