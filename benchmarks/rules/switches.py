@@ -33,9 +33,7 @@ from mapweave.merge.outlier_rejection import (
 )
 from mapweave.merge.outlier_rejection.pairwise_consistency import Sorted
 from mapweave.merge.pose_graph import verification
-from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
-from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration import recognition
 from mapweave.registration.recognition import RecognitionSettings
 
@@ -55,9 +53,7 @@ def _nothing(*_: object, **__: object) -> list[Any]:
     return []
 
 
-def _all_kept(
-    links: Sequence[Link], first: Fragment, second: Fragment, s: ConsistencySettings | None = None
-) -> Sorted:
+def _all_kept(links: Sequence[Link], *_: object) -> Sorted:
     weight = float(sum(link.weight for link in links))
     return Sorted(tuple(links), (), weight=weight, sets=(tuple(links), ()))
 
