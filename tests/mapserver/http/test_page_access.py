@@ -147,6 +147,16 @@ def test_a_finger_that_stays_after_two_moves_the_map_on(phone: Browser) -> None:
     assert "Select a node" in Person(phone).text("selected")
 
 
+def test_a_tap_chooses_a_node(phone: Browser) -> None:
+    """So close that the nodes, which stand centimetres apart, are apart on the screen."""
+    u, v = phone.run(
+        "const m = mapweave.model, row = m.rowOf('r0.1.1'), v = mapweave.viewport;"
+        "v.show(m.x[row], m.y[row], 2000); mapweave.painter.ask(); return v.toScreen(m.x[row], m.y[row])"
+    )
+    touch(phone, {0: (u + 3.0, v - 2.0)})
+    eventually(lambda: "Node r0.1.1" in Person(phone).text("selected"))
+
+
 def test_the_focus_goes_where_a_choice_leads(page: Browser) -> None:
     """It was lost with what was pressed: the next key began at the top of the page."""
     person = Person(page)
