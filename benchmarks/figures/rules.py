@@ -236,11 +236,6 @@ RULES = (
         (_places("rivals"), _wrong_places("rivals")),
     ),
     Rule(
-        "rival places by what is seen",
-        "mapserver/relocalization/verdict.py",
-        (_places("rivals by what is seen"), _wrong_places("rivals by what is seen")),
-    ),
-    Rule(
         "one weak node",
         "mapserver/relocalization/verdict.py",
         (_places("one weak node"), _wrong_places("one weak node")),

@@ -138,7 +138,6 @@ PLACE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "lonely recognition": ((view_registration, "is_lonely", lambda *_: False),),
     "one weak node": ((verdict, "ALONE", 0),),
     "rivals": ((HypothesisSelector, "_rivals", _first),),
-    "rivals by what is seen": ((verdict, "SLIGHT", math.inf),),
 }
 """Rules on answers to lost robots."""
 FRAME_RULES: Mapping[str, tuple[Switch, ...]] = {

@@ -11,14 +11,7 @@ import numpy as np
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
-from mapweave.mapserver.relocalization.place_hypotheses import (
-    ALONE,
-    SLIGHT,
-    NodeMatch,
-    PlaceHypothesis,
-    fuse,
-    supported,
-)
+from mapweave.mapserver.relocalization.place_hypotheses import ALONE, NodeMatch, PlaceHypothesis, fuse
 from mapweave.mapserver.relocalization.view_registration import Registration
 from mapweave.mapserver.retrieval.ranking import IncompleteSearch
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -30,8 +23,7 @@ FLOOR_XY = 0.05
 FLOOR_HEADING = 0.03
 """Heading error between two estimates that no covariance tells of, rad."""
 COMPARABLE = 0.6
-"""A second place is a rival if it explains so much of what the best one explains, or if so much of what it
-should see is seen, as compared with the best one."""
+"""A second place is a rival if it explains so much of what the best one explains."""
 
 
 class Outcome(Enum):
@@ -172,15 +164,7 @@ class HypothesisSelector:
 
     def _rivals(self, places: Sequence[PlaceHypothesis]) -> list[PlaceHypothesis]:
         """Places that explain the view about as well as the first, which is among them."""
-        supports = supported(places)
-        return [
-            place for place, support in zip(places, supports, strict=True)
-            if len(place.features) >= COMPARABLE * len(places[0].features)
-            or (
-                len(place.features) >= SLIGHT * len(places[0].features)
-                and support.seen >= COMPARABLE * supports[0].seen
-            )
-        ]  # fmt: skip
+        return [place for place in places if len(place.features) >= COMPARABLE * len(places[0].features)]
 
 
 def _agree(first: PoseGaussian, second: PoseGaussian) -> bool:
