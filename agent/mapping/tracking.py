@@ -21,6 +21,7 @@ from mapweave.agent.mapping.view import PendingKeyframe, RawImage, associate, ev
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.occluded_tracks import OccludedTracks
+from mapweave.agent.vision.rejection_counter import RejectionCounter
 from mapweave.agent.vision.template import HALF_PX, Templates
 from mapweave.agent.vision.track_quality import TrackQuality
 from mapweave.agent.vision.tracker import BORDER_PX, Tracker
@@ -108,6 +109,9 @@ REFILL_SHARE = 0.5
 """With a smaller share of the landmarks left than this, further tracks are taken into the filter: those that
 were chosen first may all be on the side that the robot turns away from. Without, 1.2 % instead of 0.06 % of
 the ticks trust odometry although tracks are there (docs/decisions/tracking.md)."""
+MOST_REFUSALS = 3
+"""A track that the filter refuses this often in a row is given up: its place goes to one that fits. On KITTI 03 maps
+answer 73 % instead of 69 % of the images (docs/decisions/tracking.md)."""
 
 
 class Tracking:
@@ -131,6 +135,7 @@ class Tracking:
         self._filter = MappingFilter(d.camera, d.axle, d.wheel_noise, settings.filter, d.side_slip)
         self.acceptance = ImageAcceptance(KidnapDetector(lens, description.camera))
         self._dispute = OdometryConsistency()
+        self._rejections = RejectionCounter(MOST_REFUSALS)
         self._correction = NO_CORRECTION
         self._expected_depth = 1.0
         self._next_track = self._first_new = 1
@@ -237,6 +242,7 @@ class Tracking:
         self._first_new, self._next_track = self._next_track, self._next_track + len(ids)
         view.tracks[new] = ids
         self._tracker.add(ids, view.features.raw[new])
+        self._rejections.forget()
         self._correction = self._correction._replace(unused=None if len(ids) else 0)
 
     def fill(self, expected_depth: float) -> None:
@@ -302,10 +308,13 @@ class Tracking:
         return HeldTracks(self._tracker.ids[held], self._tracker.pixels[held])
 
     def _correct(self, held: HeldTracks) -> Correction:
-        """Correct the filter, if the tracks are enough for that."""
+        """Correct the filter, if the tracks are enough for that; those that it refuses often are given up."""
         if not self._trusted(held.pixels):
             return Correction(NO_CORRECTION.misses_px, len(held.ids))
         update = self._filter.update(held.ids, held.pixels)
+        refused = self._rejections.judge(held.ids, update.accepted)
+        self._filter.remove(refused)
+        self._tracker.keep(~among(self._tracker.ids, refused))
         return Correction(update.innovations_px[update.accepted], None)
 
     def _refill(self) -> None:
