@@ -19,7 +19,7 @@ from mapweave.vision.sift import Features
 
 LEAST = 4
 """Landmarks that must be tracked (paper, section 6: n >= 4)."""
-STRIKES = 3
+MOST_REFUSALS = 3
 """A track that the filter rejects this often in a row is dropped."""
 
 
@@ -44,7 +44,7 @@ class NodeLocalizer:
         self.node = node
         self._settings = settings or AgentSettings()
         self._description = description
-        self._tracks = NodeTracks(lens, image, features, recognition.pairs, STRIKES)
+        self._tracks = NodeTracks(lens, image, features, recognition.pairs, MOST_REFUSALS)
         self._depths, self._depth_sigmas = np.full((2, len(node.landmarks)), np.nan)
         self._teaches = True
         self._filter = self._filter_at(recognition.node_from_robot, self._tracks.ids)

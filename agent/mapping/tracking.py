@@ -110,8 +110,8 @@ REFILL_SHARE = 0.5
 were chosen first may all be on the side that the robot turns away from. Without, 1.2 % instead of 0.06 % of
 the ticks trust odometry although tracks are there (docs/decisions/tracking.md)."""
 MOST_REFUSALS = 3
-"""A track that the filter refuses this often in a row is given up: its place goes to one that fits. On KITTI 03 maps
-answer 73 % instead of 69 % of the images (docs/decisions/tracking.md)."""
+"""A track that the filter refuses this often in a row is given up: its place goes to one that fits. Maps of
+KITTI 03 answer 73 instead of 69 % of the images (docs/decisions/tracking.md)."""
 
 
 class Tracking:

@@ -22,7 +22,7 @@ class NodeTracks:
         image: NDArray[np.uint8],
         features: Features,
         pairs: NDArray[np.integer],
-        strikes: int,
+        most_refusals: int,
     ) -> None:
         """Begin where a recognition has found the landmarks.
 
@@ -31,11 +31,11 @@ class NodeTracks:
             image: (H, W) grey.
             features: of the image.
             pairs: (N, 2) indices of landmarks, and of the features that show them.
-            strikes: a track that is refused this often in a row is given up.
+            most_refusals: a track that is refused this often in a row is given up.
         """
         self._tracker = Tracker(lens)
         self._tracker.track(image)
-        self._strikes = RejectionCounter(strikes)
+        self._rejections = RejectionCounter(most_refusals)
         self.renew(features, pairs)
 
     @property
@@ -52,7 +52,7 @@ class NodeTracks:
         """Continue from a detection of the landmarks in the last image; rejections are counted from zero."""
         self._tracker.clear()
         self._tracker.add(pairs[:, 0].astype(np.int64), features.raw[pairs[:, 1]])
-        self._strikes.forget()
+        self._rejections.forget()
 
     def follow(self, image: NDArray[np.uint8], expected: Array) -> None:
         """Into the next image, (H, W) grey; expected: (N, 2) px in the ideal image, NaN where unknown."""
@@ -60,6 +60,6 @@ class NodeTracks:
 
     def judge(self, accepted: NDArray[np.bool_]) -> NDArray[np.int64]:
         """Take in which tracks the filter accepted, (N,); returns the landmarks that are dropped."""
-        given_up = self._strikes.judge(self.ids, accepted)
+        given_up = self._rejections.judge(self.ids, accepted)
         self._tracker.keep(~among(self.ids, given_up))
         return given_up

@@ -36,7 +36,7 @@ def tracks(walls, description, features, pairs) -> NodeTracks:
         walls.render(HERE),
         features,
         pairs,
-        strikes=2,
+        most_refusals=2,
     )
 
 
