@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, requires, version
 from importlib.util import find_spec
 
 from mapweave.doctor.finding import Finding, good, skipped, wrong
-from mapweave.extras import MODULES, pip
+from mapweave.extras import MODULES, how_to_install, pip
 
 IMPORTED_AS = {"eclipse-zenoh": "zenoh", "opencv-python-headless": "cv2", "pyserial": "serial"}
 """Modules whose names differ from those of their packages."""
@@ -39,7 +39,7 @@ def examine() -> Iterator[Finding]:
             yield skipped(
                 f"extra {extra}",
                 f"not installed ({', '.join(lacking)}); a robot does without",
-                f"pip install 'mapweave[{extra}]'",
+                how_to_install(extra),
             )
         else:
             yield good(f"extra {extra}", "installed")

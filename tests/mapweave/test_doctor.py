@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import shlex
 import socket
 import subprocess
 import sys
@@ -22,7 +23,7 @@ from mapweave.agent.drivers.serial_port import SerialPort
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.cli import main
 from mapweave.commands import doctor as doctor_command
-from mapweave.doctor import camera, camera_model, driver, machine
+from mapweave.doctor import camera, camera_model, driver, libraries, machine
 from mapweave.doctor.finding import Finding, FindingLevel
 from mapweave.doctor.motion import MotionComparison
 from mapweave.exit_status import NO
@@ -76,6 +77,14 @@ def test_it_runs_without_libraries_and_names_them(missing: list[str], tmp_path: 
     assert (
         all(one["subject"].removeprefix("library ") in plain for one in wrong) and "first: library" in plain
     )
+
+
+def test_an_extra_that_is_not_installed_comes_with_the_pip_of_this_environment(monkeypatch) -> None:
+    """Where the environment is not activated a bare `pip` is another one, or none."""
+    monkeypatch.setenv("PATH", "")
+    monkeypatch.setattr(libraries, "find_spec", lambda module: None)
+    advice = {one.subject: one.advice for one in libraries.examine()}
+    assert advice["extra eval"] == f"{shlex.quote(sys.executable)} -m pip install 'mapweave[eval]'"
 
 
 # The computer
