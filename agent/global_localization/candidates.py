@@ -88,7 +88,7 @@ class OwnMapSource:
         self._rng = rng
 
     def candidates(self, view: View, image: NDArray[np.uint8], features: Features) -> RankedPlaces:
-        """Nodes that a view shows, of an image with these features."""
+        """Nodes that a view shows, of an image with these features; the most certain pose first."""
         if self.elsewhere:
             return RankedPlaces((), "", "the own map is of another floor")
         recalled = recognise_places(self.map, view, self._rng)
@@ -96,6 +96,8 @@ class OwnMapSource:
             return RankedPlaces((), "", f"none of {len(self.map.nodes)} nodes is recognised")
         alike = aliased_places(recalled, RIVAL, APART)
         ambiguous = "" if alike is None else f"nodes {alike[0].id} and {alike[1].id} look the same"
+        # A node from afar may show as many landmarks as the one at which the robot stands, which says more.
+        recalled.sort(key=lambda pair: float(np.linalg.det(pair[1].node_from_robot.covariance)))
         places = tuple(
             Candidate(
                 node.id, recognition.node_from_robot, RecognizedNode(node, image, features, recognition)

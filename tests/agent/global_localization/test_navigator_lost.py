@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave.agent.global_localization import candidates
 from mapweave.agent.global_localization.candidates import FleetMapSource, OwnMapSource
 from mapweave.agent.global_localization.global_localization import GlobalLocalization
 from mapweave.agent.global_localization.search_policy import TO_NAVIGATE
@@ -20,6 +21,8 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer
+from mapweave.registration.recognition import Recognition
+from mapweave.vision.sift import Features
 from synthetic.world import take_map
 from tests.agent.scripted_fleet import (
     BODY,
@@ -118,6 +121,26 @@ def test_two_similar_own_nodes_are_ambiguous(home):
     trial.run(2.0)
     assert not trial.navigator.tally.relocalizations and trial.navigator.fix is None
     assert any(isinstance(question, WhereAmI) for question in trial.asked)
+
+
+@pytest.mark.parametrize("order", [1, -1])
+def test_the_most_certain_of_some_nodes_comes_first(own_map, monkeypatch, order):
+    """A node from afar shows as many landmarks as the one at which the robot stands."""
+    near, far, *_ = own_map.nodes.values()
+    recalled = [
+        (
+            node,
+            Recognition(
+                PoseGaussian.from_sigmas(Pose2(), xy, heading), np.zeros((inliers, 2), np.int64), 40, 40, {}
+            ),
+        )
+        for node, inliers, xy, heading in ((near, 34, 0.006, 0.005), (far, 36, 0.012, 0.006))[::order]
+    ]
+    monkeypatch.setattr(candidates, "recognise_places", lambda *_: recalled)
+    source = OwnMapSource(own_map, np.random.default_rng(0))
+    nothing = Features(np.zeros((0, 2)), np.zeros((0, 2)), np.zeros((0, 32), np.uint8), np.zeros(0))
+    first, second = source.candidates(nothing.view(BODY.camera), IMAGE, nothing).places
+    assert (first.node, second.node) == (near.id, far.id)
 
 
 def test_a_place_with_a_twin_in_another_robots_map_is_not_accepted(home, own_map):
