@@ -155,8 +155,8 @@ def pitched(pixels: np.ndarray, pitch: float) -> np.ndarray:
 
 
 # The same draws each time: the bound does not hold for all. Of 60 seeds one is 0.14 sigmas off, and seed
-# 5727 with a level camera 0.35; more steps change nothing, and no sighting there weighs less than 0.97. Why is
-# not known.
+# 5727 with a level camera 0.35; more steps change nothing, and no sighting there weighs less than 0.97. Why
+# is not known.
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(st.integers(0, 10**6), st.floats(-0.03, 0.03))
 def test_pitch_against_scipy_with_points_and_pitch_as_variables(seed: int, pitch: float) -> None:
