@@ -319,7 +319,11 @@ def determined(information: Matrix) -> bool:
 
 @for_each
 def _move_point(n: Index, stack: Stack, linear: Linear, step: Vector, out: Matrix) -> None:
-    """Put point n where it fits best after a step of the pose, within its uncertainty; outliers back."""
+    """Put point n where it fits best after a step of the pose, within its uncertainty.
+
+    An outlier's too: whether it is one depends on where it is linearised. Put back, it would be an inlier
+    where it was given and none where it fits best, in turns.
+    """
     white, factor, p = linear.white, linear.factor, stack.covariances
     # The residual that is left, times the inverse of its covariance.
     left0 = white[n, 0, 0] - white[n, 0, 1] * step[0] - white[n, 0, 2] * step[1] - white[n, 0, 3] * step[2]
@@ -335,9 +339,8 @@ def _move_point(n: Index, stack: Stack, linear: Linear, step: Vector, out: Matri
     left, z = linear.by_point[n, 1] * u, linear.by_point[n, 3] * v
     x = linear.axes[n, 0] * forward - linear.axes[n, 1] * left
     y = linear.axes[n, 1] * forward + linear.axes[n, 0] * left
-    inlier = linear.inliers[n]
     for k in range(3):
-        out[n, k] = stack.points[n, k] + inlier * (p[n, k, 0] * x + p[n, k, 1] * y + p[n, k, 2] * z)
+        out[n, k] = stack.points[n, k] + p[n, k, 0] * x + p[n, k, 1] * y + p[n, k, 2] * z
 
 
 @compiled

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import scipy.optimize
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.camera import Camera
@@ -154,10 +154,11 @@ def pitched(pixels: np.ndarray, pitch: float) -> np.ndarray:
     return levelled(pixels, np.full(len(pixels), -pitch))
 
 
-# The same draws each time: the bound does not hold for all. Of 60 seeds one is 0.14 sigmas off, and seed
-# 5727 with a level camera 0.35; more steps change nothing, and no sighting there weighs less than 0.97. Why
-# is not known.
-@settings(max_examples=12, deadline=None, derandomize=True)
+# One sighting of these is inside its gate where its point was given, and outside where that fits best, or the
+# other way around.
+@example(5727, 0.0)
+@example(18, 0.0)
+@settings(max_examples=12, deadline=None)
 @given(st.integers(0, 10**6), st.floats(-0.03, 0.03))
 def test_pitch_against_scipy_with_points_and_pitch_as_variables(seed: int, pitch: float) -> None:
     """Pose, pitch and covariance are those of a full least squares with the pitch's prior."""
