@@ -26,11 +26,8 @@ from mapweave.processes.mcap_log import FREE, OCCUPIED, McapLog, _floor
 from mapweave.processes.tick_log import ellipsoids
 from mapweave.storage.map_file import read_map_file
 from mapweave.wire.ros2.messages import make
-from tests.agent.conftest import PhotoWalls
 from tests.mapweave.command_line import complaint
-
-STEP, COUNT = 0.02, 60
-CAMERA = "width = 320\nheight = 240\nfx = 277\nfy = 277\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
+from tests.mapweave.wall_drive import COUNT, STEP, wall_drive
 
 
 def read(folder: Path) -> dict[str, list[tuple[int, Any]]]:
@@ -46,15 +43,7 @@ def read(folder: Path) -> dict[str, list[tuple[int, Any]]]:
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recorded: forward before two walls."""
-    walls, folder = PhotoWalls(), tmp_path_factory.mktemp("drive") / "walk"
-    (folder / "images").mkdir(parents=True)
-    (folder / "camera.toml").write_text(CAMERA)
-    for k in range(COUNT):
-        cv2.imwrite(str(folder / "images" / f"{k}.png"), walls.render(Pose2(STEP * k)))
-    odometry = "".join(f"{STEP if k else 0},0\n" for k in range(COUNT))
-    (folder / "odometry.csv").write_text(f"forward_m,turn_rad\n{odometry}")
-    return folder
+    return wall_drive(tmp_path_factory.mktemp("drive") / "walk")
 
 
 @pytest.mark.slow

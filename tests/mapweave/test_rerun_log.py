@@ -34,15 +34,13 @@ from mapweave.vision.lens import Lens
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.agent.localization.test_node_localizer import located
 from tests.mapweave.command_line import complaint
+from tests.mapweave.wall_drive import COUNT, STEP, wall_drive
 from tests.simulator import needs_simulator
 from tests.waiting import free_port
 
 # Each process that collects tests would wait for it, so it is imported where it is used.
 pytestmark = pytest.mark.skipif(find_spec("rerun") is None, reason='needs the extra "rerun"')
 
-STEP = 0.02
-COUNT = 60
-CAMERA = "width = 320\nheight = 240\nfx = 277\nfy = 277\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
 Rows = dict[str, list[tuple[int, Any]]]
 
 
@@ -68,15 +66,7 @@ def rows_of(path: Path) -> Rows:
 
 @pytest.fixture(scope="module")
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Recorded: forward before two walls."""
-    walls, folder = PhotoWalls(), tmp_path_factory.mktemp("drive") / "walk"
-    (folder / "images").mkdir(parents=True)
-    (folder / "camera.toml").write_text(CAMERA)
-    for k in range(COUNT):
-        cv2.imwrite(str(folder / "images" / f"{k}.png"), walls.render(Pose2(STEP * k)))
-    odometry = "".join(f"{STEP if k else 0},0\n" for k in range(COUNT))
-    (folder / "odometry.csv").write_text(f"forward_m,turn_rad\n{odometry}")
-    return folder
+    return wall_drive(tmp_path_factory.mktemp("drive") / "walk")
 
 
 @pytest.mark.slow
