@@ -321,10 +321,10 @@ def determined(information: Matrix) -> bool:
 def _move_point(n: Index, stack: Stack, linear: Linear, step: Vector, out: Matrix) -> None:
     """Put point n where it fits best after a step of the pose, within its uncertainty; outliers back.
 
-    A sighting may then be an inlier where its point was given and none where that fits best, in turns: seven
-    of 425 drawn problems are 0.14 to 0.63 sigmas from the optimum. Where outliers' points move as well, none is
-    more than 0.03, but of 400 pairs of nodes by poor cameras 45 links are wrong instead of 36, and no more are
-    right (`python -m benchmarks.rules --pairs 400 --seed 871`).
+    A sighting may then be an inlier where its point was given and none where that fits best, in turns:
+    seven of 425 drawn problems are 0.14 to 0.63 sigmas from the optimum. Where outliers' points move as well,
+    none is more than 0.03, but of 400 pairs of nodes by poor cameras 45 links are wrong instead of 36, and no
+    more are right (`python -m benchmarks.rules --pairs 400 --seed 871`).
     """
     white, factor, p = linear.white, linear.factor, stack.covariances
     # The residual that is left, times the inverse of its covariance.
