@@ -87,6 +87,9 @@ def _add_run(kinds: Any) -> None:
         "--rerun", action="store_true",
         help="write what each robot senses and estimates for the Rerun viewer: rerun/ROBOT.1.rrd in --out",
     )  # fmt: skip
+    parser.add_argument(
+        "--mcap-log", action="store_true", help="the same for Foxglove and rviz: mcap/ROBOT.1/ in --out"
+    )
     _add_fleet(parser)
     parser.set_defaults(run=run_one)
 
@@ -164,6 +167,7 @@ def run_one(arguments: argparse.Namespace) -> int:
     options = TrialOptions(
         seed, out, not arguments.one_process, settings.agent, arguments.settings,
         film_every=0.0 if arguments.no_film else 1.0, view=arguments.view, rerun=arguments.rerun,
+        mcap_log=arguments.mcap_log,
     )  # fmt: skip
     trial = run_trial(scenario, options)
     if arguments.json:

@@ -29,7 +29,6 @@ from mapweave.wire.zenoh_bus import ZenohBus
 
 if TYPE_CHECKING:
     from mapweave.processes.agent_metrics import AgentMetrics
-    from mapweave.processes.rerun_log import RerunLog
     from mapweave.processes.tick_log import TickLog
 
 SILENCE = 2.0
@@ -59,7 +58,7 @@ def run_agent(
     show, manager = AgentProgress(console, options.name, options.total), ServiceManager()
     describe = partial(_describe, robot, say, options.name)
     publisher = None if options.ros2 is None else Ros2Publisher(options.ros2, options.name)
-    logs = _tick_logs(options)
+    logs = tick_logs(options)
     metrics = None if options.metrics is None else _metrics(options.name)
 
     def stepped(observation: Observation, step: TickResult) -> None:
@@ -105,20 +104,6 @@ def run_agent(
             raise InvalidFile(f"{options.name}: {lost}: {status.failure}")
 
 
-def rerun_log(target: str, robot: str) -> RerunLog:
-    """A log for the Rerun viewer; see RerunLog.
-
-    Raises:
-        MissingExtra: rerun-sdk is not installed.
-        SettingsError: the target cannot be one.
-    """
-    need("rerun")
-    # It takes a second to import, and is an extra: so it is imported here.
-    from mapweave.processes.rerun_log import RerunLog
-
-    return RerunLog(target, robot)
-
-
 def _metrics(robot: str) -> AgentMetrics:
     """Metrics of an agent; the library is an extra, so it is imported here."""
     from mapweave.processes.agent_metrics import AgentMetrics
@@ -126,11 +111,20 @@ def _metrics(robot: str) -> AgentMetrics:
     return AgentMetrics(robot)
 
 
-def _tick_logs(options: AgentOptions) -> list[TickLog]:
-    """The logs that the options ask for."""
+def tick_logs(options: AgentOptions) -> list[TickLog]:
+    """The logs that the options ask for.
+
+    Raises:
+        MissingExtra: one needs an extra that is not installed.
+        SettingsError: one cannot be where it is asked for.
+    """
     logs: list[TickLog] = []
     if options.rerun is not None:
-        logs.append(rerun_log(options.rerun, options.name))
+        need("rerun")
+        # It takes a second to import, and is an extra: so it is imported here.
+        from mapweave.processes.rerun_log import RerunLog
+
+        logs.append(RerunLog(options.rerun, options.name))
     if options.mcap_log is not None:
         from mapweave.processes.mcap_log import McapLog
 

@@ -29,6 +29,7 @@ class TrialStage:
         settings: of every robot's pipeline.
         settings_file: where they came from, if from a file.
         rerun: whether each robot's agent writes a log for the Rerun viewer.
+        mcap_log: whether it writes one for Foxglove.
     """
 
     scenario: Scenario
@@ -37,6 +38,7 @@ class TrialStage:
     settings: AgentSettings
     settings_file: Path | None = None
     rerun: bool = False
+    mcap_log: bool = False
 
     @property
     def robots(self) -> tuple[str, ...]:
@@ -55,13 +57,21 @@ class TrialStage:
 
     def rerun_log(self, robot: str) -> str | None:
         """File of a robot's log, `r0.1.rrd`; `r0.2.rrd` when its agent is started again."""
-        folder = self.out / "rerun"
-        starts = len(list(folder.glob(f"{robot}.*.rrd")))
-        return str(folder / f"{robot}.{starts + 1}.rrd") if self.rerun else None
+        return _next(self.out / "rerun", robot, ".rrd") if self.rerun else None
+
+    def mcap_folder(self, robot: str) -> str | None:
+        """Folder of a robot's log for Foxglove, `r0.1`; `r0.2` when its agent is started again."""
+        return _next(self.out / "mcap", robot) if self.mcap_log else None
 
     def agent_seed(self, robot: str) -> int:
         """Of a robot's random choices."""
         return self.seed * 16 + self.robots.index(robot)
+
+
+def _next(folder: Path, robot: str, suffix: str = "") -> str:
+    """The place of a robot's log at the next start of its agent."""
+    starts = len(list(folder.glob(f"{robot}.*{suffix}")))
+    return str(folder / f"{robot}.{starts + 1}{suffix}")
 
 
 class TrialFleet(Protocol):
@@ -70,21 +80,17 @@ class TrialFleet(Protocol):
     @property
     def bus(self) -> Bus:
         """The runner's own connection to the fleet's network."""
-        ...
 
     @property
     def keys(self) -> Keys:
         """Of the fleet."""
-        ...
 
     @property
     def control(self) -> SimControl:
         """Truth and intervention."""
-        ...
 
     def start(self) -> None:
         """Start everything; returns when every robot is there."""
-        ...
 
     def advance(self, tick: int) -> None:
         """Let time pass until a tick is over and every agent has finished with it.
@@ -92,40 +98,30 @@ class TrialFleet(Protocol):
         Raises:
             MapweaveError: a process died unexpectedly.
         """
-        ...
 
     def kill_agent(self, robot: str) -> None:
         """End an agent at once; its robot stops."""
-        ...
 
     def start_agent(self, robot: str) -> None:
         """Start an agent with the disk that is there; returns when its robot is driven again."""
-        ...
 
     def kill_server(self) -> None:
         """End the map server, and the router in it, at once."""
-        ...
 
     def start_server(self) -> None:
         """Start the map server with the disk that is there."""
-        ...
 
     def cut(self, robot: str) -> None:
         """Take a robot's network away."""
-        ...
 
     def worsen(self, robot: str, loss: float, delay: float) -> None:
         """Make a robot's network bad."""
-        ...
 
     def restore(self, robot: str) -> None:
         """Give a robot its network back, as good as new."""
-        ...
 
     def end(self) -> None:
         """End everything in order; journals and store are then closed. Idempotent."""
-        ...
 
     def wall(self) -> dict[str, float]:
         """Wall time by part, s, where it is known."""
-        ...

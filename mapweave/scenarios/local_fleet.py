@@ -16,7 +16,7 @@ from mapweave.hybridmap.errors import MapweaveError
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer, ServerSettings
 from mapweave.processes.agent import Agent, AgentOptions
-from mapweave.processes.agent_process import rerun_log
+from mapweave.processes.agent_process import tick_logs
 from mapweave.scenarios.actions import MISSION_KINDS
 from mapweave.scenarios.fleet import FIRST_EPOCH, FLEET, SERVER, TrialStage
 from mapweave.settings import load_settings
@@ -28,7 +28,7 @@ from mapweave.wire.bus import Request
 from mapweave.wire.memory import MemoryBus, MemoryHub, MessageFaults
 
 if TYPE_CHECKING:
-    from mapweave.processes.rerun_log import RerunLog
+    from mapweave.processes.tick_log import TickLog
 
 OVERTAKEN = 0.5
 """Share of a bad network's messages that later ones overtake."""
@@ -46,7 +46,7 @@ class LocalFleet:
         self.control = SimControl(self.bus, FLEET, timeout=60.0)
         self._buses: dict[str, MemoryBus] = {}
         self._agents: dict[str, Agent] = {}
-        self._logs: dict[str, RerunLog] = {}
+        self._logs: dict[str, list[TickLog]] = {}
         self._commands: dict[str, Command] = {}
         self._server: MapServer | None = None
         self._server_bus: MemoryBus | None = None
@@ -101,9 +101,9 @@ class LocalFleet:
     def kill_agent(self, robot: str) -> None:
         """Drop an agent. In lock-step all that it has mapped is on its disk already."""
         self._agents.pop(robot).close()
-        if robot in self._logs:
-            missing = self._logs.pop(robot).close()
-            self._log += [f"{robot}: not in the Rerun log: {missing}"] if missing else []
+        for log in self._logs.pop(robot):
+            if missing := log.close():
+                self._log.append(f"{robot}: not in the {log.title}: {missing}")
         self._commands.pop(robot, None)
         self._buses.pop(robot).close()
 
@@ -120,13 +120,14 @@ class LocalFleet:
             seed=stage.agent_seed(robot),
             synchronization=LockstepWaiting(),
             server=SERVER,
+            rerun=stage.rerun_log(robot),
+            mcap_log=stage.mcap_folder(robot),
         )
-        if path := stage.rerun_log(robot):
-            self._logs[robot] = rerun_log(path, robot)
+        logs = self._logs[robot] = tick_logs(options)
 
         def stepped(observation: Observation, step: TickResult) -> None:
-            if robot in self._logs:
-                self._logs[robot].step(observation, step, self._agents[robot].pipeline)
+            for log in logs:
+                log.step(observation, step, self._agents[robot].pipeline)
 
         self._agents[robot] = Agent(
             lambda: simulation.describe(robot), bus, self.keys, stage.settings, options, stepped,

@@ -90,8 +90,9 @@ class ProcessFleet:
             "--mission", stage.scenario.missions[robot],
             "--connect", _endpoint(port), "--body", _endpoint(self._simulator_port),
         ]  # fmt: skip
-        log = stage.rerun_log(robot)
-        self._children.start(robot, [*arguments, *self._settings(), *(["--rerun", log] if log else [])])
+        for option, log in (("--rerun", stage.rerun_log(robot)), ("--mcap-log", stage.mcap_folder(robot))):
+            arguments += [option, log] if log else []
+        self._children.start(robot, [*arguments, *self._settings()])
 
     def _settings(self) -> list[str]:
         file = self._stage.settings_file

@@ -25,7 +25,7 @@ from mapweave.sim.placement import starting_places
 
 OWN = ".mapweave-trial"
 """A file of this name marks a folder as a trial's: only there folders are taken away."""
-FOLDERS = ("agents", "server", "logs", "photographs", "rerun")
+FOLDERS = ("agents", "server", "logs", "photographs", "rerun", "mcap")
 FILES = (
     "*.tum", "*.mapweave", "figures.json", "report.*", "map.png", "errors.png", "film.webm", "scenario.toml",
 )  # fmt: skip
@@ -45,6 +45,7 @@ class TrialOptions:
         view: port of the live view, None for none.
         quiet: no progress on the terminal.
         rerun: whether each robot's agent writes a log for the Rerun viewer.
+        mcap_log: whether it writes one for Foxglove.
     """
 
     seed: int
@@ -56,6 +57,7 @@ class TrialOptions:
     view: int | None = None
     quiet: bool = False
     rerun: bool = False
+    mcap_log: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,8 +96,9 @@ def run_trial(scenario: Scenario, options: TrialOptions) -> TrialResult:
     starting_places(scenario.world(options.seed), scenario.robots, options.seed)
     _make_room(options.out)
     stage = TrialStage(
-        scenario, options.seed, options.out, options.settings, options.settings_file, options.rerun
-    )
+        scenario, options.seed, options.out, options.settings, options.settings_file, options.rerun,
+        options.mcap_log,
+    )  # fmt: skip
     with TerminalProgress(scenario.name, stage.robots, len(scenario.events), options.quiet) as show:
         recording = _record(stage, options, show)
         show.stage("scoring")

@@ -15,7 +15,8 @@ from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.camera_file import read_camera
-from mapweave.cli import main
+from mapweave.agent.settings import AgentSettings
+from mapweave.cli import main, parser
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -24,10 +25,14 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.markers import SPHERE, landmark_markers
 from mapweave.processes.mcap_log import FREE, OCCUPIED, McapLog, _floor
 from mapweave.processes.tick_log import ellipsoids
+from mapweave.scenarios.fleet import TrialStage
+from mapweave.scenarios.process_fleet import ProcessFleet
+from mapweave.scenarios.scenario import load_scenario, scenario_path
 from mapweave.storage.map_file import read_map_file
 from mapweave.wire.ros2.messages import make
 from tests.mapweave.command_line import complaint
 from tests.mapweave.wall_drive import COUNT, STEP, wall_drive
+from tests.simulator import needs_simulator
 
 
 def read(folder: Path) -> dict[str, list[tuple[int, Any]]]:
@@ -165,3 +170,38 @@ def test_what_is_no_place_for_a_log_is_refused(
     assert "--mcap-log" in output and "not empty" in output
     with pytest.raises(SettingsError, match=r"--mcap-log .*camera\.toml"):
         McapLog(str(drive / "camera.toml" / "x"))
+
+
+@needs_simulator
+def test_each_robot_of_a_trial_has_a_log_and_one_that_is_started_again_another(tmp_path: Path) -> None:
+    from mapweave.scenarios.local_fleet import LocalFleet
+
+    scenario = load_scenario(scenario_path("office"), ["robots=2", "world.rooms=3"])
+    fleet = LocalFleet(TrialStage(scenario, 1, tmp_path, AgentSettings(), mcap_log=True))
+    fleet.start()
+    fleet.advance(6)
+    fleet.kill_agent("r0")
+    fleet.start_agent("r0")
+    fleet.advance(10)
+    fleet.end()
+    names = ("r0.1", "r0.2", "r1.1")
+    assert sorted(path.name for path in (tmp_path / "mcap").iterdir()) == sorted(names)
+    counts = [len(read(tmp_path / "mcap" / name)["/status"]) for name in names]
+    assert counts[0] + counts[1] == counts[2] == 10
+
+
+def test_agents_in_processes_of_their_own_are_given_folders_for_their_logs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As `mapweave sim run --mcap-log` starts them."""
+    scenario = load_scenario(scenario_path("office"), ["robots=2"])
+    fleet = ProcessFleet(TrialStage(scenario, 1, tmp_path, AgentSettings(), mcap_log=True))
+    started: list[list[str]] = []
+    monkeypatch.setattr(fleet._children, "start", lambda name, arguments: started.append(arguments))
+    fleet._start_agent("r1")
+    (tmp_path / "mcap" / "r1.1").mkdir(parents=True)
+    fleet._start_agent("r1")
+    fleet.end()
+    for words, folder in zip(started, ("r1.1", "r1.2"), strict=True):
+        arguments = parser().parse_args(words)
+        assert (arguments.mcap_log, arguments.rerun) == (str(tmp_path / "mcap" / folder), None)
