@@ -118,7 +118,7 @@ def run(arguments: argparse.Namespace) -> int:
     except NoOdometry as missing:
         return _map_images(arguments, missing.recording)
     for note in (*robot.recording.notes, *recorded_faults(robot.recording)):
-        print(note)
+        print(note, flush=True)  # into a pipe as well before what the agent says, on stderr
     name = name_of(arguments)
     settings, calibration = settings_of(arguments), calibration_of(arguments, name)
     network = network_of(arguments, settings)
@@ -179,9 +179,9 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
     name, data, console = name_of(arguments), arguments.data, plain_or_terminal()
     say = EventLog(console)
     network = network_of(arguments, settings_of(arguments))
-    print(f"{recording.path}: no odometry, so it is mapped by its images alone: the map has no scale")
-    for note in recording.notes:
-        print(note)
+    first = f"{recording.path}: no odometry, so it is mapped by its images alone: the map has no scale"
+    for note in (first, *recording.notes):
+        print(note, flush=True)
     data.mkdir(parents=True, exist_ok=True)
     path = data / f"{name}.sqlite"
     journal = Journal(path, name)

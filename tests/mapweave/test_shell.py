@@ -269,6 +269,16 @@ def test_a_reader_that_ends_first_is_no_error_of_pythons_own(arguments: str) -> 
     assert (done.stderr, done.returncode) == (b"", FAILED)
 
 
+def test_what_a_replay_says_first_comes_first_into_a_pipe_as_well(recording: Path, tmp_path: Path) -> None:
+    """As in `mapweave replay ... 2>&1 | cat`: what it takes from the recording, then what the agent says."""
+    (recording / "times.txt").unlink()
+    out = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
+    done = started("replay", recording, "--offline", "--data", tmp_path / "maps", **out)
+    first, *others = done.stdout.decode().splitlines()
+    assert done.returncode == 0 and "no times.txt" in first, done.stdout
+    assert others and all(re.match(STAMP + "walk: ", line) for line in others), others
+
+
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
 @pytest.mark.parametrize("arguments", ["--version", "completion zsh", "sim list --json"])
 def test_a_full_disk_behind_stdout_is_one_line(arguments: str) -> None:
