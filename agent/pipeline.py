@@ -40,7 +40,7 @@ from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.pose import PoseGaussian
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.vision.lens import NO_DISTORTION, Lens
 
 MOST_ROOM = 3
@@ -59,6 +59,9 @@ class TickResult:
         status: for people.
         fault: the sensor that cannot be believed now, if any.
         images: of the nodes that were made.
+        way_moved: `status.map_from_robot` of all ticks before this one of the same map are to be moved by
+            this from the left, to be one way with those from now on: the geometry was corrected. None if
+            it was not. See `Mapper.take_way_moved`.
     """
 
     command: Command
@@ -67,6 +70,7 @@ class TickResult:
     status: Status
     fault: SensorFault | None = None
     images: tuple[tuple[NodeId, RawImage], ...] = ()
+    way_moved: Pose2 | None = None
 
 
 class Pipeline:
@@ -290,7 +294,10 @@ class Pipeline:
         own = isinstance(self._mission, Explore | GoTo) and driven is None and not self._lifted
         self._command = safe if own else None
         images = self.mapper.take_images()
-        return TickResult(safe, changes, tuple(questions), self._status(warning), self._fault, images)
+        return TickResult(
+            safe, changes, tuple(questions), self._status(warning), self._fault, images,
+            self.mapper.take_way_moved(),
+        )  # fmt: skip
 
     def finish(self) -> tuple[tuple[ChangeBody, ...], tuple[tuple[NodeId, RawImage], ...]]:
         """Make at once what is left of the last mapping episode, before the process ends.

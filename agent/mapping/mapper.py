@@ -63,6 +63,7 @@ class Mapper:
         self._settings = settings
         self._lens = lens or Lens(description.camera, description.distortion)
         self._pending: tuple[RobotDescription, Lens, Pose2] | None = None
+        self._way_moved: Pose2 | None = None
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings)
         self._keyframes = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
@@ -199,6 +200,17 @@ class Mapper:
     def take_images(self) -> tuple[tuple[NodeId, RawImage], ...]:
         """The images of the nodes that were made since the last call."""
         return self._keyframes.take_images()
+
+    def take_way_moved(self) -> Pose2 | None:
+        """How the way until now continues in that from now on; None unless the geometry has changed since
+        the last call.
+
+        When it becomes known that the axle is elsewhere below the camera, the camera keeps its place on the
+        map, so `map_from_robot` jumps. The way is that of an axle all along: wheels do not go sideways, and
+        the filter let it go as they do. So what came before is moved as a whole, by this from the left.
+        """
+        moved, self._way_moved = self._way_moved, None
+        return moved
 
     def drove(self, traverse: Traverse | None, refined: Node | None) -> None:
         """Take in what was measured on a drive while nothing was mapped; see KeyframeBuilder."""
@@ -370,5 +382,7 @@ class Mapper:
         (self._description, self._lens, old_from_new), self._pending = self._pending, None
         self._sift = Sift(self._lens, self._settings.sift)
         self._keyframes.recalibrate(self._description, old_from_new)
+        after = self._keyframes.map_from_anchor.mean
+        self._way_moved = after @ old_from_new @ after.inverse()
         self._trajectory.move_anchor(old_from_new)
         return True

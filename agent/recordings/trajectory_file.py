@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 from mapweave.hybridmap.pose import Pose2
+from mapweave.storage.atomic_file import read_whole, write_whole
 
 BY_WHEELS = "# not localized: by the wheels alone from here\n"
 LOCALIZED = "# localized from here\n"
@@ -13,8 +14,11 @@ LOCALIZED = "# localized from here\n"
 
 def tum_line(stamp_ns: int, pose: Pose2) -> str:
     """One pose. The stamp keeps its nanoseconds, which a float64 would not."""
+    return _line(f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}", pose)
+
+
+def _line(seconds: str, pose: Pose2) -> str:
     half = pose.heading / 2
-    seconds = f"{stamp_ns // 10**9}.{stamp_ns % 10**9:09d}"
     return f"{seconds} {pose.x:.6f} {pose.y:.6f} 0 0 0 {math.sin(half):.9f} {math.cos(half):.9f}\n"
 
 
@@ -30,7 +34,11 @@ class TrajectoryFile:
         Raises:
             OSError: it cannot be written.
         """
-        self._file = path.open("a", encoding="ascii")
+        self._path = path
+        self._file = path.open("a", encoding="ascii", newline="\n")
+        self._begin = self._file.tell()
+        # Where in the file the way before is to be moved, in bytes, and by what.
+        self._moves: list[tuple[int, Pose2]] = []
         self._pose = Pose2()
         self._localized: bool | None = None
         # Frames before the first at which the robot is localized, in the frame of the first of them.
@@ -53,10 +61,36 @@ class TrajectoryFile:
             self._write(stamp_ns, carried if pose is None else pose, pose is not None)
         self._pose = carried if pose is None else pose
 
+    def move(self, moved: Pose2) -> None:
+        """Move all poses that were added until now, from the left, at the end: a tick has no time for it."""
+        self._moves.append((self._file.tell(), moved))
+        self._pose = moved @ self._pose
+
     def close(self) -> None:
-        """Finish the file."""
+        """Finish the file.
+
+        Raises:
+            InvalidFile: it cannot be written again with the poses moved; it stays as it was.
+        """
         self._write_waiting(Pose2())
         self._file.close()
+        moves, self._moves = self._moves, []
+        if moves:
+            self._rewrite(moves)
+
+    def _rewrite(self, moves: list[tuple[int, Pose2]]) -> None:
+        at, out = 0, list[bytes]()
+        for line in read_whole(self._path).splitlines(keepends=True):
+            later = [moved for end, moved in moves if self._begin <= at < end]
+            at += len(line)
+            if later and not line.startswith(b"#"):
+                stamp, x, y, *_, sine, cosine = line.decode("ascii").split()
+                pose = Pose2(float(x), float(y), 2.0 * math.atan2(float(sine), float(cosine)))
+                for moved in later:
+                    pose = moved @ pose
+                line = _line(stamp, pose).encode("ascii")
+            out.append(line)
+        write_whole(self._path, b"".join(out))
 
     def _write_waiting(self, map_from_first: Pose2) -> None:
         waiting, self._waiting = self._waiting, []

@@ -8,8 +8,9 @@ is the recording's own where nothing contradicts it, else what least squares ove
 is that of the trajectory of all images against truth.csv after one rigid alignment; while the robot does not
 know where it is the wheels lead on. error_ratio is the worst error over that with the right geometry,
 wheels_ratio the worst error over that of dead reckoning by the wheels with the same declared geometry,
-diagnosed whether every wrong parameter was named while mapping. The scale of the wheels is named but never
-corrected while mapping (see docs/calibrate-drive.md), so its ratio shows what the wheels' own error costs.
+rpe_m and wheels_rpe_m the error of the motion over each metre, root mean square, diagnosed whether every
+wrong parameter was named while mapping. The scale of the wheels is named but never corrected while mapping
+(see docs/calibrate-drive.md), so its ratio shows what the wheels' own error costs.
 
 With --seed the wheels are simulated: the increments of truth.csv with 2 % of noise a step and 1 % a drive on
 the way, 0.15 degrees a step and 0.01 degrees a step all along on the turn.
@@ -42,7 +43,7 @@ from mapweave.agent.mission import Carried
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.recording import Recording
-from mapweave.evaluation.map_score import align
+from mapweave.evaluation.replaying import errors
 from mapweave.evaluation.truth import Truth
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
 from mapweave.hybridmap.ids import MapId
@@ -68,7 +69,9 @@ class ReplayResult:
 
     Attributes:
         error: root mean square of the positions of all images, m.
-        wheels: the same by the wheels alone, with what is declared of them, m.
+        relative: root mean square error of the motion over each metre, m.
+        wheels: the error by the wheels alone, with what is declared of them, m.
+        relative_wheels: the same of the relative one.
         used: share of the images that were mapped with.
         nodes: in all maps.
         maps: how many were begun.
@@ -76,7 +79,9 @@ class ReplayResult:
     """
 
     error: float
+    relative: float
     wheels: float
+    relative_wheels: float
     used: float
     nodes: int
     maps: int
@@ -96,7 +101,7 @@ def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: fl
     pipeline.set_mission(Carried())
     here, first_from_map, maps, nodes, used = Pose2(), Pose2(), 1, 0, 0
     reckoned, correction, declared = Pose2(), OdometryCorrection(), geometry_of(description)
-    mapped, by_wheels, true = [], [], []
+    mapped, by_wheels, true = list[Pose2](), list[Pose2](), list[Pose2]()
     count = 0
     while (observation := robot.sense()) is not None:
         count += 1
@@ -109,27 +114,36 @@ def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: fl
             pipeline = Pipeline(MapId("map", maps), description, calibration=pipeline.calibration)
             pipeline.set_mission(Carried())
             first_from_map = here
-        status = pipeline.step(observation).status
+        step = pipeline.step(observation)
+        status = step.status
+        if step.way_moved is not None:
+            moved = first_from_map @ step.way_moved @ first_from_map.inverse()
+            mapped = [moved @ pose for pose in mapped]
         if not status.astray and not pipeline.lost and status.doing != "standing still":
             here = first_from_map @ status.map_from_robot
             used += 1
         pose = truth.at(observation.stamp_ns)
         if pose is not None:
-            mapped.append(here @ Pose2(lever))
-            by_wheels.append(reckoned @ Pose2(lever))
+            mapped.append(here)
+            by_wheels.append(reckoned)
             true.append(pose)
     if len(true) < 2:
         raise InvalidValue("the recording has no truth.csv for its images: there is no error to compute")
     pipeline.finish()
     nodes += len(pipeline.map.nodes)
     causes = tuple(pipeline.calibration.causes)
-    return ReplayResult(_error(mapped, true), _error(by_wheels, true), used / count, nodes, maps, causes)
+    scored = (*_errors(mapped, true, lever), *_errors(by_wheels, true, lever))
+    return ReplayResult(*scored, used / count, nodes, maps, causes)
 
 
-def _error(estimated: list[Pose2], true: list[Pose2]) -> float:
-    """Root mean square distance of (N,) positions after one rigid alignment, m."""
-    at, there = (np.array([[pose.x, pose.y] for pose in poses]) for poses in (estimated, true))
-    return float(np.sqrt(((align(at, there).apply(at) - there) ** 2).sum(axis=1).mean()))
+def _errors(robot: list[Pose2], camera: list[Pose2], lever: float) -> tuple[float, float]:
+    """Error of (N,) positions after one rigid alignment, and of the motion over a metre, m."""
+    at, there = (
+        np.array([pose.vector for pose in poses])
+        for poses in ([pose @ Pose2(lever) for pose in robot], camera)
+    )
+    absolute, relative, _ = errors(at, there, np.zeros(len(at)))
+    return (math.nan if absolute is None else absolute), (math.nan if relative is None else relative)
 
 
 def drawn_wheels(recording: Recording, truth: Truth, seed: int) -> Recording:
@@ -175,7 +189,8 @@ def run(
 
     right = right_geometry(opened(), console)
     description = declaring(opened().describe(), right)
-    table = Table("declared", "error, m", "ratio", "wheels alone, m", "used", "nodes", "maps", "named")
+    table = Table("declared", "error, m", "ratio", "wheels alone, m", "over 1 m", "wheels", "used",
+                  "nodes", "maps", "named")  # fmt: skip
     base = replay(opened(), description, truth, right.forward)
 
     def row(label: str, result: ReplayResult) -> None:
@@ -184,7 +199,8 @@ def run(
         )
         ratio = result.error / base.error
         table.add_row(
-            label, f"{result.error:.2f}", f"{ratio:.2f}", f"{result.wheels:.2f}", f"{result.used:.3f}",
+            label, f"{result.error:.2f}", f"{ratio:.2f}", f"{result.wheels:.2f}",
+            f"{result.relative:.4f}", f"{result.relative_wheels:.4f}", f"{result.used:.3f}",
             str(result.nodes), str(result.maps), named or "-",
         )  # fmt: skip
         console.print(f"{label}: error {result.error:.2f} m, used {result.used:.3f}, named: {named or '-'}")
@@ -200,6 +216,7 @@ def run(
         results[label] = replay(opened(), wrong, truth, right.forward)
         row(label, results[label])
     console.print(table)
+    replays = {"right": base, **results}
     named = {
         label: any(c.parameter is WRONG[label][0] for c in result.causes) for label, result in results.items()
     }
@@ -209,6 +226,8 @@ def run(
         "frames_used": round(min(result.used for result in (base, *results.values())), 4),
         "diagnosed": all(named.values()),
         "wheels_ratio": round(max(r.error / r.wheels for r in (base, *results.values())), 3),
+        "rpe_m": {label: round(r.relative, 4) for label, r in replays.items()},
+        "wheels_rpe_m": {label: round(r.relative_wheels, 4) for label, r in replays.items()},
         "right_m": round(base.error, 3),
         "ratios": ratios,
         "named": named,

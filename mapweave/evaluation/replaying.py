@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -41,7 +41,8 @@ class ReplayedFrame:
     Attributes:
         stamp_ns: of it.
         part: number of the map that was made then, from 0.
-        map_from_robot: where the robot believed to be; None if the frame was not used.
+        map_from_robot: where the robot believed to be, moved as a whole where the geometry was corrected
+            later (`TickResult.way_moved`); None if the frame was not used.
         wheels: dead reckoning from the first observation.
         reason: why it was not used; empty if it was.
     """
@@ -181,7 +182,10 @@ def evaluate_replay(
         if pipelines[-1].lost:
             calibration = pipelines[-1].calibration
             pipelines.append(_pipeline(len(pipelines), description, settings, calibration))
-        status = pipelines[-1].step(observation).status
+        step = pipelines[-1].step(observation)
+        status = step.status
+        if step.way_moved is not None:
+            frames = [_moved(frame, step.way_moved, len(pipelines) - 1) for frame in frames]
         wheels = wheels @ observation.odometry.motion()
         pose = status.map_from_robot if status.located else None
         reason = "" if status.located else status.detail.partition(":")[0] or status.doing
@@ -192,6 +196,12 @@ def evaluate_replay(
     maps = [pipeline.map for pipeline in pipelines]
     notes = list(dict.fromkeys(line for pipeline in pipelines for line in pipeline.complaints))
     return ReplayEvaluation(str(replay.recording.path), frames, maps, true_poses(truth, stamps), notes)
+
+
+def _moved(frame: ReplayedFrame, moved: Pose2, part: int) -> ReplayedFrame:
+    """A frame after the geometry was corrected, moved if it is of that map."""
+    pose = frame.map_from_robot
+    return frame if pose is None or frame.part != part else replace(frame, map_from_robot=moved @ pose)
 
 
 def true_poses(path: Path | None, stamps_ns: Stamps) -> Array:

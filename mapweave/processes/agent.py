@@ -274,6 +274,8 @@ class Agent:
             self._views.keep(step.images, step.changes)
         if self._trajectory is not None:
             pose = step.status.map_from_robot if step.status.located else None
+            if step.way_moved is not None:
+                self._trajectory.move(step.way_moved)
             self._trajectory.add(observation.stamp_ns, observation.odometry.motion(), pose)
         line = self._server_watch.see(self._fleet.server_in_reach(), observation.stamp_ns)
         if line and self._options.patience > 0.0:
@@ -378,7 +380,10 @@ class Agent:
 
     def _leave(self) -> None:
         if self._trajectory is not None:
-            self._trajectory.close()
+            try:
+                self._trajectory.close()
+            except (InvalidFile, OSError) as error:
+                self._say(str(error))
         self._fleet.close()
         self._left_maps.close()
         self.merged_poses.close()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -12,6 +13,7 @@ from evo.core import metrics, sync
 from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
 
+from mapweave.agent.calibration.correction import corrected, frame_change
 from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.calibration.report import Cause
 from mapweave.agent.drive_geometry import Parameter
@@ -122,6 +124,45 @@ def test_a_recording_is_scored_and_its_trajectory_is_read_by_evo(
     assert matched.num_poses == 30
     missing = tmp_path / "none.csv"
     assert f"{missing}: no such file" in complaint(capfd, "eval", "replay", folder, "--truth", missing)
+
+
+def test_a_corrected_geometry_makes_no_jump_in_the_trajectories(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In the middle of a drive the camera is found to be 0.4 m further ahead of the axle than declared.
+
+    That it is found is tested with the calibration.
+    """
+    walls, folder, count, step = PhotoWalls(), tmp_path / "walk", 60, 0.02
+    (folder / "images").mkdir(parents=True)
+    (folder / "camera.toml").write_text(
+        "width = 320\nheight = 240\nfx = 277\nfy = 277\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
+    )
+    odometry = ["forward_m,turn_rad"]
+    for k in range(count):
+        cv2.imwrite(str(folder / "images" / f"{k}.png"), walls.render(Pose2(step * k)))
+        odometry.append(f"{step if k else 0.0},0")
+    (folder / "odometry.csv").write_text("\n".join(odometry) + "\n")
+    changed = list[OnlineCalibration]()
+
+    def watch(self: OnlineCalibration, *arguments: object) -> tuple[Cause, ...]:
+        if not changed:
+            after = replace(self.geometry, forward=0.4)
+            self._next, change = after, frame_change(self.geometry, after)
+            self.pending = (*corrected(self.description, after), change)
+            changed.append(self)
+        return ()
+
+    monkeypatch.setattr(OnlineCalibration, "watch", watch)
+    for arguments, file in (
+        (["eval", "replay", str(folder), "--out", str(tmp_path)], "map0.tum"),
+        (["replay", str(folder), "--offline", "--data", str(tmp_path / "data")], "data/walk.1.tum"),
+    ):
+        changed.clear()
+        assert main(arguments) == 0
+        assert changed[0].geometry.forward == 0.4, "the episode has ended, and it is in use"
+        poses = file_interface.read_tum_trajectory_file(tmp_path / file).positions_xyz
+        assert np.diff(poses[:, 0]) == pytest.approx(np.full(count - 1, step), abs=0.01)
 
 
 @pytest.mark.parametrize(

@@ -181,6 +181,27 @@ def test_a_camera_found_further_ahead_moves_the_robot_and_no_landmark(walls, des
     assert near[0] == pytest.approx(near[1], abs=0.05)
 
 
+@pytest.mark.parametrize("old_from_new", [Pose2(-0.3), Pose2(-0.1, 0.0, 0.05)])
+def test_a_camera_found_elsewhere_leaves_the_way_without_a_jump(walls, description, old_from_new):
+    """An axle goes straight ahead all along, whatever is found out about the camera above it."""
+    mapper = Mapper(MapId("r0", 1), description)
+    positions, way = list(np.arange(0.0, 0.51, 0.025)), []
+    for tick, x in enumerate(positions, 1):
+        last = drive(mapper, walls, [max(x - 0.025, 0.0), x], start=2 * tick)
+        way.append(mapper.map_from_robot.mean)
+    assert mapper.take_way_moved() is None
+    mapper.recalibrate(description, Lens(description.camera, description.distortion), old_from_new)
+    assert mapper.take_way_moved() is None, "it is put to use at the end of the episode"
+    mapper.finish(last)
+    moved, here = mapper.take_way_moved(), mapper.map_from_robot.mean
+    assert moved is not None and mapper.take_way_moved() is None
+    assert here.distance(way[-1]) > 0.09, "the camera keeps its place, so the axle has another"
+    for pose, x in zip(way, positions, strict=True):
+        seen = here.inverse() @ moved @ pose
+        assert seen.distance(Pose2(x - positions[-1])) < 0.015
+        assert seen.heading == pytest.approx(0.0, abs=0.02)
+
+
 def test_a_view_without_features_gives_no_node(walls, description):
     mapper = Mapper(MapId("r0", 1), description)
     away = [Pose2(0, 0, np.pi)] * 3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 import numpy as np
@@ -37,6 +38,35 @@ def test_without_any_place_there_are_the_wheels(tmp_path: Path) -> None:
     lines = written(tmp_path / "b.tum", [None, None])
     assert lines[0] == BY_WHEELS and len(lines) == 3
     assert lines[2].startswith("1.000000000 0.100000 ")
+
+
+def test_a_way_that_is_moved_is_moved_to_the_place_where_it_was(tmp_path: Path) -> None:
+    """What an earlier run has written stays; so do comments and stamps."""
+    path, turn = tmp_path / "d.tum", Pose2(1.0, 2.0, math.pi / 2)
+    path.write_text("0.5 7.000000 0.000000 0 0 0 0.000000000 1.000000000\n")
+    file = TrajectoryFile(path)
+    poses = [Pose2(1.0, 0.0, 0.1), None, Pose2(2.0, 0.0, 0.2), Pose2(9.0, 0.0, 0.3)]
+    for k, pose in enumerate(poses):
+        if k == 3:
+            file.move(turn)
+            file.move(Pose2(0.5))
+        file.add(k * 10**9, STEP, pose)
+    file.move(Pose2(0.0, 5.0))
+    file.add(4 * 10**9, STEP, None)
+    file.close()
+    assert [line for line in path.read_text().splitlines() if line.startswith("#")] == [
+        BY_WHEELS.strip(), LOCALIZED.strip(), BY_WHEELS.strip(),
+    ]  # fmt: skip
+    read = file_interface.read_tum_trajectory_file(path)
+    assert read.timestamps == pytest.approx([0.5, 0.0, 1.0, 2.0, 3.0, 4.0])
+    # (x, y) turned by a quarter is (-y, x).
+    carried = (1.5 - 0.1 * math.sin(0.1), 8.0 + 0.1 * math.cos(0.1))
+    last = (9.0 + 0.1 * math.cos(0.3), 5.0 + 0.1 * math.sin(0.3))
+    there = [(7.0, 0.0), (1.5, 3.0 + 5.0), carried, (1.5, 4.0 + 5.0), (9.0, 5.0), last]
+    assert read.positions_xyz[:, :2] == pytest.approx(np.array(there), abs=1e-5)
+    headings = 2.0 * np.arctan2(read.orientations_quat_wxyz[:, 3], read.orientations_quat_wxyz[:, 0])
+    quarter = math.pi / 2
+    assert headings == pytest.approx([0.0, quarter + 0.1, quarter + 0.1, quarter + 0.2, 0.3, 0.3], abs=1e-6)
 
 
 def test_a_drive_that_is_always_localized_needs_no_comment(tmp_path: Path) -> None:
