@@ -14,7 +14,8 @@ from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodeRetired
 from mapweave.hybridmap.ids import NodeId
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.kept_bytes import LEAST_GROWN
-from mapweave.mapserver.log.store import ROW_BYTES, Store
+from mapweave.mapserver.log.sql_sizes import ROW_BYTES
+from mapweave.mapserver.log.store import Store
 from mapweave.storage.map_file import MapFile
 from mapweave.wire.codec import element_of, encode_body, encode_change
 

@@ -13,7 +13,8 @@ from dataclasses import dataclass, field
 
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.entry import ReceivedChange
-from mapweave.mapserver.log.store import PRUNING_MARK, ROW_BYTES, Store
+from mapweave.mapserver.log.sql_sizes import ROW_BYTES
+from mapweave.mapserver.log.store import PRUNING_MARK, Store
 
 LEAST_GROWN = 2**22
 """Bytes of a map that must have come before it is compacted."""

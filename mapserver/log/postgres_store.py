@@ -19,8 +19,7 @@ from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.log.postgres_follower import CHANNEL, LOG, RECORD, PostgresFollower, words_of
 from mapweave.mapserver.log.postgres_name import ServerName
-from mapweave.mapserver.log.sql_store import SqlStore
-from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, ID, LogChanges, News, fresh_id
+from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, ID, LogChanges, News, Store, fresh_id
 from mapweave.storage.file_format import what_to_do
 from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
 from mapweave.storage.postgres_watchdog import PostgresWatchdog
@@ -70,7 +69,7 @@ SCHEMA_LOCK = 0x4D575354
 """Advisory lock of who makes the tables: 'MWST'."""
 
 
-class PostgresStore(SqlStore):
+class PostgresStore(Store):
     """All logs in one database.
 
     One session writes, another reads: a commit that waits for a standby holds up no answer. Where PostgreSQL

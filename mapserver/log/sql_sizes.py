@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Sequence
+from contextlib import AbstractContextManager
+from typing import Any
 
 from mapweave.hybridmap.change import EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.limits import MAX_NUMBER
 from mapweave.mapserver.log.entry import Traffic
-from mapweave.mapserver.log.sql_tables import SqlTables
-from mapweave.mapserver.log.store import ROW_BYTES
 
+ROW_BYTES = 100
+"""That a change takes beside its message: its key, its columns and its place in the table."""
 _OF_NODES = f"kind IN ('{NodePut.__name__}', '{NodeRetired.__name__}')"
 _RETIRES = f"kind IN ('{NodeRetired.__name__}', '{EdgeRetired.__name__}')"
 _SUPERSEDED = (
@@ -25,8 +28,8 @@ _SUPERSEDED = (
 store may not have read that yet, and edges of before go with it."""
 
 
-class SqlSizes(SqlTables):
-    """Counts of what is kept."""
+class SqlSizes(ABC):
+    """Counts of what is kept. Tables are as in mapweave.mapserver.log.integrity, marks of values are `?`."""
 
     def __init__(self) -> None:
         self._traffic_lock = threading.Lock()
@@ -48,7 +51,7 @@ class SqlSizes(SqlTables):
         return {MapId(agent, epoch): (nodes, total) for epoch, nodes, total in self._read(query, (agent,))}
 
     def edges(self, agent: str) -> dict[MapId, int]:
-        """Edges of each map of a robot; see `Store`."""
+        """Edges of each map of a robot; this reads through all of its logs."""
         query = (
             "SELECT epoch, number, kind FROM change WHERE agent = ? AND kind IN (?, ?) "
             "ORDER BY epoch, sequence"
@@ -60,7 +63,10 @@ class SqlSizes(SqlTables):
         return {map_id: len(there) for map_id, there in edges.items()}
 
     def stored_bytes(self, map_id: MapId, after: int, last: int) -> int:
-        """Bytes that are kept of the changes of a map behind `after`, up to `last`; see `Store`."""
+        """Bytes that are kept of the changes of a map behind `after`, up to `last`, taken or refused.
+
+        Each counts with its message and `ROW_BYTES`. This reads through that part of the log.
+        """
         where = "FROM {} WHERE agent = ? AND epoch = ? AND sequence > ? AND sequence <= ?"
         sizes = {"change": "wire_bytes", "refused": "length(message) + length(reason)"}
         total = 0
@@ -71,12 +77,29 @@ class SqlSizes(SqlTables):
         return total
 
     def superseded(self, map_id: MapId, most: int) -> list[tuple[int, int]]:
-        """Changes of a map that later ones of it supersede; see `Store`."""
+        """Changes of a map that later ones of it supersede: without them its replay is the same map.
+
+        Of each node and edge that was put or retired the newest change stays, and the last retirement. This
+        reads through the log.
+
+        Args:
+            map_id: of the map.
+            most: so many at most.
+
+        Returns:
+            Sequence number and bytes of each, as in `stored_bytes`.
+        """
         rows = self._read(_SUPERSEDED, (*map_id, most))
         return [(sequence, ROW_BYTES + wire_bytes) for sequence, wire_bytes in rows]
 
     def drop(self, map_id: MapId, sequences: Sequence[int]) -> None:
-        """Delete superseded changes of a map; see `Store`."""
+        """Delete superseded changes of a map.
+
+        The watermark stays, so the robot does not send again what is deleted.
+
+        Raises:
+            InvalidFile: the disk does not take it; nothing is deleted.
+        """
         marks = ", ".join("?" * len(sequences))
         query = f"DELETE FROM change WHERE agent = ? AND epoch = ? AND sequence IN ({marks})"
         with self._transaction():
@@ -116,3 +139,31 @@ class SqlSizes(SqlTables):
         with self._traffic_lock:
             self._counted.clear()
             self._sums.clear()
+
+    @abstractmethod
+    def _wire_bytes(self, grown: Sequence[tuple[str, int, int, int]]) -> Iterable[tuple[str, int, int]]:
+        """Changes and their bytes by kind, of stretches of logs.
+
+        Args:
+            grown: agent, epoch, the change before the first one and the last one.
+        """
+
+    @abstractmethod
+    def _read(self, query: str, values: Sequence[object] = ()) -> list[Any]:
+        """The rows of a query, inside a transaction or outside.
+
+        Raises:
+            InvalidFile: they cannot be read.
+        """
+
+    @abstractmethod
+    def _transaction(self) -> AbstractContextManager[None]:
+        """All that is written inside is committed at the end, or nothing of it; one thread at a time.
+
+        Raises:
+            InvalidFile: it is not committed.
+        """
+
+    @abstractmethod
+    def _write(self, query: str, values: Sequence[object]) -> None:
+        """Inside a transaction."""

@@ -13,8 +13,7 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.log.integrity import SCHEMA, Gap, insert, repair
-from mapweave.mapserver.log.sql_store import SqlStore
-from mapweave.mapserver.log.store import ID, LogChanges, News, fresh_id
+from mapweave.mapserver.log.store import ID, LogChanges, News, Store, fresh_id
 from mapweave.storage.database import Database
 
 log = logging.getLogger(__name__)
@@ -31,7 +30,7 @@ ADVICE = (
 )
 
 
-class SqliteStore(SqlStore):
+class SqliteStore(Store):
     """All logs in one SQLite file, which belongs to one process."""
 
     shared = False

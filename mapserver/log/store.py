@@ -6,17 +6,24 @@ servers share (mapweave.mapserver.log.postgres_store).
 
 from __future__ import annotations
 
+import logging
 import secrets
+from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Protocol
 
-from mapweave.hybridmap.change import Change
-from mapweave.hybridmap.errors import InvalidValue, MapweaveError
+from mapweave.hybridmap.annotation import MAX_ANNOTATIONS
+from mapweave.hybridmap.change import Change, EdgePut, EdgeRetired, NodePut, NodeRetired
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
-from mapweave.mapserver.log.entry import Applied, Position, ReceivedChange, Traffic
+from mapweave.hybridmap.limits import MAX_NUMBER
+from mapweave.mapserver.log.entry import Applied, Position, ReceivedChange
 from mapweave.mapserver.log.integrity import Gap
+from mapweave.mapserver.log.sql_sizes import SqlSizes
+from mapweave.wire.codec import decode_body, element_of, unwrap_body
 from mapweave.wire.log_messages import Refusal
+
+log = logging.getLogger(__name__)
 
 ID = "store id"
 """Among the results."""
@@ -30,10 +37,22 @@ MOST_REFUSED_KEPT = 100
 """Refused changes of a map of which the bytes are kept; of further ones only the reason."""
 MOST_REFUSALS = 1000
 """Reasons of a map that are kept; then a new one takes the place of the oldest that is kept without bytes."""
-ROW_BYTES = 100
-"""That a change takes beside its message: its key, its columns and its place in the table."""
 MAX_CONSTRAINTS = 10_000
 """Made by hand, one by one."""
+READ_AT_ONCE = 256
+"""Rows in memory at a time while a log is read: mostly of 3 kB each, so below 1 MB."""
+RETIREMENTS: dict[str, Callable[[NodeId], NodeRetired | EdgeRetired]] = {
+    NodePut.__name__: NodeRetired,
+    EdgePut.__name__: EdgeRetired,
+}
+"""By the kind of change that they undo."""
+PRUNED_AT_ONCE = 256
+"""Elements of one map: a log is read through once for so many."""
+OLDEST_REASON = (
+    "DELETE FROM refused WHERE agent = ? AND epoch = ? AND sequence = (SELECT sequence FROM refused "
+    "WHERE agent = ? AND epoch = ? ORDER BY sequence LIMIT 1 OFFSET ?)"
+)
+"""The first refusal of a map behind those of which the bytes are kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,8 +94,10 @@ CONSTRAINTS, ANNOTATIONS = "manual_constraint", "annotation"
 """Records, by the names of their tables."""
 
 
-class Store(Protocol):
+class Store(SqlSizes):
     """The record of all logs. Any thread may call it; what it returns as done survives a loss of power.
+
+    Its queries are those that SQLite and PostgreSQL both understand.
 
     Attributes:
         id: random, drawn when the store was made, see mapweave.wire.log_messages.Ack.
@@ -87,33 +108,48 @@ class Store(Protocol):
     shared: bool
 
     @property
+    @abstractmethod
     def leads(self) -> bool:
         """Whether this server writes the results of merging: one of those that share a store does."""
 
     @property
+    @abstractmethod
     def displaced(self) -> str:
         """Why this server must end, in one line; empty if it need not.
 
         Another server of its name has taken a store that servers share. Nothing more is written.
         """
 
+    @abstractmethod
     def follow(self, changed: Callable[[News], None]) -> None:
         """Have what other servers write reported from now on, from a thread of the store's.
 
         Before this server leads, it is called once more: what the leader before wrote is known then.
         """
 
+    @abstractmethod
+    def close(self) -> None:
+        """Close it. Idempotent."""
+
     def maps(self, agent: str | None = None) -> list[MapId]:
         """All maps of a robot, or of all robots, of which something is known."""
+        where, values = ("", ()) if agent is None else ("WHERE agent = ? ", (agent,))
+        rows = self._read(f"SELECT agent, epoch FROM log {where}ORDER BY agent, epoch", values)
+        return [MapId(*row) for row in rows]
 
     def positions(self, maps: Collection[MapId] | None = None) -> dict[MapId, Position]:
         """Which log is kept of each of these maps, or of all, and how far it is settled."""
+        query = "SELECT agent, epoch, log_id, watermark FROM log"
+        if maps is None:
+            rows = self._read(query)
+        else:
+            rows = [row for m in maps for row in self._read(f"{query} WHERE agent = ? AND epoch = ?", m)]
+        return {MapId(agent, epoch): Position(int(log_id), mark) for agent, epoch, log_id, mark in rows}
 
     def watermark(self, map_id: MapId) -> int:
         """Up to which change the log is settled, 0 without a log."""
-
-    def log_id(self, map_id: MapId) -> int | None:
-        """Id of the log of this name, None without one."""
+        rows = self._read("SELECT watermark FROM log WHERE agent = ? AND epoch = ?", map_id)
+        return int(rows[0][0]) if rows else 0
 
     def apply(
         self, map_id: MapId, log_id: int, entries: Sequence[ReceivedChange], covered: int | None = None
@@ -142,12 +178,28 @@ class Store(Protocol):
             For each run what is new, or its error: InvalidValue where another log goes by this name, which
             holds up no other run; InvalidFile for all if the disk does not take it, and nothing is applied.
         """
+        try:
+            with self._transaction():
+                logs = self._begin(runs)
+                return [self._apply(run, logs) for run in runs]
+        except InvalidFile as error:
+            return [InvalidFile(str(error)) for _ in runs]
 
     def replay(self, map_id: MapId, last: int = 0) -> Iterator[Change]:
         """Every change behind `last` that was taken, in order.
 
         Those that cannot be read, or are out of bounds since they were taken, are left out.
         """
+        query = (
+            "SELECT sequence, stamp_ns, body FROM change "
+            "WHERE agent = ? AND epoch = ? AND sequence > ? ORDER BY sequence LIMIT ?"
+        )
+        while rows := self._read(query, (*map_id, last, READ_AT_ONCE)):
+            for last, stamp_ns, body in rows:
+                try:
+                    yield Change(map_id, last, stamp_ns, decode_body(body))
+                except InvalidMessage as error:
+                    log.error("change %d of %s cannot be read (%s); it is left out", last, map_id, error)
 
     def prune(
         self,
@@ -174,9 +226,47 @@ class Store(Protocol):
         Raises:
             InvalidFile: the disk does not take it; nothing is pruned.
         """
+        node_numbers, edge_numbers = _numbers(nodes), _numbers(edges)
+        maps = {map_id for map_id, _ in (*node_numbers, *edge_numbers)}
+        with self._transaction():
+            self._lock_table("result")
+            if any(self.result(name) != value for name, value in (unchanged or {}).items()):
+                return False
+            # No other server may put one of the nodes between the queries.
+            self._begin([LogChanges(map_id, at.log_id, ()) for map_id, at in self.positions(maps).items()])
+            for kinds, numbers in (
+                ((NodePut, NodeRetired), node_numbers),
+                ((EdgePut, EdgeRetired), edge_numbers),
+            ):
+                names = [kind.__name__ for kind in kinds]
+                for map_id, some in numbers:
+                    self._write(
+                        "DELETE FROM change WHERE agent = ? AND epoch = ? AND sequence <= ? "
+                        f"AND kind IN (?, ?) AND number IN ({_marks(some)})",
+                        (*map_id, MAX_NUMBER if last is None else last.get(map_id, 0), *names, *some),
+                    )
+            for map_id, some in node_numbers:
+                put_again = self._read(
+                    "SELECT DISTINCT number FROM change WHERE agent = ? AND epoch = ? AND kind = ? "
+                    f"AND number IN ({_marks(some)})",
+                    (*map_id, NodePut.__name__, *some),
+                )
+                if gone := sorted({*some} - {number for (number,) in put_again}):
+                    self._delete_nodes(map_id, gone)
+            for name, value in results.items():
+                self._put("result", (name, value))
+        self._count_again()
+        return True
 
     def damaged(self, map_id: MapId | None = None) -> list[Gap]:
         """Changes that were found damaged and are not restored yet, of one map or of all."""
+        query = (
+            "SELECT agent, epoch, first, last FROM damaged "
+            "WHERE CAST(? AS TEXT) IS NULL OR (agent = ? AND epoch = ?) ORDER BY agent, epoch, first"
+        )
+        agent, epoch = map_id or (None, None)
+        rows = self._read(query, (agent, agent, epoch))
+        return [Gap(MapId(agent, epoch), first, last) for agent, epoch, first, last in rows]
 
     def restore(
         self, map_id: MapId, first: int, covered: int, entries: Sequence[ReceivedChange]
@@ -198,9 +288,35 @@ class Store(Protocol):
         Raises:
             InvalidFile: the disk does not take it; nothing is restored.
         """
+        changes: list[Change] = []
+        refusals: list[Refusal] = []
+        with self._transaction():
+            for gap in self.damaged(map_id):
+                if gap.first <= first <= gap.last:
+                    self._write(
+                        "DELETE FROM damaged WHERE agent = ? AND epoch = ? AND first = ?",
+                        (*map_id, gap.first),
+                    )
+                    if gap.first < first:
+                        self._put("damaged", (*map_id, gap.first, first - 1))
+                    if covered < gap.last:
+                        self._put("damaged", (*map_id, covered + 1, gap.last))
+            for entry in entries:
+                self._take(map_id, entry, changes, refusals, restored=True)
+            if len(entries) <= covered - first and first > 1:
+                before = self.unverified(map_id)
+                self._put("unverified", (*map_id, 1, max(first - 1, before.last if before else 0)))
+        self._count_again()
+        for refusal in refusals:
+            log.warning("refused %s %d: %s", map_id, refusal.sequence, refusal.reason)
+        if any(self._may_undo(change) for change in changes):
+            return self.replay(map_id, changes[0].sequence - 1)
+        return iter(changes)
 
     def unverified(self, map_id: MapId) -> Gap | None:
         """Stored changes that a lost one may have undone; None if there are none, see `verify`."""
+        rows = self._read("SELECT first, last FROM unverified WHERE agent = ? AND epoch = ?", map_id)
+        return Gap(map_id, *rows[0]) if rows else None
 
     def verify(self, map_id: MapId, first: int, covered: int, kept: Collection[int]) -> list[Change]:
         """Delete unverified changes that the robot has dropped, since others undid them.
@@ -217,56 +333,47 @@ class Store(Protocol):
         Raises:
             InvalidFile: the disk does not take it; nothing is deleted.
         """
-
-    def landmarks(self, node: NodeId) -> int | None:
-        """How many landmarks a node has; None if there is no such node."""
-
-    def kept(self, agent: str) -> dict[MapId, tuple[int, int]]:
-        """Nodes and landmarks of each map of a robot."""
-
-    def edges(self, agent: str) -> dict[MapId, int]:
-        """Edges of each map of a robot; this reads through all of its logs."""
-
-    def stored_bytes(self, map_id: MapId, after: int, last: int) -> int:
-        """Bytes that are kept of the changes of a map behind `after`, up to `last`, taken or refused.
-
-        Each counts with its message and `ROW_BYTES`. This reads through that part of the log.
-        """
-
-    def superseded(self, map_id: MapId, most: int) -> list[tuple[int, int]]:
-        """Changes of a map that later ones of it supersede: without them its replay is the same map.
-
-        Of each node and edge that was put or retired the newest change stays, and the last retirement. This
-        reads through the log.
-
-        Args:
-            map_id: of the map.
-            most: so many at most.
-
-        Returns:
-            Sequence number and bytes of each, as in `stored_bytes`.
-        """
-
-    def drop(self, map_id: MapId, sequences: Sequence[int]) -> None:
-        """Delete superseded changes of a map.
-
-        The watermark stays, so the robot does not send again what is deleted.
-
-        Raises:
-            InvalidFile: the disk does not take it; nothing is deleted.
-        """
+        there = (
+            "SELECT sequence, stamp_ns, kind, number FROM change "
+            "WHERE agent = ? AND epoch = ? AND sequence BETWEEN ? AND ? ORDER BY sequence"
+        )
+        put = "SELECT 1 FROM change WHERE agent = ? AND epoch = ? AND kind = ? AND number = ? LIMIT 1"
+        retired: dict[tuple[str, int], Change] = {}
+        with self._transaction():
+            dropped = [row for row in self._read(there, (*map_id, first, covered)) if row[0] not in kept]
+            for sequence, *_ in dropped:
+                self._write(
+                    "DELETE FROM change WHERE agent = ? AND epoch = ? AND sequence = ?", (*map_id, sequence)
+                )
+            for sequence, stamp_ns, kind, number in dropped:
+                if kind in RETIREMENTS and not self._read(put, (*map_id, kind, number)):
+                    body = RETIREMENTS[kind](NodeId(*map_id, number))
+                    retired[kind, number] = Change(map_id, sequence, stamp_ns, body)
+            gone = [NodeId(*map_id, number) for kind, number in retired if kind == NodePut.__name__]
+            for _, some in _numbers(gone):
+                self._delete_nodes(map_id, some)
+            unverified = self.unverified(map_id)
+            self._write("DELETE FROM unverified WHERE agent = ? AND epoch = ?", map_id)
+            if unverified is not None and covered < unverified.last:
+                self._put("unverified", (*map_id, covered + 1, unverified.last))
+        self._count_again()
+        return list(retired.values())
 
     def refusals(self, map_id: MapId, newest: int = 16) -> list[Refusal]:
         """The newest changes of a map that were refused, in order."""
+        query = (
+            "SELECT sequence, reason FROM refused WHERE agent = ? AND epoch = ? "
+            "ORDER BY sequence DESC LIMIT ?"
+        )
+        return [Refusal(*row) for row in reversed(self._read(query, (*map_id, newest)))]
 
     def refused(self) -> int:
         """How many changes of any map were refused; of each map at most `MOST_REFUSALS` count."""
-
-    def traffic(self, map_id: MapId | None = None) -> Traffic:
-        """What a map has cost on the wire, or all maps together if none is named."""
+        return int(self._read("SELECT count(*) FROM refused")[0][0])
 
     def constraints(self) -> list[bytes]:
         """The manual constraints, in order."""
+        return self._record(CONSTRAINTS)
 
     def add_constraint(self, body: bytes) -> None:
         """Add a manual constraint.
@@ -275,12 +382,15 @@ class Store(Protocol):
             InvalidValue: there are too many.
             InvalidFile: the disk does not take it.
         """
+        self._add_to_record(CONSTRAINTS, body, MAX_CONSTRAINTS)
 
     def annotations(self) -> list[bytes]:
         """The annotations, in order."""
+        return self._record(ANNOTATIONS)
 
     def add_annotation(self, body: bytes) -> None:
         """Add an annotation; see `add_constraint`."""
+        self._add_to_record(ANNOTATIONS, body, MAX_ANNOTATIONS)
 
     def put_result(self, name: str, value: bytes) -> None:
         """Store another result of the server.
@@ -288,19 +398,137 @@ class Store(Protocol):
         Raises:
             InvalidFile: the disk does not take it.
         """
+        with self._transaction():
+            self._put("result", (name, value))
 
     def result(self, name: str) -> bytes | None:
         """The result of this name."""
+        rows = self._read("SELECT value FROM result WHERE name = ?", (name,))
+        return bytes(rows[0][0]) if rows else None
 
-    def close(self) -> None:
-        """Close it. Idempotent."""
+    def _apply(self, run: LogChanges, logs: dict[MapId, Position]) -> Applied | MapweaveError:
+        stored_id, watermark = logs.get(run.map_id, (run.log_id, 0))
+        if stored_id != run.log_id and watermark > 0:
+            return InvalidValue(f"another log goes by the name {run.map_id}: begin a fresh map")
+        before = watermark
+        changes: list[Change] = []
+        refusals: list[Refusal] = []
+        for entry in run.entries:
+            if entry.sequence <= watermark:
+                continue
+            if entry.sequence > watermark + 1 and run.covered is None:
+                break
+            self._take(run.map_id, entry, changes, refusals)
+            watermark = entry.sequence
+        watermark = max(watermark, run.covered or 0)
+        self._put("log", (*run.map_id, str(run.log_id), watermark))
+        logs[run.map_id] = Position(run.log_id, watermark)
+        return Applied(tuple(changes), tuple(refusals), watermark, before)
+
+    def _record(self, table: str) -> list[bytes]:
+        return [bytes(body) for (body,) in self._read(f"SELECT body FROM {table} ORDER BY number")]
+
+    def _add_to_record(self, table: str, body: bytes, most: int) -> None:
+        with self._transaction():
+            self._lock_table(table)
+            count, newest = self._read(f"SELECT count(*), coalesce(max(number), 0) FROM {table}")[0]
+            if count >= most:
+                raise InvalidValue(f"the record of {table.replace('_', ' ')}s is full: {most}")
+            self._put(table, (newest + 1, body))
+
+    def _delete_nodes(self, map_id: MapId, numbers: Sequence[int]) -> None:
+        """Of one map, no more than `_numbers` gives at once."""
+        self._write(
+            f"DELETE FROM node WHERE agent = ? AND epoch = ? AND number IN ({_marks(numbers)})",
+            (*map_id, *numbers),
+        )
+
+    def _take(
+        self,
+        map_id: MapId,
+        entry: ReceivedChange,
+        changes: list[Change],
+        refusals: list[Refusal],
+        restored: bool = False,
+    ) -> None:
+        """Store a change, or store it aside with the reason."""
+        reason = entry.change if isinstance(entry.change, str) else self._objection(entry.change)
+        if isinstance(entry.change, str) or reason:
+            refusals.append(Refusal(entry.sequence, reason))
+            count = self._read("SELECT count(*) FROM refused WHERE agent = ? AND epoch = ?", map_id)[0][0]
+            if count >= MOST_REFUSALS:
+                self._write(OLDEST_REASON, (*map_id, *map_id, MOST_REFUSED_KEPT))
+            message = b"" if count >= MOST_REFUSED_KEPT else entry.message
+            self._put("refused", (*map_id, entry.sequence, reason, message))
+        else:
+            changes.append(entry.change)
+            self._insert(entry, entry.change, restored)
+
+    def _insert(self, entry: ReceivedChange, change: Change, restored: bool) -> None:
+        _, stamp_ns, body = unwrap_body(entry.message)
+        kind, number = type(change.body).__name__, element_of(change.body).number
+        values = (*change.map, entry.sequence, stamp_ns, kind, number, len(entry.message), body)
+        self._put("change", values)
+        later = (
+            "SELECT 1 FROM change WHERE agent = ? AND epoch = ? AND sequence > ? AND number = ? AND kind = ?"
+        )
+        if isinstance(change.body, NodePut) and not (
+            restored and self._read(later, (*change.map, entry.sequence, number, kind))
+        ):
+            self._put("node", (*change.map, number, len(change.body.node.landmarks)))
+
+    def _may_undo(self, change: Change) -> bool:
+        """Whether the log goes on behind a change with something that depends on its place in the order."""
+        if not isinstance(change.body, NodePut | EdgePut):
+            return True
+        query = (
+            "SELECT 1 FROM change WHERE agent = ? AND epoch = ? AND sequence > ? "
+            "AND (number = ? OR kind IN (?, ?)) LIMIT 1"
+        )
+        retired = (NodeRetired.__name__, EdgeRetired.__name__)
+        number = element_of(change.body).number
+        return bool(self._read(query, (*change.map, change.sequence, number, *retired)))
+
+    def _objection(self, change: Change) -> str:
+        """Why a decoded change is refused; empty if it is accepted."""
+        if isinstance(change.body, EdgePut) and len(change.body.edge.shared):
+            edge = change.body.edge
+            for end, highest in zip((edge.a, edge.b), edge.shared.max(axis=0), strict=True):
+                count = self.landmarks(end)
+                if count is not None and highest >= count:
+                    return f"edge {edge.id} shares landmark {highest} of {end}, which has {count}"
+        return ""
+
+    @abstractmethod
+    def _begin(self, runs: Sequence[LogChanges]) -> dict[MapId, Position]:
+        """The logs of these runs that are stored; only this transaction changes them until the commit."""
+
+    @abstractmethod
+    def _lock_table(self, table: str) -> None:
+        """Only this transaction changes it until the commit."""
+
+    @abstractmethod
+    def _put(self, table: str, values: Sequence[object]) -> None:
+        """Inside a transaction: put a row into a table, in the place of one with the same key."""
+
+
+def _marks(values: Sequence[object]) -> str:
+    """Of values in a query."""
+    return ", ".join("?" * len(values))
+
+
+def _numbers(elements: Iterable[NodeId]) -> list[tuple[MapId, Sequence[int]]]:
+    """The numbers of elements by their maps, so many at once."""
+    by_map: dict[MapId, list[int]] = {}
+    for element in sorted(elements):
+        by_map.setdefault(element.map, []).append(element.number)
+    return [
+        (map_id, numbers[first : first + PRUNED_AT_ONCE])
+        for map_id, numbers in by_map.items()
+        for first in range(0, len(numbers), PRUNED_AT_ONCE)
+    ]
 
 
 def fresh_id() -> int:
     """For a store that is made now."""
     return secrets.randbits(62) + 1
-
-
-def name_taken(map_id: MapId) -> InvalidValue:
-    """The error of a run whose log is not the one that is stored."""
-    return InvalidValue(f"another log goes by the name {map_id}: begin a fresh map")

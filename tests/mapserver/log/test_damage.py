@@ -20,7 +20,6 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.mapserver.explainer import ConstraintRecord
-from mapweave.mapserver.log import sql_store
 from mapweave.mapserver.log.entry import Traffic
 from mapweave.mapserver.log.integrity import checksum
 from mapweave.mapserver.log.sqlite_store import SqliteStore
@@ -303,7 +302,7 @@ def test_a_damaged_constraint_costs_only_itself(fleet: Fleet, caplog: pytest.Log
 
 
 def test_the_number_of_constraints_is_limited(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sql_store, "MAX_CONSTRAINTS", 7)
+    monkeypatch.setattr("mapweave.mapserver.log.store.MAX_CONSTRAINTS", 7)
     store = SqliteStore(fleet.path)
     book = ConstraintRecord(store)
     constraint = book.constraints.made[0]

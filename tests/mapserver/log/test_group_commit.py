@@ -39,7 +39,7 @@ def run(map_id: MapId, sequences: list[int], covered: int | None = None, log_id:
 def contents(path: Path) -> dict[MapId, object]:
     store = SqliteStore(path)
     try:
-        return {m: (store.log_id(m), store.watermark(m), list(store.replay(m))) for m in store.maps()}
+        return {m: (store.positions([m]), store.watermark(m), list(store.replay(m))) for m in store.maps()}
     finally:
         store.close()
 

@@ -329,7 +329,7 @@ def test_a_beacon_beyond_all_logs_moves_only_its_own(
 
 
 def test_undecodable_changes_fill_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("mapweave.mapserver.log.sql_store.MOST_REFUSED_KEPT", 5)
+    monkeypatch.setattr("mapweave.mapserver.log.store.MOST_REFUSED_KEPT", 5)
     store = SqliteStore(tmp_path / "s0.sqlite")
     entries = [ReceivedChange.read(MAP, sequence, b"\xc1" * 100_000) for sequence in range(1, 51)]
     store.apply(MAP, LOG_ID, entries)

@@ -77,7 +77,7 @@ def content(store: Store) -> list[object]:
     return [
         store.maps(), store.positions(), store.refused(), store.damaged(),
         store.constraints(), store.annotations(), store.result("poses"), store.kept("r0"), store.traffic(),
-        *((store.watermark(m), store.log_id(m), store.refusals(m, 3)) for m in (MAP, OTHER)),
+        *((store.watermark(m), store.positions([m]), store.refusals(m, 3)) for m in (MAP, OTHER)),
         *(store.unverified(m) for m in (MAP, OTHER)),
         *(store.traffic(m) for m in (MAP, OTHER)),
         *([(c.sequence, c.stamp_ns, encode_body(c.body)) for c in store.replay(m, 2)] for m in (MAP, OTHER)),

@@ -19,14 +19,14 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.mapserver.log import sql_store, sqlite_store
+from mapweave.mapserver.log import sqlite_store
 from mapweave.mapserver.log.entry import Applied, ReceivedChange
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.postgres_store import PostgresStore
-from mapweave.mapserver.log.sql_sizes import SqlSizes
+from mapweave.mapserver.log.sql_sizes import ROW_BYTES, SqlSizes
 from mapweave.mapserver.log.sqlite_store import SqliteStore
-from mapweave.mapserver.log.store import ROW_BYTES, LogChanges, Store
+from mapweave.mapserver.log.store import LogChanges, Store
 from mapweave.wire.codec import encode_body, encode_change
 from mapweave.wire.log_messages import Refusal
 from synthetic.postgres_server import PostgresServer
@@ -80,7 +80,7 @@ def sequences(store: Store, map_id: MapId = MAP) -> list[int]:
 
 
 def test_an_unknown_map_is_empty(store: Store) -> None:
-    assert (store.maps(), store.watermark(MAP), store.log_id(MAP), sequences(store)) == ([], 0, None, [])
+    assert (store.maps(), store.watermark(MAP), store.positions(), sequences(store)) == ([], 0, {}, [])
 
 
 def test_doubles_are_left_out_and_gaps_stop(store: Store) -> None:
@@ -108,7 +108,7 @@ def test_all_is_there_after_a_restart(place: Path | str) -> None:
     assert store.id == store_id
     assert store.maps() == [MAP, OTHER]
     assert (store.maps("r1"), store.maps("r")) == ([OTHER], [])
-    assert (store.watermark(MAP), store.log_id(MAP)) == (3, 2**64 - 1)
+    assert store.positions([MAP]) == {MAP: (2**64 - 1, 3)}
     replayed = list(store.replay(MAP))
     assert [(c.sequence, c.stamp_ns) for c in replayed] == [(1, 7), (3, 7)]
     assert encode_body(replayed[0].body) == encode_body(node_put(1, 3))
@@ -429,8 +429,8 @@ def test_a_compacted_map_is_the_same(
 
 
 def test_reasons_of_refusals_are_bounded(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sql_store, "MOST_REFUSED_KEPT", 3)
-    monkeypatch.setattr(sql_store, "MOST_REFUSALS", 10)
+    monkeypatch.setattr("mapweave.mapserver.log.store.MOST_REFUSED_KEPT", 3)
+    monkeypatch.setattr("mapweave.mapserver.log.store.MOST_REFUSALS", 10)
     store.apply(MAP, 5, [broken(k) for k in range(1, 41)])
     assert store.refused() == 10 and store.watermark(MAP) == 40
     assert [refusal.sequence for refusal in store.refusals(MAP)] == [1, 2, 3, *range(34, 41)]
