@@ -7,7 +7,7 @@ Ingest -> Store -> MergeWorker -> Answers <- Services <- robots, over the bus
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field, replace
 from importlib.metadata import version
@@ -15,15 +15,13 @@ from pathlib import Path
 from types import TracebackType
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
-from mapweave.hybridmap.annotation import Annotation, Annotations
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.explanation import Explanation
-from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.mission_order import MissionKind, MissionReport, MissionRequest, Missions
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
+from mapweave.hybridmap.mission_order import MissionKind, MissionReport
+from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.annotator import AnnotationRecord, Annotator
 from mapweave.mapserver.answers import Answers
@@ -221,7 +219,16 @@ class MapServer:
             self._bus, self._keys, self._name, self._named_places, self._annotations, self._plans.check,
             lambda: self._constraints.constraints, self._apply_annotations, clock.time_ns,
         )  # fmt: skip
-        self._views = NodeViews(self._bus, self._keys, lambda: worker.current().merged)
+        self._views = views = NodeViews(self._bus, self._keys, lambda: worker.current().merged)
+        # What people ask, from any thread; see mapserver.http.answering.
+        self.locate, self.map_file = self._services.locate, self._services.map_file
+        self.history, self.constraints = self._explainer.history, self._explainer.constraints
+        self.constrain, self.annotate = self._explainer.constrain, self._annotator.annotate
+        self.plans, self.plan_image = self._plans.plans, self._plans.image
+        self.put_plan_image, self.kept_image = self._plans.put, self._plans.images.get
+        self.resolve, self.why_no_view, self.view = self._annotator.resolve, views.why_none, views.view
+        self.command, self.missions = self._missions.command, self._missions.missions
+        self.portal_done, self.metrics = self._missions.portal_done, self._metrics.scrape
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         self._metrics.read(self._sources())
         clock.every(STATUS_EVERY, self._publish)
@@ -295,18 +302,6 @@ class MapServer:
             **self._admission.counters(),
         }
 
-    def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
-        """Ask where a view was taken, from any thread; as long as robots ask, one waits one's turn.
-
-        Args:
-            look: makes the view; called by a worker.
-            ticket: the same if the same image comes again, see AdmissionControl.submit.
-
-        Raises:
-            Busy: too many ask.
-        """
-        return self._services.locate(look, ticket)
-
     def explain(self, request: ExplainRequest) -> Future[Explanation]:
         """Ask why nodes or maps are linked or are not, or why a route leads so, from any thread.
 
@@ -315,96 +310,9 @@ class MapServer:
         """
         return self._admission.submit(lambda: self._explainer.explain(request), usual=False)
 
-    def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps, manual constraints, annotations and commands, in order."""
-        return self._explainer.history()
-
     def annotations(self) -> Annotations:
         """What people say about the map."""
         return self._annotations.annotations
-
-    def annotate(self, annotation: Annotation, check: bool = False) -> str:
-        """Add an annotation to the record, or only check it, from any thread; says what it does in words.
-
-        Raises:
-            InvalidValue: it says nothing new, or is about something that is not there.
-        """
-        return self._annotator.annotate(annotation, check)
-
-    def plans(self) -> PlacedPlans:
-        """Floor plans under the newest merged map, from any thread."""
-        return self._plans.plans()
-
-    def plan_image(self, name: str) -> bytes:
-        """The PNG file of a floor plan, from any thread.
-
-        Raises:
-            InvalidValue: there is none of this name.
-            InvalidFile: its image is lost.
-        """
-        return self._plans.image(name)
-
-    def kept_image(self, sha256: str) -> bytes:
-        """The PNG file of an image that was put here, whether a plan names it or not yet; from any thread.
-
-        Raises:
-            InvalidFile: it is not there, or damaged.
-        """
-        return self._plans.images.get(sha256)
-
-    def put_plan_image(self, data: bytes, negate: bool = False) -> PlanImage:
-        """Keep the image of a floor plan, from any thread; an annotation names it afterwards.
-
-        Args:
-            data: an image file.
-            negate: exchange light and dark, as a map.yaml says.
-
-        Raises:
-            InvalidValue: it is no image, or too large.
-        """
-        return self._plans.put(data, negate)
-
-    def why_no_view(self, node: NodeId) -> str:
-        """Why asking for the image of a node is of no use, from any thread; empty if it is worth it."""
-        return self._views.why_none(node)
-
-    def view(self, node: NodeId) -> bytes:
-        """The image of a node, a JPEG file, from any thread; waits for its robot.
-
-        Raises:
-            InvalidValue: there is no such node.
-            NoView: its robot is away, or has kept none.
-            Busy: it may be had later.
-        """
-        return self._views.view(node)
-
-    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
-        """Nodes for words, from any thread.
-
-        Raises:
-            InvalidValue: a word is none, with the reason.
-        """
-        return self._annotator.resolve(request)
-
-    def constraints(self) -> ConstraintList:
-        """The record of manual constraints, in order."""
-        return self._explainer.constraints()
-
-    def constrain(self, request: ConstraintRequest) -> str:
-        """Keep a manual constraint, or only check it, from any thread; says what it does in words.
-
-        Raises:
-            InvalidValue: it has no effect, or contradicts the map.
-        """
-        return self._explainer.constrain(request)
-
-    def command(self, request: MissionRequest) -> MissionReport:
-        """Hand a mission on to its robot, from any thread; waits for the robot's answer.
-
-        Raises:
-            InvalidValue: there is no such robot, or no such goal.
-        """
-        return self._missions.command(request)
 
     def give(
         self,
@@ -419,29 +327,9 @@ class MapServer:
         """Give a robot a mission that is newer than the one that holds it; see `command`."""
         return self._missions.command(self._missions.request(robot, kind, goal, by, mission_id, via, because))
 
-    def portal_done(self, robot: str, by: str) -> str:
-        """Tell a robot that it was taken through a portal, from any thread; returns what it does, in words.
-
-        Raises:
-            InvalidValue: it does not wait at a portal, or does not answer.
-        """
-        return self._missions.portal_done(robot, by)
-
-    def missions(self) -> Missions:
-        """The missions that are known, oldest first."""
-        return self._missions.missions()
-
     def robots(self) -> FleetStatus:
         """The robots, and where they are."""
         return self._roster.robots(self._named_places())
-
-    def map_file(self) -> Future[bytes]:
-        """The merged map as a map file."""
-        return self._services.map_file()
-
-    def metrics(self) -> bytes:
-        """What Prometheus scrapes, in its text format; from any thread."""
-        return self._metrics.scrape()
 
     def _sources(self) -> Sources:
         worker, ingest = self._worker, self._ingest

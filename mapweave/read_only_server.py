@@ -10,14 +10,14 @@ from importlib.metadata import version
 from typing import NoReturn
 
 from mapweave.hybridmap.agent_status import FleetStatus
-from mapweave.hybridmap.annotation import Annotation, Annotations
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import Explanation
-from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
+from mapweave.hybridmap.floor_plan import PlacedPlans
 from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraints
+from mapweave.hybridmap.manual_constraint import ConstraintList, ManualConstraints
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
+from mapweave.hybridmap.mission_order import Missions
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.mapserver.admission_control import AdmissionControl
 from mapweave.mapserver.constraint_history import with_constraints
@@ -36,8 +36,27 @@ from mapweave.wire.log_messages import Scalar
 NO_VIEWS = "a map file has no views"
 
 
+def _refused(why: str) -> Callable[..., NoReturn]:
+    """A method that refuses to change anything, as InvalidValue."""
+
+    def refuse(self: ReadOnlyServer, *_: object) -> NoReturn:
+        raise InvalidValue(
+            f"{self._opened.name} is only shown, and nothing of it changes: {why}; "
+            "`mapweave server --map FILE` serves it to robots"
+        )
+
+    return refuse
+
+
 class ReadOnlyServer:
     """Answers what `mapserver.http.web.Web` asks. A context manager; any thread may ask."""
+
+    annotate = _refused("`mapweave place add --map FILE -o OUT` and the like write an annotated copy")
+    put_plan_image = _refused("`mapweave plan add --map FILE -o OUT` writes a copy with a plan")
+    constrain = _refused("`mapweave map link | unmerge | retire --map FILE -o OUT` write a corrected copy")
+    give = _refused("there are no robots to send")
+    portal_done = _refused("there are no robots")
+    metrics = _refused("a map file has no metrics")
 
     def __init__(self, opened: OpenedMap, merged: MergedMap, settings: MergeSettings | None = None) -> None:
         """Begin to prepare answers, in the background.
@@ -116,14 +135,6 @@ class ReadOnlyServer:
         """What people say about the map."""
         return self._annotations
 
-    def annotate(self, annotation: Annotation, check: bool = False) -> str:
-        """Refuse an annotation.
-
-        Raises:
-            InvalidValue: always.
-        """
-        self._refuse("`mapweave place add --map FILE -o OUT` and the like write an annotated copy")
-
     def plans(self) -> PlacedPlans:
         """Floor plans under the map."""
         return placed_plans(self._annotations, self._merged)
@@ -149,14 +160,6 @@ class ReadOnlyServer:
             raise InvalidValue(f"the image {sha256[:12]} is not in {self._opened.name}")
         return self._opened.content.images[sha256]
 
-    def put_plan_image(self, data: bytes, negate: bool = False) -> PlanImage:
-        """Refuse an image.
-
-        Raises:
-            InvalidValue: always.
-        """
-        self._refuse("`mapweave plan add --map FILE -o OUT` writes a copy with a plan")
-
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         """Nodes for words.
 
@@ -172,39 +175,6 @@ class ReadOnlyServer:
     def missions(self) -> Missions:
         """There are none."""
         return Missions()
-
-    def give(
-        self,
-        robot: str,
-        kind: MissionKind,
-        goal: str,
-        by: str,
-        mission_id: str,
-        via: tuple[str, ...],
-        because: str = "",
-    ) -> MissionReport:
-        """Refuse a mission.
-
-        Raises:
-            InvalidValue: always.
-        """
-        self._refuse("there are no robots to send")
-
-    def metrics(self) -> bytes:
-        """Refuse: nothing changes, so there is nothing to measure.
-
-        Raises:
-            InvalidValue: always.
-        """
-        self._refuse("a map file has no metrics")
-
-    def portal_done(self, robot: str, by: str) -> str:
-        """Refuse.
-
-        Raises:
-            InvalidValue: always.
-        """
-        self._refuse("there are no robots")
 
     def why_no_view(self, node: NodeId) -> str:
         """Maps have no images."""
@@ -222,14 +192,6 @@ class ReadOnlyServer:
         """What people decided, in order."""
         return ConstraintList(tuple(self._opened.content.constraints))
 
-    def constrain(self, request: ConstraintRequest) -> str:
-        """Refuse a correction.
-
-        Raises:
-            InvalidValue: always.
-        """
-        self._refuse("`mapweave map link | unmerge | retire --map FILE -o OUT` write a corrected copy")
-
     def map_file(self) -> Future[bytes]:
         """The map as a map file."""
         return self._background.submit(lambda: self._packed)
@@ -241,9 +203,3 @@ class ReadOnlyServer:
     @cached_property
     def _packed(self) -> bytes:
         return pack_map_file(self._opened.file(self._merged))
-
-    def _refuse(self, why: str) -> NoReturn:
-        raise InvalidValue(
-            f"{self._opened.name} is only shown, and nothing of it changes: {why}; "
-            "`mapweave server --map FILE` serves it to robots"
-        )

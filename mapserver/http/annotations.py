@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from typing import Any, Protocol
+from typing import Any
 
 import msgspec
 
-from mapweave.hybridmap.annotation import MAX_NAME, Annotation, Annotations
+from mapweave.hybridmap.annotation import MAX_NAME
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan
-from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.mapserver.floor_plans import placed_plan
+from mapweave.mapserver.http.answering import Answering
 from mapweave.mapserver.http.json_body import read_json
 from mapweave.mapserver.http.json_values import json_values, time_of
-from mapweave.merge.pose_graph.merged_map import MergedMap
 
 EXAMPLES = {
     "name": '"kitchen"',
@@ -38,23 +37,7 @@ class _Posted(msgspec.Struct, forbid_unknown_fields=True):
     because: str = ""
 
 
-class Annotating(Protocol):
-    """What a map server offers, see MapServer."""
-
-    def annotations(self) -> Annotations:
-        """What people say about the map."""
-
-    def annotate(self, annotation: Annotation, check: bool = False) -> str:
-        """Add an annotation, or only check it."""
-
-    def merged(self) -> MergedMap:
-        """The newest merged map."""
-
-    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
-        """Nodes for words."""
-
-
-def annotations_json(server: Annotating) -> Mapping[str, Any]:
+def annotations_json(server: Answering) -> Mapping[str, Any]:
     """The whole record, and which of its entries hold now: each by the number of its place in the record."""
     record = server.annotations()
     holding = {id(record.last(entry.kind, entry.name)) for entry in record.made}
@@ -72,7 +55,7 @@ def annotations_json(server: Annotating) -> Mapping[str, Any]:
     }
 
 
-def annotate(server: Annotating, data: bytes, by: str, who: str = "") -> Mapping[str, Any]:
+def annotate(server: Answering, data: bytes, by: str, who: str = "") -> Mapping[str, Any]:
     """Add the annotation of a request.
 
     Args:

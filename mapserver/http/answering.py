@@ -6,18 +6,64 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Protocol
 
+from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.explanation import Explanation
+from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest
+from mapweave.hybridmap.map_event import MapEvent
 from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
-from mapweave.mapserver.http.annotations import Annotating
-from mapweave.mapserver.http.live import Shown
-from mapweave.mapserver.http.nodes import Showing
-from mapweave.mapserver.http.plans import Planning
+from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.log_messages import Scalar
 
 
-class Answering(Annotating, Planning, Showing, Shown, Protocol):
+class Answering(Protocol):
     """The questions, as of a MapServer or a map file: from any thread; a MapweaveError refuses one."""
+
+    def annotations(self) -> Annotations:
+        """What people say about the map."""
+
+    def annotate(self, annotation: Annotation, check: bool = False) -> str:
+        """Add an annotation, or only check it."""
+
+    def merged(self) -> MergedMap:
+        """The newest merged map; the same object as long as nothing has changed."""
+
+    def resolve(self, request: ResolveRequest) -> ResolveAnswer:
+        """Nodes for words."""
+
+    def why_no_view(self, node: NodeId) -> str:
+        """Why asking for the image of a node is of no use; empty if it is worth it."""
+
+    def view(self, node: NodeId) -> bytes:
+        """The image of a node, a JPEG file; NoView says why there is none."""
+
+    def plans(self) -> PlacedPlans:
+        """Floor plans under the newest merged map."""
+
+    def plan_image(self, name: str) -> bytes:
+        """The PNG file of a plan."""
+
+    def kept_image(self, sha256: str) -> bytes:
+        """The PNG file of an image, by its content."""
+
+    def put_plan_image(self, data: bytes, negate: bool = False) -> PlanImage:
+        """Keep the image of a plan."""
+
+    @property
+    def read_only(self) -> bool:
+        """Whether nothing can be changed, and no robot be moved, as with a map file."""
+
+    def robots(self) -> FleetStatus:
+        """The robots, and where they are."""
+
+    def history(self) -> tuple[MapEvent, ...]:
+        """The history of the maps."""
+
+    def status(self) -> dict[str, Scalar]:
+        """What the server holds and does."""
 
     def locate(self, look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
         """Where a view was taken."""

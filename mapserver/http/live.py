@@ -14,17 +14,17 @@ import threading
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, Protocol
+from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.websockets import WebSocket, WebSocketDisconnect
 
-from mapweave.hybridmap.agent_status import LONGEST_STATUS_PERIOD, FleetStatus
-from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.agent_status import LONGEST_STATUS_PERIOD
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.map_event import History, MapEvent
+from mapweave.mapserver.http.answering import Answering
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.last_shown import NOTHING, LastShown
 from mapweave.mapserver.http.live_map import LiveMap, Pair
@@ -55,33 +55,10 @@ SERVER_FIELDS = ("summary", "settled", "event", "loading")
 """Of the server's status, which are sent along."""
 
 
-class Shown(Protocol):
-    """What viewers see; from any thread."""
-
-    @property
-    def read_only(self) -> bool:
-        """Whether nothing can be changed, and no robot be moved, as with a map file."""
-
-    def merged(self) -> MergedMap:
-        """The newest merged map; the same object as long as nothing has changed."""
-
-    def annotations(self) -> Annotations:
-        """What people say about the map."""
-
-    def robots(self) -> FleetStatus:
-        """The robots, and where they are."""
-
-    def history(self) -> tuple[MapEvent, ...]:
-        """The history of the maps."""
-
-    def status(self) -> dict[str, Scalar]:
-        """What the server holds and does."""
-
-
 class LiveUpdates:
     """Sends changes of the shown map to the viewers' pages; idle while there are none."""
 
-    def __init__(self, server: Shown, access: RequestAuthorization, before: LastShown = NOTHING) -> None:
+    def __init__(self, server: Answering, access: RequestAuthorization, before: LastShown = NOTHING) -> None:
         """Begin with no viewer.
 
         Args:

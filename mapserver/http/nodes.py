@@ -4,40 +4,23 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
 from http import HTTPStatus
-from typing import Any, Protocol
+from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 from starlette.responses import Response
 
-from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.ids import NodeId
+from mapweave.mapserver.http.answering import Answering
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.node_details import node_details
 from mapweave.mapserver.node_views import NoView
-from mapweave.merge.pose_graph.merged_map import MergedMap
 
 Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
 
 
-class Showing(Protocol):
-    """What a map server offers, see MapServer."""
-
-    def merged(self) -> MergedMap:
-        """The newest merged map."""
-
-    def annotations(self) -> Annotations:
-        """What people say about the map."""
-
-    def why_no_view(self, node: NodeId) -> str:
-        """Why asking for the image of a node is of no use; empty if it is worth it."""
-
-    def view(self, node: NodeId) -> bytes:
-        """The image of a node, a JPEG file; NoView says why there is none."""
-
-
-def node_answers(server: Showing) -> list[tuple[str, str, str, Answer]]:
+def node_answers(server: Answering) -> list[tuple[str, str, str, Answer]]:
     """Method, path, question and answer of what is asked about a node."""
 
     async def node(request: Request) -> Mapping[str, Any]:

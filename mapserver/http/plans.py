@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from starlette.concurrency import run_in_threadpool
 from starlette.requests import Request
 from starlette.responses import Response
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
-from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
+from mapweave.mapserver.http.answering import Answering
 from mapweave.mapserver.http.form import form_parts
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.storage.nav2_map import parse_nav2_map
@@ -19,24 +19,8 @@ from mapweave.storage.nav2_map import parse_nav2_map
 Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
 
 
-class Planning(Protocol):
-    """What a map server offers, see MapServer."""
-
-    def plans(self) -> PlacedPlans:
-        """Floor plans under the newest merged map."""
-
-    def plan_image(self, name: str) -> bytes:
-        """The PNG file of a plan."""
-
-    def kept_image(self, sha256: str) -> bytes:
-        """The PNG file of an image, by its content."""
-
-    def put_plan_image(self, data: bytes, negate: bool = False) -> PlanImage:
-        """Keep the image of a plan."""
-
-
 def plan_answers(
-    server: Planning, body_of: Callable[[Request], Awaitable[bytes]]
+    server: Answering, body_of: Callable[[Request], Awaitable[bytes]]
 ) -> list[tuple[str, str, str, Answer]]:
     """Method, path, question and answer of what is asked about plans.
 
@@ -68,7 +52,7 @@ def plan_answers(
     ]
 
 
-def keep_image(server: Planning, content_type: str, body: bytes) -> Mapping[str, Any]:
+def keep_image(server: Answering, content_type: str, body: bytes) -> Mapping[str, Any]:
     """Keep the image of a plan.
 
     Args:
