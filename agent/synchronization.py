@@ -28,19 +28,15 @@ class Synchronization(Protocol):
     @property
     def answer_timeout(self) -> float:
         """After which a question counts as unanswered, s."""
-        ...
 
     def changes_submitted(self, replicator: Replicator, fleet: FleetClient) -> None:
         """Called when a tick has handed over changes of the map."""
-        ...
 
     def before_questions(self) -> None:
         """Called before questions are sent."""
-        ...
 
     def answers(self, fleet: FleetClient) -> tuple[ServerAnswer, ...]:
         """Answers to the questions that were just sent, as far as the loop waits for them."""
-        ...
 
 
 class FreeRunning:

@@ -24,7 +24,6 @@ class NodeRetrieval(Protocol):
 
     def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> Ranked:
         """At most k nodes with how much they look like a view, best first."""
-        ...
 
 
 class ActiveNodes:

@@ -47,47 +47,36 @@ class Schedule(Protocol):
 
     def monotonic(self) -> float:
         """A clock that only grows, s."""
-        ...
 
     def time_ns(self) -> int:
         """Wall time, ns since 1970."""
-        ...
 
     def observe(self, stamp_ns: int) -> None:
         """Take note of the time that a robot's message carries."""
-        ...
 
     def post(self, job: Job) -> None:
         """Have a job run in the background, one after the other."""
-        ...
 
     def idle(self, job: IdleJob) -> None:
         """Run a job in the background whenever no posted job waits. There is one such job."""
-        ...
 
     def every(self, period: float, job: Job) -> None:
         """Have a job run every so many seconds, however busy the background is."""
-        ...
 
     def executor(self, workers: int) -> Executor:
         """Where questions are answered; the caller shuts it down."""
-        ...
 
     def catch_up(self) -> None:
         """Called before a question is answered: in lock-step all that was posted is done first."""
-        ...
 
     def give_way(self, busy: Callable[[], bool]) -> None:
         """Hold the background back as long as something more urgent goes on, a little at each pause."""
-        ...
 
     def pause(self) -> None:
         """Called in the background, before each job and between the pieces of a long one."""
-        ...
 
     def start(self) -> None:
         """Start. Idempotent."""
-        ...
 
     def close(self) -> bool:
         """End; returns whether nothing of it runs any more. Idempotent.
@@ -95,7 +84,6 @@ class Schedule(Protocol):
         Jobs that wait may be dropped and the one that runs may be interrupted at its next pause: what the
         background makes is derived from the record, and made again at the next start.
         """
-        ...
 
 
 class _Ended(BaseException):

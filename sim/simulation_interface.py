@@ -21,7 +21,6 @@ class SimulatedWorld(Protocol):
     @property
     def plan(self) -> BuildingPlan:
         """The floor plan."""
-        ...
 
 
 class Simulated(Protocol):
@@ -30,64 +29,49 @@ class Simulated(Protocol):
     @property
     def world(self) -> SimulatedWorld:
         """Where it takes place."""
-        ...
 
     @property
     def robots(self) -> tuple[str, ...]:
         """Names."""
-        ...
 
     @property
     def tick(self) -> int:
         """How many ticks are over."""
-        ...
 
     @property
     def stamp_ns(self) -> int:
         """The simulation's time."""
-        ...
 
     @property
     def seconds(self) -> Mapping[str, float]:
         """Wall time by part, s."""
-        ...
 
     def describe(self, name: str) -> RobotDescription:
         """Camera, footprint, limits."""
-        ...
 
     def advance(self, commands: Mapping[str, Command]) -> None:
         """One tick; robots without a command stand still."""
-        ...
 
     def observe(self, name: str) -> Observation:
         """What a robot senses now, with its odometry since it was asked before."""
-        ...
 
     def apply(self, event: SimEvent, /) -> str:
         """Execute an event between two ticks; returns one line for people."""
-        ...
 
     def snapshot(self) -> Snapshot:
         """The view from above, and the robots' last images."""
-        ...
 
     def kidnap(self, name: str, world_from_robot: Pose2, /) -> None:
         """Put a robot elsewhere."""
-        ...
 
     def truth(self, name: str) -> Pose2:
         """`world_from_robot` now."""
-        ...
 
     def truth_at(self, name: str, stamp_ns: int) -> Pose2:
         """`world_from_robot` at a time that is over."""
-        ...
 
     def trajectory(self, name: str) -> tuple[NDArray[np.int64], Array]:
         """(N,) ns and (N, 3) `world_from_robot` of each tick."""
-        ...
 
     def collisions(self, name: str) -> int:
         """Number of a robot's collisions."""
-        ...

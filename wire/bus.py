@@ -31,16 +31,13 @@ class Request(Protocol):
     @property
     def key(self) -> str:
         """The key that was asked."""
-        ...
 
     @property
     def payload(self) -> bytes:
         """What was asked."""
-        ...
 
     def reply(self, payload: bytes) -> None:
         """Answer. A second answer is ignored."""
-        ...
 
     def refuse(self, reason: str, retry_after: float = 0.0) -> None:
         """Answer with an error that the asker can log.
@@ -49,7 +46,6 @@ class Request(Protocol):
             reason: in words.
             retry_after: seconds after which the same question may be answered; 0: to ask again does not help.
         """
-        ...
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,7 +74,6 @@ class Closing(Protocol):
 
     def close(self) -> None:
         """Take it back. Twice is no error."""
-        ...
 
 
 class Bus(Protocol):
@@ -91,7 +86,6 @@ class Bus(Protocol):
 
     def publish(self, key: str, payload: bytes, attachment: bytes = b"") -> None:
         """Send best-effort; never blocks the caller, never raises for a missing connection."""
-        ...
 
     def subscribe(self, pattern: str, handler: Callable[[Sample], None], *, direct: bool = False) -> Closing:
         """Call the handler with each message whose key the pattern (`*`, `**`) matches.
@@ -103,11 +97,9 @@ class Bus(Protocol):
                 called in the transport's thread, beside the other handlers. Each thread between costs more
                 than the message.
         """
-        ...
 
     def serve(self, key: str, handler: Callable[[Request], None]) -> Closing:
         """Answer questions. A handler that raises MapweaveError refuses with its text, and Busy its time."""
-        ...
 
     def ask(
         self, key: str, payload: bytes, timeout: float, enough: Callable[[Reply], bool] = never
@@ -123,25 +115,19 @@ class Bus(Protocol):
         Returns:
             The replies. An empty list means that there is no server.
         """
-        ...
 
     def announce(self, key: str) -> Closing:
         """Be alive under this key until closed or dead."""
-        ...
 
     def watch(self, pattern: str, handler: Callable[[str, bool], None]) -> Closing:
         """Call the handler with (key, alive) for those alive now and at each change."""
-        ...
 
     @property
     def dropped(self) -> int:
         """Messages and questions for which the queue of the handlers had no room, since the start."""
-        ...
 
     def connected(self) -> bool:
         """Whether messages can leave now. Always true on an in-memory bus."""
-        ...
 
     def close(self) -> None:
         """Take everything back and disconnect. Twice is no error."""
-        ...

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import re
 import time
@@ -12,7 +11,8 @@ from typing import Annotated
 import numpy as np
 from msgspec import Meta
 
-from mapweave.agent.drivers.base import BaseReading, WheelCounter, Wheels
+from mapweave.agent.drivers.base import BaseReading, Wheels
+from mapweave.agent.drivers.serial_base import SerialBase
 from mapweave.agent.drivers.serial_port import TIMEOUT, SerialPort
 from mapweave.agent.drivers.settings import Geometry, Positive, RobotSettings
 from mapweave.agent.drivers.wheeled import WheeledRobot
@@ -40,28 +40,22 @@ class ArduinoOptions:
     baud: Annotated[int, Meta(ge=50, le=10_000_000)] = 115200
 
 
-class ArduinoBase:
+class ArduinoBase(SerialBase):
     """The base. The sketch has a watchdog."""
 
     geometry = Geometry(max_forward=0.3, max_turn=0.8)
 
-    def __init__(self, options: ArduinoOptions, geometry: Geometry) -> None:
-        """Create a base without opening the port.
-
-        Args:
-            options: port and wheels.
-            geometry: proximity sensors of the settings.
-        """
-        self._options = options
-        self._rangers = len(geometry.ranger_bearings_deg or ())
-        self._reach = geometry.ranger_reach or 0.0
-        self._port: SerialPort | None = None
-        scale = math.tau * options.wheel_radius / options.counts_per_turn
-        self._counters = [WheelCounter(scale, 32, 3.0) for _ in range(2)]
+    def __init__(self, options: ArduinoOptions, settings: RobotSettings) -> None:
+        """Create a base without opening the port; the settings have its proximity sensors."""
+        self.baud = options.baud
+        self.metres_per_count = math.tau * options.wheel_radius / options.counts_per_turn
+        super().__init__(settings)
+        self._rangers = len(settings.geometry.ranger_bearings_deg or ())
+        self._reach = settings.geometry.ranger_reach or 0.0
 
     def open(self) -> None:
         """Open the port and wait for the board to start."""
-        self._port = SerialPort(self._options.port, self._options.baud)
+        self._port = SerialPort(self._path, self.baud)
         end = time.monotonic() + BOOT
         while True:
             try:
@@ -72,22 +66,9 @@ class ArduinoBase:
                     raise
         self.drive(Wheels())
 
-    def close(self) -> None:
-        """Stop the wheels and close the port."""
-        if self._port is not None:
-            with contextlib.suppress(DeviceError):
-                self.drive(Wheels())
-            self._port.close()
-            self._port = None
-
-    def nearest(self, speeds: Wheels) -> Wheels:
-        """Round to whole mm/s."""
-        return Wheels(round(speeds.left * 1e3) / 1e3, round(speeds.right * 1e3) / 1e3)
-
     def drive(self, speeds: Wheels) -> None:
-        """Send speeds."""
-        assert self._port is not None
-        self._port.write(f"D {round(speeds.left * 1e3)} {round(speeds.right * 1e3)}\n".encode())
+        """Send speeds, in mm/s."""
+        self.send(f"D {round(speeds.left * 1e3)} {round(speeds.right * 1e3)}")
 
     def read(self) -> BaseReading:
         """Wait for a line of the stream; returns the newest. Incomplete lines are skipped."""
@@ -99,20 +80,18 @@ class ArduinoBase:
             newest = parse_state(line) or newest
             if newest is None and time.monotonic() >= end:
                 raise DeviceError(
-                    f"{self._options.port}: {line!r} is not 'S left right bumped cm ...'; "
-                    f"is {self._options.baud} the baud rate of the sketch?"
+                    f"{self._path}: {line!r} is not 'S left right bumped cm ...'; "
+                    f"is {self.baud} the baud rate of the sketch?"
                 )
         left, right, bumped, *centimetres = newest
         if len(centimetres) != self._rangers:
             raise DeviceError(
-                f"{self._options.port}: {len(centimetres)} distances, but [robot.geometry] has "
+                f"{self._path}: {len(centimetres)} distances, but [robot.geometry] has "
                 f"{self._rangers} ranger_bearings_deg"
             )
-        now = time.monotonic()
-        way = Wheels(self._counters[0].update(left, now), self._counters[1].update(right, now))
         distances = np.array(centimetres, dtype=np.float64) / 100.0
         proximity = np.where(distances < 0.0, self._reach, np.minimum(distances, self._reach))
-        return BaseReading(way, proximity, bool(bumped))
+        return BaseReading(self.way(left, right), proximity, bool(bumped))
 
 
 def parse_state(line: str) -> list[int] | None:
@@ -125,5 +104,4 @@ class Arduino(WheeledRobot):
 
     def __init__(self, settings: RobotSettings) -> None:
         """Connect to the port in the options."""
-        options = settings.options_as(ArduinoOptions)
-        super().__init__(ArduinoBase(options, settings.geometry), settings)
+        super().__init__(ArduinoBase(settings.options_as(ArduinoOptions), settings), settings)

@@ -48,27 +48,21 @@ class Base(Protocol):
     @property
     def geometry(self) -> Geometry:
         """Dimensions and limits known to the driver; valid after the first `open`."""
-        ...
 
     def open(self) -> None:
         """Connect, with the wheels stopped. Called again after each failure."""
-        ...
 
     def close(self) -> None:
         """Stop the wheels if possible, and release the line. Never raises."""
-        ...
 
     def nearest(self, speeds: Wheels) -> Wheels:
         """The speeds that the hardware would drive for these speeds. Called from any thread."""
-        ...
 
     def drive(self, speeds: Wheels) -> None:
         """Drive at these speeds. A base without a hardware watchdog informs its `WheelGuard`."""
-        ...
 
     def read(self) -> BaseReading:
         """Read encoders and sensors."""
-        ...
 
 
 class WheelCounter:

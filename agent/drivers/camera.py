@@ -47,11 +47,9 @@ class FrameSource(Protocol):
 
     def newer(self, stamp_ns: int, patience: float) -> StampedImage | None:
         """Wait up to `patience` (s) for a frame newer than a stamp; returns the newest. Never raises."""
-        ...
 
     def close(self) -> None:
         """Release the camera. Never raises."""
-        ...
 
 
 class Capture:

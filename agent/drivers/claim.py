@@ -24,15 +24,12 @@ class ClaimKeys(Protocol):
 
     def robot_drivers_of(self, robot: str) -> str:
         """Pattern: all who drive the robot."""
-        ...
 
     def robot_driver(self, robot: str, number: int) -> str:
         """Liveliness of the one with this number."""
-        ...
 
     def parse_robot_driver(self, key: str) -> tuple[str, int]:
         """Which robot, and the number of who drives it."""
-        ...
 
 
 class Claim:

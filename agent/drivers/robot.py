@@ -15,7 +15,6 @@ class Robot(Protocol):
 
     def describe(self) -> RobotDescription:
         """Camera, footprint, limits."""
-        ...
 
     def sense(self) -> Observation | None:
         """Wait for the next observation, at most two ticks. None at the end of the observations.
@@ -26,15 +25,12 @@ class Robot(Protocol):
         Raises:
             DeviceError: the robot cannot be read.
         """
-        ...
 
     def act(self, command: Command) -> Command:
         """Send a command; returns the applied command. Does not block.
 
         The wheels stop within 0.5 s when no further command follows, also when this process dies.
         """
-        ...
 
     def close(self) -> None:
         """Stop the wheels and let go."""
-        ...

@@ -25,8 +25,8 @@ class SerialBase(ABC):
     """
 
     geometry: Geometry = Geometry()
-    baud: ClassVar[int] = 115200
-    metres_per_count: ClassVar[float]
+    baud: int = 115200
+    metres_per_count: float
     count_bits: ClassVar[int] = 32
     speed_step: ClassVar[float] = 0.001
 

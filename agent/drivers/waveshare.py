@@ -66,15 +66,12 @@ class Line(Protocol):
 
     def send(self, command: Json) -> None:
         """Send a command."""
-        ...
 
     def feedback(self) -> BaseInfo:
         """Read the newest state of the wheels."""
-        ...
 
     def close(self) -> None:
         """Close the connection."""
-        ...
 
 
 class SerialLine:

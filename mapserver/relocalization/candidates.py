@@ -21,7 +21,6 @@ class Retrieval(Protocol):
 
     def query(self, view: View, k: int = 5) -> Ranked:
         """At most k nodes with their similarity to it, best first."""
-        ...
 
 
 @dataclass(frozen=True, eq=False)
