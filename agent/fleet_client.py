@@ -23,7 +23,7 @@ from mapweave.hybridmap.mission_order import MissionOrder
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RelocalizeAnswer
-from mapweave.wire.bus import Bus, Reply, Request
+from mapweave.wire.bus import Bus, Declared, Reply, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_record
 from mapweave.wire.messages import decode, encode
@@ -41,7 +41,7 @@ ASK_AGAIN = 0.05
 """s before that."""
 
 
-class FleetClient:
+class FleetClient(Declared):
     """Runs beside the robot's loop, which never waits for it unless it asks to.
 
     Attributes:
@@ -160,8 +160,7 @@ class FleetClient:
     def close(self) -> None:
         """Withdraw from the fleet."""
         self._asked.put(None)
-        for closing in self._closing:
-            closing.close()
+        super().close()
         self._asker.join(self._timeout + 1.0)
 
     def status(self) -> AgentStatus:

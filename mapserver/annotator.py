@@ -33,7 +33,7 @@ from mapweave.mapserver.routes import Router
 from mapweave.mapserver.services import guarded
 from mapweave.merge.floors import floor_of, held_together, parted_by
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.bus import Bus, Closing, Request
+from mapweave.wire.bus import Bus, Declared, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_said
 from mapweave.wire.messages import decode, encode
@@ -91,7 +91,7 @@ class AnnotationRecord:
         return self._base + own if self._base is not None and self._base.made else own
 
 
-class Annotator:
+class Annotator(Declared):
     """Declared on a bus until closed."""
 
     def __init__(
@@ -122,7 +122,7 @@ class Annotator:
         self._places, self._record, self._time_ns = places, record, time_ns
         self._check, self._constraints, self._changed = check, constraints, changed
         self._turn = threading.Lock()
-        self._closing: list[Closing] = [
+        self._closing = [
             *serve_senders(bus, keys.annotate(name), self._annotate),
             bus.serve(keys.annotations(name), guarded(lambda _: encode(record.annotations))),
             bus.serve(
@@ -130,11 +130,6 @@ class Annotator:
                 guarded(lambda payload: encode(self.resolve(decode(payload, ResolveRequest)))),
             ),
         ]
-
-    def close(self) -> None:
-        """Stop answering."""
-        for closing in self._closing:
-            closing.close()
 
     def resolve(self, request: ResolveRequest) -> ResolveAnswer:
         """Nodes for words, from any thread; see Places.answer."""

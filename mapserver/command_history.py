@@ -8,13 +8,13 @@ import threading
 from collections import Counter
 from collections.abc import Callable
 from datetime import UTC, datetime
-from typing import Protocol
 
 from mapweave.hybridmap.agent_status import HandDrive
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.hybridmap.limits import MAX_WORDS
 from mapweave.hybridmap.map_event import History, MapEvent, MapEventKind
 from mapweave.hybridmap.mission_order import AT_START, MissionOrder
+from mapweave.mapserver.log.store import Store
 from mapweave.wire.messages import decode, encode
 
 log = logging.getLogger(__name__)
@@ -26,21 +26,11 @@ MOST = 1000
 MISSION = re.compile(r"\(mission ([^ ,)]+)(, as [^ ]+ says)?\)$")
 
 
-class Results(Protocol):
-    """What a store offers, see mapweave.mapserver.log.store."""
-
-    def result(self, name: str) -> bytes | None:
-        """What is kept under a name."""
-
-    def put_result(self, name: str, value: bytes) -> None:
-        """Keep something under a name."""
-
-
 class CommandHistory:
     """Thread-safe. What is noted is written soon, and not waited for: a robot that is to stop comes first."""
 
     def __init__(
-        self, store: Results, time_ns: Callable[[], int], later: Callable[[Callable[[], None]], None]
+        self, store: Store, time_ns: Callable[[], int], later: Callable[[Callable[[], None]], None]
     ) -> None:
         """Go on with the record of the store.
 

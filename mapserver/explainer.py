@@ -38,7 +38,7 @@ from mapweave.mapserver.services import guarded
 from mapweave.merge.constraint_checks import check_manual_constraint
 from mapweave.merge.settings import MergeSettings
 from mapweave.merge.unmerged_links import with_unmerged_links
-from mapweave.wire.bus import Bus, Closing, Request
+from mapweave.wire.bus import Bus, Declared, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_said
 from mapweave.wire.messages import decode, encode
@@ -108,7 +108,7 @@ class ConstraintRecord:
         return ManualConstraints(sorted(dated, key=lambda one: dated[one]))
 
 
-class Explainer:
+class Explainer(Declared):
     """Declared on a bus until closed."""
 
     def __init__(
@@ -152,17 +152,12 @@ class Explainer:
         self._events = events
         self._annotations = annotations
         self._turn = threading.Lock()
-        self._closing: list[Closing] = [
+        self._closing = [
             bus.serve(keys.explain(name), self._explain_later),
             *serve_senders(bus, keys.constrain(name), self._constrain_later),
             bus.serve(keys.constraints(name), guarded(lambda _: encode(self.constraints()))),
             bus.serve(keys.history(name), guarded(lambda _: encode(History(self.history())))),
         ]
-
-    def close(self) -> None:
-        """Stop answering."""
-        for closing in self._closing:
-            closing.close()
 
     def _explain_later(self, request: Request) -> None:
         self._later(request, lambda: self._explain(request.payload))

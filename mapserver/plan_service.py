@@ -17,7 +17,7 @@ from mapweave.mapserver.plan_images import PlanImages
 from mapweave.mapserver.services import guarded
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.plan_image import plan_file
-from mapweave.wire.bus import Bus, Closing
+from mapweave.wire.bus import Bus, Declared
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
 
@@ -27,7 +27,7 @@ MOST_AT_ONCE = 4
 """Images on their way; one more takes the place of the oldest."""
 
 
-class PlanService:
+class PlanService(Declared):
     """Declared on a bus until closed. Thread-safe."""
 
     def __init__(
@@ -59,7 +59,7 @@ class PlanService:
         self._lock = threading.Lock()
         self._incoming: dict[str, bytearray] = {}
         self._placed: tuple[MergedMap, Annotations, PlacedPlans] | None = None
-        self._closing: list[Closing] = [
+        self._closing = [
             bus.serve(keys.plans(name), guarded(lambda _: encode(self.plans()))),
             bus.serve(keys.plan_image(name), guarded(lambda payload: self.images.get(_sha256(payload)))),
             bus.serve(
@@ -67,11 +67,6 @@ class PlanService:
                 guarded(lambda payload: encode(self.receive(decode(payload, PlanPiece)))),
             ),
         ]
-
-    def close(self) -> None:
-        """Stop answering."""
-        for closing in self._closing:
-            closing.close()
 
     def plans(self) -> PlacedPlans:
         """All plans, under the newest merged map; worked out once for each."""

@@ -27,7 +27,7 @@ from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.quotas import MOST_ROBOTS, Quotas
 from mapweave.merge.explanation.map_standing import MapStanding, map_standings
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.bus import Bus, Sample
+from mapweave.wire.bus import Bus, Declared, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode
 
@@ -61,7 +61,7 @@ class Presence(NamedTuple):
     unsent: int
 
 
-class Roster:
+class Roster(Declared):
     """Listens until closed. Thread-safe.
 
     Attributes:
@@ -101,11 +101,6 @@ class Roster:
             bus.subscribe(keys.agent_statuses(), self._take),
             bus.watch(keys.agents_alive(), self._see),
         ]
-
-    def close(self) -> None:
-        """Stop listening."""
-        for closing in self._closing:
-            closing.close()
 
     def alive(self, robot: str) -> bool:
         """Whether an agent of this name is there."""

@@ -41,7 +41,7 @@ from mapweave.mapserver.route_rules import rule_words
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.wire_limits import drivable, within_range
 from mapweave.merge.floors import maps_elsewhere
-from mapweave.wire.bus import Bus, Closing, Request
+from mapweave.wire.bus import Bus, Declared, Request
 from mapweave.wire.keys import Keys, robot_of
 from mapweave.wire.log_messages import Scalar, encode_record
 from mapweave.wire.messages import decode, decode_view, encode
@@ -52,7 +52,7 @@ log = logging.getLogger(__name__)
 Handler = Callable[[bytes], bytes]
 
 
-class Services:
+class Services(Declared):
     """Declared on a bus until closed."""
 
     def __init__(
@@ -119,7 +119,7 @@ class Services:
             keys.reserve(name): self._reserve_in_name,
             keys.nearby(name): self._nearby_in_name,
         }
-        self._closing: list[Closing] = [
+        self._closing = [
             *(bus.serve(question, answer) for question, answer in of_robots.items()),
             *(
                 bus.serve(sent_by_any(question), self._limited(answer))
@@ -135,8 +135,7 @@ class Services:
 
     def close(self) -> None:
         """Stop answering."""
-        for closing in self._closing:
-            closing.close()
+        super().close()
         self._relays.shutdown()
         self._map.close()
 

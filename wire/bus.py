@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -74,6 +74,17 @@ class Closing(Protocol):
 
     def close(self) -> None:
         """Take it back. Twice is no error."""
+
+
+class Declared:
+    """What is declared on a bus until it is closed: what a subclass puts into `_closing`."""
+
+    _closing: Sequence[Closing] = ()
+
+    def close(self) -> None:
+        """Take it all back."""
+        for closing in self._closing:
+            closing.close()
 
 
 class Bus(Protocol):

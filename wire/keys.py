@@ -54,16 +54,31 @@ def check_epoch(epoch: int) -> int:
     return epoch
 
 
+def _pattern(form: str) -> Callable[[Keys], str]:
+    """A method of Keys: a pattern."""
+    return lambda keys: f"{keys.root}/{form}"
+
+
+def _named(form: str) -> Callable[[Keys, str], str]:
+    """A method of Keys: a key or pattern with a name in the place of `{}`."""
+    return lambda keys, name: f"{keys.root}/{form.format(check_name(name))}"
+
+
+def _of_map(what: str) -> Callable[[Keys, MapId], str]:
+    """A method of Keys: an agent's key about one of its maps."""
+    return lambda keys, map_id: (
+        f"{keys.root}/agent/{check_name(map_id.agent)}/{what}/{check_epoch(map_id.epoch)}"
+    )
+
+
+def _parsed_map(what: str) -> Callable[[Keys, str], MapId]:
+    """A method of Keys: the map that a key of `_of_map` is about."""
+    return lambda keys, key: _map_of(keys, what, key)
+
+
 def _of_servers(what: str) -> tuple[Callable[[Keys, str], str], Callable[[Keys], str]]:
     """Two methods of Keys: the key of one server's `what`, and the pattern of any server's."""
-
-    def of_one(self: Keys, server: str) -> str:
-        return f"{self.root}/server/{check_name(server)}/{what}"
-
-    def of_any(self: Keys) -> str:
-        return f"{self.root}/server/*/{what}"
-
-    return of_one, of_any
+    return _named(f"server/{{}}/{what}"), _pattern(f"server/*/{what}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,65 +102,36 @@ class Keys:
 
     # Keys of an agent.
 
-    def change(self, map_id: MapId) -> str:
-        """Where an agent publishes the changes of one map."""
-        return self._of_map("change", map_id)
-
-    def changes(self) -> str:
-        """Pattern: the changes of every map."""
-        return f"{self.root}/agent/*/change/*"
-
-    def head(self, map_id: MapId) -> str:
-        """Where an agent publishes the newest sequence number of a map."""
-        return self._of_map("head", map_id)
-
-    def heads(self) -> str:
-        """Pattern: the beacons of every map."""
-        return f"{self.root}/agent/*/head/*"
-
-    def log(self, map_id: MapId) -> str:
-        """Where an agent answers for ranges of a map's log."""
-        return self._of_map("log", map_id)
-
-    def logs(self, agent: str) -> str:
-        """Pattern: the logs of all maps of an agent."""
-        return f"{self.root}/agent/{check_name(agent)}/log/*"
-
-    def agent_alive(self, map_id: MapId) -> str:
-        """Under which an agent that makes this map is alive."""
-        return self._of_map("alive", map_id)
-
-    def agents_alive(self) -> str:
-        """Pattern: every agent."""
-        return f"{self.root}/agent/*/alive/*"
-
-    def agent_status(self, agent: str) -> str:
-        """Where an agent publishes what it is doing."""
-        return f"{self.root}/agent/{check_name(agent)}/status"
-
-    def agent_statuses(self) -> str:
-        """Pattern: what every agent is doing."""
-        return f"{self.root}/agent/*/status"
-
-    def mission(self, agent: str) -> str:
-        """Where an agent takes orders."""
-        return f"{self.root}/agent/{check_name(agent)}/mission"
-
-    def drive(self, agent: str) -> str:
-        """Where an agent takes a person's velocity commands."""
-        return f"{self.root}/agent/{check_name(agent)}/drive"
-
-    def portal(self, agent: str) -> str:
-        """Where an agent takes reports that it was taken through a portal."""
-        return f"{self.root}/agent/{check_name(agent)}/portal"
-
-    def view(self, agent: str) -> str:
-        """Where an agent that keeps images of its nodes gives them to servers, and under which it says so."""
-        return f"{self.root}/agent/{check_name(agent)}/view"
-
-    def views(self) -> str:
-        """Pattern: every agent that keeps images."""
-        return f"{self.root}/agent/*/view"
+    change = _of_map("change")
+    """Where an agent publishes the changes of one map."""
+    changes = _pattern("agent/*/change/*")
+    """Pattern: the changes of every map."""
+    head = _of_map("head")
+    """Where an agent publishes the newest sequence number of a map."""
+    heads = _pattern("agent/*/head/*")
+    """Pattern: the beacons of every map."""
+    log = _of_map("log")
+    """Where an agent answers for ranges of a map's log."""
+    logs = _named("agent/{}/log/*")
+    """Pattern: the logs of all maps of an agent."""
+    agent_alive = _of_map("alive")
+    """Under which an agent that makes this map is alive."""
+    agents_alive = _pattern("agent/*/alive/*")
+    """Pattern: every agent."""
+    agent_status = _named("agent/{}/status")
+    """Where an agent publishes what it is doing."""
+    agent_statuses = _pattern("agent/*/status")
+    """Pattern: what every agent is doing."""
+    mission = _named("agent/{}/mission")
+    """Where an agent takes orders."""
+    drive = _named("agent/{}/drive")
+    """Where an agent takes a person's velocity commands."""
+    portal = _named("agent/{}/portal")
+    """Where an agent takes reports that it was taken through a portal."""
+    view = _named("agent/{}/view")
+    """Where an agent that keeps images of its nodes gives them to servers, and under which it says so."""
+    views = _pattern("agent/*/view")
+    """Pattern: every agent that keeps images."""
 
     # Keys of a server.
 
@@ -153,21 +139,17 @@ class Keys:
         """Acknowledgements of a server to an agent."""
         return f"{self.root}/server/{check_name(server)}/ack/{check_name(agent)}"
 
-    def all_acks(self, server: str) -> str:
-        """Pattern: a server's acknowledgements to all agents; a question: the newest map of one."""
-        return f"{self.root}/server/{check_name(server)}/ack/*"
-
-    def acks(self, agent: str) -> str:
-        """Pattern: acknowledgements of any server to an agent."""
-        return f"{self.root}/server/*/ack/{check_name(agent)}"
+    all_acks = _named("server/{}/ack/*")
+    """Pattern: a server's acknowledgements to all agents; a question: the newest map of one."""
+    acks = _named("server/*/ack/{}")
+    """Pattern: acknowledgements of any server to an agent."""
 
     def poses(self, server: str, agent: str) -> str:
         """Merged poses of an agent's nodes, published by a server; a question returns all of them."""
         return f"{self.root}/server/{check_name(server)}/poses/{check_name(agent)}"
 
-    def all_poses(self, server: str) -> str:
-        """Pattern: a server's merged poses for all agents."""
-        return f"{self.root}/server/{check_name(server)}/poses/*"
+    all_poses = _named("server/{}/poses/*")
+    """Pattern: a server's merged poses for all agents."""
 
     # Of each pair the first takes the name of a server, and the second gives the pattern of any server.
 
@@ -216,13 +198,10 @@ class Keys:
 
     # Keys of a robot base.
 
-    def robot_describe(self, robot: str) -> str:
-        """Description of a robot base."""
-        return f"{self.root}/robot/{check_name(robot)}/describe"
-
-    def robot_step(self, robot: str) -> str:
-        """A robot base takes a command and returns the next observation."""
-        return f"{self.root}/robot/{check_name(robot)}/step"
+    robot_describe = _named("robot/{}/describe")
+    """Description of a robot base."""
+    robot_step = _named("robot/{}/step")
+    """A robot base takes a command and returns the next observation."""
 
     def robot_driver(self, robot: str, number: int) -> str:
         """Liveliness of a robot base's driver."""
@@ -232,27 +211,19 @@ class Keys:
         """Pattern: all agents that drive one base."""
         return f"{self.root}/robot/{check_name(robot)}/driver/*"
 
-    def robot_drivers(self) -> str:
-        """Pattern: all drivers of a base."""
-        return f"{self.root}/robot/*/driver/*"
+    robot_drivers = _pattern("robot/*/driver/*")
+    """Pattern: all drivers of a base."""
 
     # Parsing of received keys. Each raises InvalidMessage if the key is of another form.
 
-    def parse_change(self, key: str) -> MapId:
-        """Whose changes."""
-        return self._parse_map("change", key)
-
-    def parse_head(self, key: str) -> MapId:
-        """Whose beacon."""
-        return self._parse_map("head", key)
-
-    def parse_log(self, key: str) -> MapId:
-        """Whose log."""
-        return self._parse_map("log", key)
-
-    def parse_agent_alive(self, key: str) -> MapId:
-        """Which agent, and which map it makes."""
-        return self._parse_map("alive", key)
+    parse_change = _parsed_map("change")
+    """Whose changes."""
+    parse_head = _parsed_map("head")
+    """Whose beacon."""
+    parse_log = _parsed_map("log")
+    """Whose log."""
+    parse_agent_alive = _parsed_map("alive")
+    """Which agent, and which map it makes."""
 
     def parse_agent_status(self, key: str) -> str:
         """Which agent."""
@@ -276,12 +247,6 @@ class Keys:
         """Which server, to which agent."""
         server, agent = self._parse_names("server/*/poses/*", key)
         return server, agent
-
-    def _of_map(self, what: str, map_id: MapId) -> str:
-        return f"{self.root}/agent/{check_name(map_id.agent)}/{what}/{check_epoch(map_id.epoch)}"
-
-    def _parse_map(self, what: str, key: str) -> MapId:
-        return _map_of(self, what, key)
 
     def _parse_names(self, form: str, key: str) -> list[str]:
         return [_name(chunk, key) for chunk in self._chunks(form, key)]

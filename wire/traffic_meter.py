@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from typing import Any
 
 from mapweave.wire.bus import Bus, Closing, Reply, Request, Sample, never
 
@@ -62,40 +63,15 @@ class TrafficMeter:
             self._count(reply.payload, reply.error)
         return replies
 
-    def announce(self, key: str) -> Closing:
-        """Be alive; the transport's own messages are not counted."""
-        return self._bus.announce(key)
-
-    def watch(self, pattern: str, handler: Callable[[str, bool], None]) -> Closing:
-        """See who is alive; the transport's own messages are not counted."""
-        return self._bus.watch(pattern, handler)
-
-    @property
-    def dropped(self) -> int:
-        """What found the queue of the handlers full."""
-        return self._bus.dropped
-
-    def connected(self) -> bool:
-        """Whether messages can leave now."""
-        return self._bus.connected()
-
-    def close(self) -> None:
-        """Close the bus."""
-        self._bus.close()
+    def __getattr__(self, name: str) -> Any:
+        """All else is the bus's: the transport's own messages are not counted."""
+        return getattr(self._bus, name)
 
 
 class _MeteredRequest:
     def __init__(self, request: Request, count: Callable[..., None]) -> None:
         self._request = request
         self._count = count
-
-    @property
-    def key(self) -> str:
-        return self._request.key
-
-    @property
-    def payload(self) -> bytes:
-        return self._request.payload
 
     def reply(self, payload: bytes) -> None:
         self._count(payload)
@@ -104,3 +80,6 @@ class _MeteredRequest:
     def refuse(self, reason: str, retry_after: float = 0.0) -> None:
         self._count(reason)
         self._request.refuse(reason, retry_after)
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._request, name)

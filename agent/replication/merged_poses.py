@@ -12,7 +12,7 @@ import threading
 
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.wire.bus import Bus, Sample
+from mapweave.wire.bus import Bus, Declared, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.pose_messages import MergedPose, PoseNews
 
@@ -23,7 +23,7 @@ TIMEOUT = 3.0
 """How long a question may take, s."""
 
 
-class MergedPoses:
+class MergedPoses(Declared):
     """Listens to one server. A thread of its own asks when something is missing."""
 
     def __init__(self, bus: Bus, keys: Keys, agent: str, server: str) -> None:
@@ -58,8 +58,7 @@ class MergedPoses:
 
     def close(self) -> None:
         """Stop listening."""
-        for closing in self._closing:
-            closing.close()
+        super().close()
         self._work.put(None)
         self._thread.join(TIMEOUT + 1.0)
 
