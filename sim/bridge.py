@@ -8,6 +8,7 @@ import time
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from typing import TYPE_CHECKING
 
 from mapweave.agent.drivers.messages import (
     AGAIN,
@@ -23,8 +24,10 @@ from mapweave.sim.ground_truth_service import GroundTruthService
 from mapweave.sim.keys import SimKeys
 from mapweave.sim.lockstep import Seat, StepBarrier
 from mapweave.sim.lockstep_robot import Rendezvous, decode_rendezvous
-from mapweave.sim.simulation_interface import Simulated
 from mapweave.wire.bus import Bus, Request
+
+if TYPE_CHECKING:
+    from mapweave.sim.simulation import Simulation
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +44,7 @@ class SimBridge:
 
     def __init__(
         self,
-        simulation: Simulated,
+        simulation: Simulation,
         bus: Bus,
         fleet: str,
         patience: float = 20.0,

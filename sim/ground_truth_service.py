@@ -6,7 +6,7 @@ The questions are those of `mapweave.sim.ground_truth_messages`; `mapweave.sim.g
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -30,9 +30,11 @@ from mapweave.sim.ground_truth_messages import (
     SimStatus,
     TrueTrajectory,
 )
-from mapweave.sim.simulation_interface import Simulated
 from mapweave.wire.packing import unpack
 from mapweave.wire.typed import encode
+
+if TYPE_CHECKING:
+    from mapweave.sim.simulation import Simulation
 
 
 class GroundTruthService:
@@ -40,7 +42,7 @@ class GroundTruthService:
 
     def __init__(
         self,
-        simulation: Simulated,
+        simulation: Simulation,
         active: Callable[[], set[str]],
         wall: Mapping[str, float],
     ) -> None:

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +20,6 @@ from mapweave.sim.bridge import SimBridge
 from mapweave.sim.floorplan import BuildingPlan, Rectangle
 from mapweave.sim.ground_truth_client import SimControl
 from mapweave.sim.keys import SimKeys
-from mapweave.sim.simulation_interface import Simulated
 from mapweave.wire.memory import MemoryBus, MemoryHub
 
 KEYS = SimKeys("test")
@@ -118,7 +118,7 @@ class Stage:
 
     def start(
         self,
-        simulation: Simulated,
+        simulation: Any,
         patience: float = 20.0,
         farewell: float = 0.02,
     ) -> SimControl:
