@@ -18,6 +18,7 @@ from mapweave.hybridmap.errors import InvalidValue
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
+    from mapweave.hybridmap.annotation import Body
     from mapweave.offline_annotations import OfflineAnnotations
 
 
@@ -69,6 +70,19 @@ def add_remove(actions: Any, kind: str, words: str, of: str, description: str) -
     remove.add_argument("name", metavar="NAME", help=of)
     add_record_options(remove, changes=True)
     remove.set_defaults(run=run)
+
+
+def print_entries(arguments: argparse.Namespace, title: str, kind: type[Body], none: str) -> int:
+    """Print the annotations of a kind that are in force, or that there are none; the exit status."""
+    from mapweave.mapserver.http.json_values import json_values
+
+    with record_of(arguments) as record:
+        entries = [entry for entry, _ in record.annotations().in_force(kind)]
+    if arguments.json:
+        print(json.dumps({title: [json_values(entry) for entry in entries]}))
+    else:
+        print("\n".join(entry.words for entry in entries) or none)
+    return 0
 
 
 def print_said(arguments: argparse.Namespace, *said: str, **values: object) -> None:

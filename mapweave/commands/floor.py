@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-import json
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_record_options, print_said, record_of
+from mapweave.commands.annotating import add_record_options, print_entries, print_said, record_of
 from mapweave.commands.usage import UsageError
 
 
@@ -32,10 +31,11 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Label a map, or withdraw its label."""
+    from mapweave.hybridmap.annotation import Floor
     from mapweave.hybridmap.query import ResolveRequest
 
     if (arguments.label, arguments.node, arguments.undo) == (None, "list", False):
-        return _list(arguments)
+        return print_entries(arguments, "floors", Floor, "no map has a label yet: mapweave floor NAME NODE")
     if (arguments.label is None) != arguments.undo:
         raise UsageError("give the name of a floor and a node; with --undo a node alone")
     with record_of(arguments) as record:
@@ -49,20 +49,4 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.map is not None and not arguments.check:
         said.append("links between floors fall when the file is merged again: mapweave map merge FILE -o OUT")
     print_said(arguments, *said)
-    return 0
-
-
-def _list(arguments: argparse.Namespace) -> int:
-    from mapweave.hybridmap.annotation import Floor
-    from mapweave.mapserver.http.json_values import json_values
-
-    with record_of(arguments) as record:
-        entries = [entry for entry, _ in record.annotations().in_force(Floor)]
-    if arguments.json:
-        print(json.dumps({"floors": [json_values(entry) for entry in entries]}))
-        return 0
-    for entry in entries:
-        print(entry.words)
-    if not entries:
-        print("no map has a label yet: mapweave floor NAME NODE")
     return 0

@@ -18,7 +18,7 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.named_nodes import Record, Resolve, ids_of
 from mapweave.hybridmap.query import ExplainRequest, ResolveAnswer, ResolveRequest
 from mapweave.refusals import refusals
-from mapweave.wire.bus import Reply
+from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, decode_explanation, encode
 from mapweave.wire.patience import ask_patiently
@@ -26,6 +26,7 @@ from mapweave.wire.patience import ask_patiently
 if TYPE_CHECKING:
     from mapweave.hybridmap.explanation import Explanation
     from mapweave.mapserver.routes import Router
+    from mapweave.settings import NetworkSettings
 
 
 def different_ends_of(words: list[str]) -> Ends:
@@ -152,14 +153,19 @@ def ask(arguments: argparse.Namespace, key_of: Callable[[Keys], str], payload: b
         NotConnected: no server answers, or all are busy.
         Refused: all refuse.
     """
-    from mapweave.connection import no_server
-
     network = network_of(arguments, settings_of(arguments))
     bus, keys = reach(network, "give --connect, or --map FILE")
     try:
-        replies = ask_patiently(bus, key_of(keys), payload, arguments.timeout)
+        return answers(bus, network, key_of(keys), payload, arguments.timeout)
     finally:
         bus.close()
+
+
+def answers(bus: Bus, network: NetworkSettings, key: str, payload: bytes, timeout: float) -> list[Reply]:
+    """The same by a connection that is there."""
+    from mapweave.connection import no_server
+
+    replies = ask_patiently(bus, key, payload, timeout)
     if not replies:
         raise no_server(network.fleet, key_holder(network))
     good = [reply for reply in replies if not reply.error]

@@ -3,11 +3,16 @@
 from __future__ import annotations
 
 import argparse
-import json
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_record_options, add_remove, print_said, record_of
+from mapweave.commands.annotating import (
+    add_record_options,
+    add_remove,
+    print_entries,
+    print_said,
+    record_of,
+)
 from mapweave.commands.usage import UsageError
 
 KINDS = ("lift", "ramp", "door")
@@ -69,15 +74,6 @@ def run_add(arguments: argparse.Namespace) -> int:
 def run_list(arguments: argparse.Namespace) -> int:
     """Print the portals."""
     from mapweave.hybridmap.portal import Portal
-    from mapweave.mapserver.http.json_values import json_values
 
-    with record_of(arguments) as record:
-        entries = [entry for entry, _ in record.annotations().in_force(Portal)]
-    if arguments.json:
-        print(json.dumps({"portals": [json_values(entry) for entry in entries]}))
-        return 0
-    for entry in entries:
-        print(entry.words)
-    if not entries:
-        print("there is no portal yet: mapweave map portal add NAME A B --kind lift")
-    return 0
+    none = "there is no portal yet: mapweave map portal add NAME A B --kind lift"
+    return print_entries(arguments, "portals", Portal, none)

@@ -6,7 +6,6 @@ import argparse
 import json
 import math
 import sys
-import time
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -24,7 +23,7 @@ from mapweave.commands.network import (
 from mapweave.commands.plan import add_plan_option, plan_of, plan_place
 from mapweave.commands.usage import UsageError
 from mapweave.exit_status import DONE, NO
-from mapweave.hybridmap.errors import DeviceError, NotConnected, Refused
+from mapweave.hybridmap.errors import DeviceError, NotConnected
 
 if TYPE_CHECKING:
     from collections.abc import Callable
@@ -111,6 +110,7 @@ def _by_server(
     arguments: argparse.Namespace, view: Callable[[], View]
 ) -> tuple[RelocalizeAnswer, Node | None]:
     """The answer of a running server, and the best candidate's node if it is to be drawn."""
+    from mapweave.commands.map_ends import answers
     from mapweave.connection import no_server
     from mapweave.hybridmap.query import RelocalizeAnswer
     from mapweave.wire.messages import decode, encode_view
@@ -120,8 +120,8 @@ def _by_server(
     try:
         if not bus.ask(keys.server_statuses(), b"", arguments.timeout):
             raise no_server(network.fleet, key_holder(network))  # said before the work
-        payload = _ask(bus, network, keys.any_relocalize(), encode_view(view()), arguments.timeout)
-        answer = decode(payload, RelocalizeAnswer)
+        (reply, *_) = answers(bus, network, keys.any_relocalize(), encode_view(view()), arguments.timeout)
+        answer = decode(reply.payload, RelocalizeAnswer)
         if arguments.draw is None or not answer.candidates:
             return answer, None
         return answer, _node(bus, keys, network, answer.candidates[0].node, arguments.timeout)
@@ -143,33 +143,14 @@ def _by_map(arguments: argparse.Namespace, view: View) -> tuple[RelocalizeAnswer
     return answer, merged.maps[best.map].nodes[best]
 
 
-def _ask(bus: ZenohBus, network: NetworkSettings, key: str, payload: bytes, patience: float) -> bytes:
-    """Ask until a server answers; a busy server is asked again at its retry time."""
-    from mapweave.connection import no_server
-
-    end = time.monotonic() + patience
-    while True:
-        replies = bus.ask(key, payload, max(end - time.monotonic(), 0.1))
-        for reply in replies:
-            if not reply.error:
-                return reply.payload
-        if not replies:
-            raise no_server(network.fleet, key_holder(network))
-        pause = replies[0].retry_after
-        if not pause:
-            raise Refused(f"the map server refused: {replies[0].error}")
-        if time.monotonic() + pause > end:
-            raise NotConnected(f"the map server is {replies[0].error}")
-        time.sleep(pause)
-
-
 def _node(bus: ZenohBus, keys: Keys, network: NetworkSettings, node_id: NodeId, patience: float) -> Node:
     """A node of the merged map: the beginning of the way from itself to itself."""
+    from mapweave.commands.map_ends import answers
     from mapweave.hybridmap.query import RouteAnswer, RouteRequest
     from mapweave.wire.messages import decode, encode
 
     request = encode(RouteRequest(node_id, node_id))
-    way = decode(_ask(bus, network, keys.any_route(), request, patience), RouteAnswer)
+    way = decode(answers(bus, network, keys.any_route(), request, patience)[0].payload, RouteAnswer)
     if not way.legs or way.legs[0].node.id != node_id:
         raise NotConnected(f"the map server did not give node {node_id}: {way.reason}")
     return way.legs[0].node
