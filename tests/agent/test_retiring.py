@@ -23,9 +23,9 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Ack, KeptNodes, NewestMap
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.pose_messages import MergedPose, PoseNews
-from synthetic.own_map import SurveyedMap
 from synthetic.world import room
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
+from tests.agent.own_map import SurveyedMap
 from tests.waiting import eventually
 
 KEYS, MAP = Keys("retiring"), MapId("r0", 1)

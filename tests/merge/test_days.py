@@ -20,8 +20,8 @@ from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdicts
-from synthetic.drives import Drive, DriveSettings, drives
 from synthetic.fleet import FleetSettings, link_between
+from tests.merge.drives import Drive, DriveSettings, drives
 
 FLOOR = FleetSettings(nodes=24, side=5.0)
 

@@ -17,8 +17,8 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.reachability import FARTHEST, WIDEST
 from mapweave.hybridmap.superseding import CROWD
 from mapweave.registration.recognition import register
-from synthetic.own_map import SurveyedMap
 from synthetic.world import room
+from tests.agent.own_map import SurveyedMap
 
 MAP = MapId("r0", 1)
 DAY = 86_400_000_000_000
