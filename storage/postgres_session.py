@@ -122,6 +122,8 @@ class PostgresAddress:
             writes: of several hosts connect to the one that takes changes.
         """
         defaults: dict[str, Any] = {"connect_timeout": CONNECT_TIMEOUT, "application_name": name, **KEEPALIVE}
+        # Texts of a database without an encoding, which initdb makes without a locale, would come as bytes.
+        defaults["client_encoding"] = "UTF8"
         if writes:
             defaults["target_session_attrs"] = "read-write"
         return make_conninfo("", **(defaults | self.parameters))

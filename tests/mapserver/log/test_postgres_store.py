@@ -335,3 +335,23 @@ def test_texts_that_postgresql_does_not_take(postgres: PostgresServer) -> None:
     assert store.apply(MAP, 5, [refused, broken(2)]).watermark == 2
     assert store.refusals(MAP)[0].reason == "a reason with \ufffd and ?"
     store.close()
+
+
+def test_a_database_without_an_encoding_keeps_texts_as_they_are(postgres: PostgresServer) -> None:
+    """As `initdb` makes one where no locale is set: psycopg then gave bytes for texts."""
+    with psycopg.connect(postgres.address(), autocommit=True) as people:
+        people.execute("DROP DATABASE IF EXISTS ascii")
+        people.execute("CREATE DATABASE ascii ENCODING 'SQL_ASCII' TEMPLATE template0")
+    store = PostgresStore(postgres.address("ascii"))
+    (taken,) = store.apply_all([LogChanges(MAP, 5, [entry(1), broken(2)])])
+    assert isinstance(taken, Applied) and taken.watermark == 2
+    store.put_result("Büro", b"\xff")
+    store.close()
+    store = PostgresStore(postgres.address("ascii"), read_only=True)
+    assert [change.sequence for change in store.replay(MAP)] == [1]
+    (refusal,) = store.refusals(MAP)
+    assert refusal.sequence == 2 and isinstance(refusal.reason, str)
+    assert store.result("Büro") == b"\xff"
+    store.close()
+    with psycopg.connect(postgres.address(), autocommit=True) as people:
+        people.execute("DROP DATABASE ascii WITH (FORCE)")
