@@ -97,9 +97,9 @@ class OdometryCorrection:
     """Odometry as wheels without errors would report it, at the time of the image."""
 
     def __init__(self) -> None:
-        """Begin with a robot that stands."""
+        """Begin with a robot of which it is unknown whether it moves."""
         self._stamp_ns = 0
-        self._before = (0.0, 0.0)
+        self._before: tuple[float, float] | None = None
 
     def step(self, observation: Observation, geometry: DriveGeometry) -> Observation:
         """Correct the odometry of the next observation.
@@ -111,10 +111,13 @@ class OdometryCorrection:
         span = 1e-9 * (observation.stamp_ns - self._stamp_ns)
         first = self._stamp_ns == 0 or span <= 0.0
         self._stamp_ns = observation.stamp_ns
-        rate = self._before if first else (wheels.forward / span, wheels.turn / span)
-        later = (geometry.delay * (now - then) for now, then in zip(rate, self._before, strict=True))
-        extra = (0.0, 0.0) if first else tuple(later)
-        self._before = rate
+        extra = (0.0, 0.0)
+        if not first:
+            rate = wheels.forward / span, wheels.turn / span
+            # A recording may begin at any speed, and so may a process that is started again.
+            before = self._before or rate
+            extra = geometry.delay * (rate[0] - before[0]), geometry.delay * (rate[1] - before[1])
+            self._before = rate
         way = geometry.wheel_scale * (wheels.forward + extra[0])
         turn = geometry.turn_scale * (wheels.turn + extra[1]) + geometry.drift * way
         if (way, turn) == (wheels.forward, wheels.turn) and not geometry.left:

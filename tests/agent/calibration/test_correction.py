@@ -82,6 +82,15 @@ def test_late_odometry_is_made_good():
     assert total_turn == pytest.approx(0.9 * 0.05 * (end**2 - begin**2) + 0.02 * want_way, abs=0.003)
 
 
+def test_late_odometry_of_a_robot_that_drives_already_is_no_jump():
+    """At a constant speed no delay shows, from the first step on."""
+    correction = OdometryCorrection()
+    for k in range(1, 5):
+        observation = Observation(k * 100_000_000, Odometry(0.9, 0.02))
+        given = correction.step(observation, DriveGeometry(delay=0.05)).odometry
+        assert (given.forward, given.turn) == pytest.approx((0.9, 0.02))
+
+
 def test_odometry_without_errors_stays_as_it_is():
     correction = OdometryCorrection()
     for k in range(1, 5):
