@@ -150,6 +150,20 @@ def test_the_floor_lies_where_it_was_seen() -> None:
     assert cells[int((2.4 - at.y) / side), int((1.02 - at.x) / side)] == FREE
 
 
+def test_what_repeats_itself_takes_little_room(tmp_path: Path) -> None:
+    """Each floor is 230 kB, nearly all of it unknown."""
+    log = McapLog(str(tmp_path / "log"))
+    pipeline = Pipeline(MapId("r0", 1), RobotDescription(Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3)))
+    for k in range(30):
+        observation = Observation(k * 10**8, Odometry(0.0, 0.0), np.zeros((48, 64), np.uint8))
+        log.step(observation, pipeline.step(observation), pipeline)
+    assert not log.close()
+    with AnyReader([tmp_path / "log"]) as reader:
+        messages = sum(len(data) for _, _, data in reader.messages())
+    assert messages > 3 * 230_000
+    assert (tmp_path / "log" / "log.mcap").stat().st_size < messages / 5
+
+
 def test_a_full_disk_ends_the_log_and_not_the_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
