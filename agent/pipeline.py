@@ -131,7 +131,7 @@ class Pipeline:
     def complaints(self) -> list[str]:
         """What was found to be wrong with the odometry and with the declared geometry, a line each."""
         odometry = (f"the map is wrong: {line}" for line in self._convention.complaints)
-        return [*odometry, *map(str, self.calibration.causes)]
+        return [*odometry, *map(str, self.calibration.causes), *self.calibration.contradicted]
 
     @property
     def map(self) -> HybridMap:

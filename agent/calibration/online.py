@@ -25,10 +25,11 @@ from mapweave.agent.calibration.image_pairs import (
     SHORTEST_S,
     sigma_of,
 )
+from mapweave.agent.calibration.learned import LearnedGeometry, intrinsics_of, joined
 from mapweave.agent.calibration.pair_information import ImagePair
 from mapweave.agent.calibration.parameter_sigmas import useful
 from mapweave.agent.calibration.ranger_scale import RangerScale
-from mapweave.agent.calibration.report import Cause, causes
+from mapweave.agent.calibration.report import NAMES, Cause, causes, readable
 from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.pose import Array, Pose2
@@ -78,21 +79,37 @@ class OnlineCalibration:
         description: the robot as everything behind the lens shall know it now.
         lens: of its images now.
         causes: parameters that were found to be declared wrongly, in the order in which they were found.
+        contradicted: what of an earlier drive was given up, a line each.
         pending: what the mapper shall change to with its next node, if anything: the robot, the lens, and
             `old_from_new` of the robot's frame.
     """
 
-    def __init__(self, description: RobotDescription) -> None:
-        """Begin with what is declared."""
+    def __init__(self, description: RobotDescription, learned: LearnedGeometry | None = None) -> None:
+        """Begin with what is declared, or was learned on an earlier drive.
+
+        Args:
+            description: as the robot is declared.
+            learned: of an earlier drive; left out if it does not fit the description.
+        """
         self._declared = description
-        self._geometry = geometry_of(description)
+        declared = geometry_of(description)
+        if learned is None or not learned.fits(description):
+            learned = LearnedGeometry(declared, intrinsics_of(description), {})
+        self._geometry = learned.over(declared)
         self.description, self.lens = corrected(description, self._geometry)
         self.causes: list[Cause] = []
+        self.contradicted: list[str] = []
         self.pending: tuple[RobotDescription, Lens, Pose2] | None = None
         self._next = self._geometry
         self._correction = OdometryCorrection()
         self._plain = Lens(description.camera, description.distortion)
-        self._estimator = Estimator(self._geometry, sigma_of(description.camera))
+        self._estimator = Estimator(declared, sigma_of(description.camera))
+        if learned.parameters:
+            self._estimator.vector = self._geometry.vector
+        # What is used instead of what is declared; its sigmas; what of it only an earlier drive has shown.
+        self._used = np.array([p in learned.parameters for p in Parameter])
+        self._sigmas = learned.sigmas
+        self._earlier = self._used.copy()
         self._counted = CountedWheels()
         self._turns: list[float] = []
         self._source: object = None
@@ -109,6 +126,24 @@ class OnlineCalibration:
         self._changed_since = np.full(COUNT, np.inf)
         self._stale = 0
         self._last: Estimate | None = None
+        self._settled = np.zeros(COUNT, np.bool_)
+
+    @property
+    def learned(self) -> LearnedGeometry | None:
+        """What the next start shall know of this drive and those before it; None if that is nothing.
+
+        Estimates of the last solution are better than those with which the robot has begun to correct itself.
+        """
+        vector, sigmas, used = self._next.vector, self._sigmas.copy(), self._used
+        last = self._last
+        if last is not None:
+            agree = np.abs(last.vector - vector) < SIGNIFICANT * np.hypot(last.sigmas, sigmas)
+            better = used & last.shown & self._settled & agree
+            for p in (p for p in Parameter if better[p]):
+                here = float(last.vector[p]), float(last.sigmas[p])
+                earlier = float(vector[p]), float(sigmas[p])
+                vector[p], sigmas[p] = joined(*earlier, *here, p) if self._earlier[p] else here
+        return LearnedGeometry.of(self._declared, vector, sigmas, used) if used.any() else None
 
     @property
     def geometry(self) -> DriveGeometry:
@@ -223,6 +258,7 @@ class OnlineCalibration:
         settled = np.abs(estimate.vector - before.vector) < np.maximum(
             SETTLED * useful(estimate.declared), estimate.sigmas
         )
+        self._settled = settled
         self._adopt(estimate, settled & before.shown)
         known = {cause.parameter for cause in self.causes}
         wrong = {cause.parameter: cause for cause in causes(estimate) if settled[cause.parameter]}
@@ -245,7 +281,7 @@ class OnlineCalibration:
             estimate.shown
             & settled
             & (off > WORTH * useful(estimate.declared))
-            & (off > SIGNIFICANT * estimate.sigmas)
+            & (off > SIGNIFICANT * np.hypot(estimate.sigmas, np.where(self._earlier, self._sigmas, 0.0)))
         )
         named_only = [p for p in NAMED_ONLY if not (p is P.WHEEL_SCALE and estimate.lengths is Lengths.BOTH)]
         change[named_only] = False
@@ -258,7 +294,28 @@ class OnlineCalibration:
         along = belongs & estimate.shown & settled & (off > estimate.sigmas)
         along[named_only] = False
         self._next = DriveGeometry.of(np.where(change | along, estimate.vector, target))
+        self._note(change | along, change, target, estimate)
         self.pending = (*corrected(self._declared, self._next), frame_change(self._geometry, self._next))
+
+    def _note(self, taken: NDArray[np.bool_], wrong: NDArray[np.bool_], before: Array, now: Estimate) -> None:
+        """Note what is used from now on of a solution.
+
+        Args:
+            taken: (10,) from it.
+            wrong: (10,) because what was used before is contradicted.
+            before: (10,) what was used.
+            now: the solution.
+        """
+        given_up = wrong & self._earlier
+        was, value = readable(before), readable(now.vector)
+        self.contradicted += [
+            f"{NAMES[p]} {was[p]:z.2f}, learned earlier, is contradicted by images and wheels: "
+            f"now {value[p]:z.2f}"
+            for p in Parameter
+            if given_up[p]
+        ]
+        self._used, self._sigmas = self._used | taken, np.where(taken, now.sigmas, self._sigmas)
+        self._earlier &= ~taken
 
     def _refresh(self) -> None:
         """Reduce one pair again, each in its turn, between the images that make new ones."""
@@ -280,7 +337,7 @@ class OnlineCalibration:
         vector = self._estimator.vector
         self._estimator = Estimator(geometry_of(self._declared), sigma_of(self._declared.camera))
         self._estimator.vector = vector
-        self._source, self._last = None, None
+        self._source, self._last, self._settled = None, None, np.zeros(COUNT, np.bool_)
         self._since_solution = self._parts_left = self._taken = 0
         self._named_since[:] = self._changed_since[:] = np.inf
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mapweave.doctor import camera, camera_model, driver, libraries, machine, server
+from mapweave.doctor import camera, camera_model, driver, learned, libraries, machine, server
 from mapweave.doctor.finding import Finding, good, skipped, wrong
 
 if TYPE_CHECKING:
@@ -43,6 +43,7 @@ def examine(options: ExaminationOptions) -> Iterator[Finding]:
     yield from libraries.examine()
     yield from machine.clock()
     yield from machine.disk(options.data)
+    yield from guarded(learned.SUBJECT, lambda: learned.examine(options.data))
     settings: list[Settings] = []
     yield from guarded("settings", lambda: _settings(options, settings))
     if not settings:

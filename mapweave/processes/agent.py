@@ -34,7 +34,14 @@ from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile, Refused
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.processes.agent_files import epochs_of_files, map_path, trajectory_path, views_path
+from mapweave.processes.agent_files import (
+    epochs_of_files,
+    learned_path,
+    map_path,
+    trajectory_path,
+    views_path,
+)
+from mapweave.processes.learned_geometry import GeometryKeeper
 from mapweave.processes.portal_command import PortalCommand
 from mapweave.processes.server_watch import ServerWatch
 from mapweave.storage.map_file import MapFile, write_map_file
@@ -164,6 +171,13 @@ class Agent:
                 options.name, settings.portals, self.missions.portal_done, self._say
             )
             self._description = measured(describe(), options.calibration)
+            # The same recording is the same map, whatever was learned from it before.
+            self._geometry: GeometryKeeper | None = None
+            calibration = None
+            if not options.recorded:
+                path = learned_path(options.data, options.name)
+                self._geometry = GeometryKeeper(path, self._say)
+                calibration = self._geometry.calibration(self._description)
             if settings.keep_views:
                 folder = views_path(options.data, options.name)
                 self._views = ViewKeeper(self._bus, keys, options.name, folder)
@@ -172,12 +186,12 @@ class Agent:
                 print_line(f"{options.name}: {line}")
             maps = self.journal.maps()
             if options.resume is not None or (maps and not options.fresh):
-                self._resume(self._chosen(maps))
+                self._resume(self._chosen(maps), calibration)
             else:
                 for left in maps[-1:]:
                     # An agent that was killed has written no file.
                     self._write(left, RetainedMap.of(self.journal, left))
-                self._begin()
+                self._begin(calibration)
         except BaseException:
             if self._views is not None:
                 self._views.close()
@@ -207,11 +221,11 @@ class Agent:
         )
         self._start(map_id, pipeline)
 
-    def _resume(self, map_id: MapId) -> None:
+    def _resume(self, map_id: MapId, calibration: OnlineCalibration | None) -> None:
         kept = RetainedMap.of(self.journal, map_id)
         pipeline = Pipeline(
-            map_id, self._description, self._settings, kept.contents, kept.next_number,
-            released=self._released,
+            map_id, self._description, self._settings, kept.contents, kept.next_number, calibration,
+            self._released,
         )  # fmt: skip
         self.journal.open_map(map_id.epoch)
         nodes = len(pipeline.map.nodes)
@@ -277,6 +291,8 @@ class Agent:
             if step.way_moved is not None:
                 self._trajectory.move(step.way_moved)
             self._trajectory.add(observation.stamp_ns, observation.odometry.motion(), pose)
+        if self._geometry is not None:
+            self._geometry.see(self.pipeline.calibration)
         line = self._server_watch.see(self._fleet.server_in_reach(), observation.stamp_ns)
         if line and self._options.patience > 0.0:
             self._say(line)
@@ -392,6 +408,8 @@ class Agent:
     def close(self) -> None:
         """Commit what was mapped and leave the fleet. The bus stays open."""
         self._portal_command.close()
+        if self._geometry is not None:
+            self._geometry.close(self.pipeline.calibration)
         self._leave()
         if self._views is not None:
             self._views.close()

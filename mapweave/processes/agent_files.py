@@ -22,6 +22,11 @@ def views_path(folder: Path, agent: str) -> Path:
     return folder / f"{agent}.views"
 
 
+def learned_path(folder: Path, agent: str) -> Path:
+    """Where an agent keeps what it has learned of its geometry, for example `r0.learned.toml`."""
+    return folder / f"{agent}.learned.toml"
+
+
 def epochs_of_files(folder: Path, agent: str) -> list[int]:
     """Numbers of the maps of an agent that have a file in a folder."""
     numbers = (read_number(path.name.split(".")[1]) for path in folder.glob(f"{agent}.*.mapweave"))
