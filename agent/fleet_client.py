@@ -23,7 +23,7 @@ from mapweave.hybridmap.mission_order import MissionOrder
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RelocalizeAnswer
-from mapweave.wire.bus import Bus, Declared, Reply, Request
+from mapweave.wire.bus import Bus, BusClient, Reply, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_record
 from mapweave.wire.messages import decode, encode
@@ -41,7 +41,7 @@ ASK_AGAIN = 0.05
 """s before that."""
 
 
-class FleetClient(Declared):
+class FleetClient(BusClient):
     """Runs beside the robot's loop, which never waits for it unless it asks to.
 
     Attributes:

@@ -33,7 +33,7 @@ from mapweave.mapserver.routes import Router
 from mapweave.mapserver.services import guarded
 from mapweave.merge.floors import floor_of, held_together, parted_by
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.bus import Bus, Declared, Request
+from mapweave.wire.bus import Bus, BusClient, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_said
 from mapweave.wire.messages import decode, encode
@@ -91,8 +91,8 @@ class AnnotationRecord:
         return self._base + own if self._base is not None and self._base.made else own
 
 
-class Annotator(Declared):
-    """Declared on a bus until closed."""
+class Annotator(BusClient):
+    """BusClient on a bus until closed."""
 
     def __init__(
         self,

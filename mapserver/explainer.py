@@ -38,7 +38,7 @@ from mapweave.mapserver.services import guarded
 from mapweave.merge.constraint_checks import check_manual_constraint
 from mapweave.merge.settings import MergeSettings
 from mapweave.merge.unmerged_links import with_unmerged_links
-from mapweave.wire.bus import Bus, Declared, Request
+from mapweave.wire.bus import Bus, BusClient, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import encode_said
 from mapweave.wire.messages import decode, encode
@@ -108,8 +108,8 @@ class ConstraintRecord:
         return ManualConstraints(sorted(dated, key=lambda one: dated[one]))
 
 
-class Explainer(Declared):
-    """Declared on a bus until closed."""
+class Explainer(BusClient):
+    """BusClient on a bus until closed."""
 
     def __init__(
         self,

@@ -17,7 +17,7 @@ from mapweave.mapserver.plan_images import PlanImages
 from mapweave.mapserver.services import guarded
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.plan_image import plan_file
-from mapweave.wire.bus import Bus, Declared
+from mapweave.wire.bus import Bus, BusClient
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
 
@@ -27,8 +27,8 @@ MOST_AT_ONCE = 4
 """Images on their way; one more takes the place of the oldest."""
 
 
-class PlanService(Declared):
-    """Declared on a bus until closed. Thread-safe."""
+class PlanService(BusClient):
+    """BusClient on a bus until closed. Thread-safe."""
 
     def __init__(
         self,

@@ -27,7 +27,7 @@ from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.quotas import MOST_ROBOTS, Quotas
 from mapweave.merge.explanation.map_standing import MapStanding, map_standings
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.wire.bus import Bus, Declared, Sample
+from mapweave.wire.bus import Bus, BusClient, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode
 
@@ -61,7 +61,7 @@ class Presence(NamedTuple):
     unsent: int
 
 
-class Roster(Declared):
+class Roster(BusClient):
     """Listens until closed. Thread-safe.
 
     Attributes:

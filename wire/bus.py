@@ -76,8 +76,8 @@ class Closing(Protocol):
         """Take it back. Twice is no error."""
 
 
-class Declared:
-    """What is declared on a bus until it is closed: what a subclass puts into `_closing`."""
+class BusClient:
+    """A part of a process that is on a bus until it is closed, by what it puts into `_closing`."""
 
     _closing: Sequence[Closing] = ()
 

@@ -12,7 +12,7 @@ import threading
 
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.wire.bus import Bus, Declared, Sample
+from mapweave.wire.bus import Bus, BusClient, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.pose_messages import MergedPose, PoseNews
 
@@ -23,7 +23,7 @@ TIMEOUT = 3.0
 """How long a question may take, s."""
 
 
-class MergedPoses(Declared):
+class MergedPoses(BusClient):
     """Listens to one server. A thread of its own asks when something is missing."""
 
     def __init__(self, bus: Bus, keys: Keys, agent: str, server: str) -> None:

@@ -20,7 +20,7 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.view_image import ViewImage, ViewRequest
 from mapweave.storage.atomic_file import read_whole, write_whole
 from mapweave.storage.view_file import is_whole, view_file
-from mapweave.wire.bus import Bus, Declared, Request
+from mapweave.wire.bus import Bus, BusClient, Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
 
@@ -35,7 +35,7 @@ RETRY_AFTER = 1.0
 SUFFIX = ".jpg"
 
 
-class ViewKeeper(Declared):
+class ViewKeeper(BusClient):
     """Keeps the images of one robot's nodes, for all its maps."""
 
     def __init__(self, bus: Bus, keys: Keys, agent: str, folder: Path) -> None:
