@@ -41,7 +41,7 @@ from mapweave.mapserver.route_rules import rule_words
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.wire_limits import drivable, within_range
 from mapweave.merge.floors import maps_elsewhere
-from mapweave.wire.bus import Bus, Declared, Request
+from mapweave.wire.bus import Bus, BusClient, Request
 from mapweave.wire.keys import Keys, robot_of
 from mapweave.wire.log_messages import Scalar, encode_record
 from mapweave.wire.messages import decode, decode_view, encode
@@ -52,8 +52,8 @@ log = logging.getLogger(__name__)
 Handler = Callable[[bytes], bytes]
 
 
-class Services(Declared):
-    """Declared on a bus until closed."""
+class Services(BusClient):
+    """BusClient on a bus until closed."""
 
     def __init__(
         self,
@@ -114,10 +114,10 @@ class Services(Declared):
         )  # fmt: skip
         of_robots: dict[str, Callable[[Request], None]] = {
             keys.relocalize(name): self._relocalize_later,
-            keys.route(name): self._route_in_name,
+            keys.route(name): _in_name(self._route),
             keys.known(name): guarded(self._known),
-            keys.reserve(name): self._reserve_in_name,
-            keys.nearby(name): self._nearby_in_name,
+            keys.reserve(name): _in_name(self._reserve),
+            keys.nearby(name): _in_name(self._around),
         }
         self._closing = [
             *(bus.serve(question, answer) for question, answer in of_robots.items()),
@@ -189,9 +189,6 @@ class Services(Declared):
             elsewhere = maps_elsewhere(answers.merged, places.annotations.floors, view.near)
         return places.named(answers.relocalizer.answer(view, elsewhere))
 
-    def _route_in_name(self, request: Request) -> None:
-        guarded(lambda payload: self._route(payload, robot_of(request.key)))(request)
-
     def _route(self, payload: bytes, robot: str) -> bytes:
         request, now = decode(payload, RouteRequest), self._clock()
         router = self._answers().router
@@ -228,9 +225,6 @@ class Services(Declared):
                 discs.append(disc)
         return discs
 
-    def _reserve_in_name(self, request: Request) -> None:
-        guarded(lambda payload: self._reserve(payload, robot_of(request.key)))(request)
-
     def _reserve(self, payload: bytes, robot: str) -> bytes:
         request = decode(payload, ReserveRequest)
         if robot not in ("", request.robot):
@@ -244,9 +238,6 @@ class Services(Declared):
         self._reservations.ask(replace(request, route=()), router, self._clock())
         number, closure = closed
         return encode(ReserveAnswer(number, "", None, f"the way ahead is {rule_words(closure)}", True))
-
-    def _nearby_in_name(self, request: Request) -> None:
-        guarded(lambda payload: self._around(payload, robot_of(request.key)))(request)
 
     def _around(self, payload: bytes, robot: str) -> bytes:
         request = decode(payload, NearbyRequest)
@@ -285,3 +276,8 @@ def guarded(answer: Handler) -> Callable[[Request], None]:
             request.refuse(f"the server failed: {error}")
 
     return handle
+
+
+def _in_name(answer: Callable[[bytes, str], bytes]) -> Callable[[Request], None]:
+    """Answer in the name of the robot that asks; see `guarded`."""
+    return lambda request: guarded(lambda payload: answer(payload, robot_of(request.key)))(request)
