@@ -1,7 +1,8 @@
-"""Annotations from Python: what people say about the map, and nodes for words."""
+"""Annotations from Python: what people say about the map, floor plans among it, and nodes for words."""
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Iterable, Mapping
 from typing import Any
@@ -9,6 +10,8 @@ from typing import Any
 from mapweave.annotation_methods import AnnotationMethods
 from mapweave.fleet_questions import FleetQuestions
 from mapweave.hybridmap.annotation import AnnotationRequest, Annotations
+from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.floor_plan import PIECE, PlacedPlans, PlanImage, PlanPiece, PlanReceived
 from mapweave.hybridmap.named_nodes import asked_of
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_words import annotation_of_words
@@ -69,6 +72,39 @@ class FleetAnnotations(FleetQuestions, AnnotationMethods):
         """
         payload = encode(asked_of(request))
         return decode(self._question(self._keys.any_resolve(), payload, ANSWER), ResolveAnswer)
+
+    def plans(self) -> PlacedPlans:
+        """Floor plans, and where they lie under the merged map.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        return decode(self._question(self._keys.any_plans(), b"", ANSWER), PlacedPlans)
+
+    def plan_image(self, sha256: str) -> bytes:
+        """The PNG file of a plan, by the name of its image.
+
+        Raises:
+            Refused: the server does not have it.
+            NotConnected: no map server answers.
+        """
+        return self._question(self._keys.any_plan_image(), sha256.encode(), ANSWER)
+
+    def put_plan_image(self, png: bytes) -> PlanImage:
+        """Send the image of a plan, a PNG file, before the annotation that names it.
+
+        Raises:
+            InvalidValue: it is no PNG file, or too large.
+            NotConnected: no map server answers.
+        """
+        self._check_role()
+        sha256, key = hashlib.sha256(png).hexdigest(), self._keys.any_put_plan_image()
+        for offset in range(0, len(png), PIECE):
+            piece = PlanPiece(sha256, len(png), offset, png[offset : offset + PIECE])
+            received = decode(self._question(key, encode(piece), ANSWER), PlanReceived)
+            if received.image is not None:
+                return received.image
+        raise InvalidValue("a plan is a PNG file")
 
     def _annotate(
         self, name: str, fields: Mapping[str, Any], removed: bool, because: str, check: bool

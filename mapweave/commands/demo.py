@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.usage import arguments_read
+from mapweave.commands.usage import UsageError
 from mapweave.exit_status import DONE, NO
 
 
@@ -40,16 +40,15 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.extras import TRIAL, need
 
     need(*TRIAL)
-    from mapweave.demo.options import DemoOptions
     from mapweave.demo.report import summary_table
     from mapweave.demo.run import run_demo
+    from mapweave.scenarios.run import TrialOptions
     from mapweave.terminal import plain_or_terminal
 
-    with arguments_read():
-        options = DemoOptions(
-            seed=arguments.seed, robots=arguments.robots, rooms=arguments.rooms, out=arguments.out
-        )
-    report = run_demo(options)
+    for option, least, most in (("robots", 2, 16), ("rooms", 3, 12)):
+        if not least <= (count := getattr(arguments, option)) <= most:
+            raise UsageError(f"--{option} {count}: the demo needs {least} to {most}")
+    report = run_demo(TrialOptions(arguments.seed, arguments.out), arguments.robots, arguments.rooms)
     if arguments.json:
         print(json.dumps(report.as_dict()))
     else:

@@ -1,14 +1,16 @@
-"""Manual constraints on the command line: their options, and how they reach a server or a file."""
+"""`mapweave map link`, `unmerge`, `retire` and `undo`: manual constraints, which reach a server or a file."""
 
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+from mapweave.commands import values
 from mapweave.commands.annotating import print_said
 from mapweave.commands.map_input import SOURCES, map_source, merge_progress, merged_with_progress, opened
 from mapweave.commands.network import (
@@ -28,6 +30,12 @@ if TYPE_CHECKING:
 
 PATIENT = 2.0
 """s; who waits longer hears what for."""
+
+
+def add_to(actions: Any) -> None:
+    """Declare the actions."""
+    for add in (_add_link, _add_unmerge, _add_retire, _add_undo):
+        add(actions)
 
 
 def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -> None:
@@ -165,3 +173,172 @@ def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> lis
         merged, file = with_constraint(one, before, constraint, settings, report)
     one.written(out, file)
     return [words, f"{out}: {merged.summary()}"]
+
+
+def _add_link(actions: Any) -> None:
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "link",
+        help="link two nodes by hand: they see one place",
+        description="Link two nodes (r0.1.17 r1.1.5) that see one place, of two maps or of one. Their images "
+        "say how they lie to each other. Where these do not agree, that is refused with the evidence, unless "
+        "you give the pose yourself (--pose) and say why (--because). What contradicts the merged map, or "
+        "puts two robots in one place at one time, is refused with the figures and with what to undo first. "
+        "The link stays, whatever robots map later; what contradicts it then is in `mapweave map history`.",
+    )
+    parser.add_argument("nodes", nargs=2, metavar="NODE|PLACE", help="the two nodes")
+    parser.add_argument(
+        "--pose", metavar="X,Y,DEGREES",
+        help="the second node seen from the first: m ahead, m left, heading; if negative, --pose=-1,0,90",
+    )  # fmt: skip
+    add_constraint_options(parser)
+    parser.set_defaults(run=run_link)
+
+
+def run_link(arguments: argparse.Namespace) -> int:
+    """Link two nodes."""
+    from mapweave.commands.map_ends import names_of, node_of
+    from mapweave.hybridmap.constraint_subject import Linked, read_pose
+    from mapweave.hybridmap.named_nodes import own_ids_of
+
+    pose = None
+    if arguments.pose is not None:
+        try:
+            numbers = [float(word) for word in arguments.pose.split(",")]
+        except ValueError:
+            raise UsageError(f"--pose {arguments.pose!r}: give X,Y,DEGREES, for example 1.5,0,90") from None
+        with arguments_read():
+            pose = read_pose(numbers)
+    a, b = map(node_of, own_ids_of(arguments.nodes, *names_of(arguments)))
+    with arguments_read():
+        about = Linked(a, b, pose)
+    constrain(arguments, about)
+    return 0
+
+
+def _add_unmerge(actions: Any) -> None:
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "unmerge",
+        help="undo a link, or all links between two maps",
+        description="Undo the link between two nodes (r0.1.17 r1.1.5), or all links between two maps "
+        "(r0.1 r1.1), those to come included. It stays undone, also when robots map on and the server starts "
+        "again, until it is withdrawn with --undo. Who did so, when and why is kept and shown by "
+        "`mapweave map explain`.",
+    )
+    parser.add_argument(
+        "ends", nargs="+", metavar="NODE|PLACE|MAP", help="the link: two nodes or places, or two maps"
+    )
+    add_constraint_options(parser)
+    parser.set_defaults(run=run_unmerge)
+
+
+def run_unmerge(arguments: argparse.Namespace) -> int:
+    """Undo a link, or all links between two maps."""
+    from mapweave.commands.map_ends import different_ends_of, explanation_of, names_of
+    from mapweave.hybridmap.constraint_subject import Apart
+    from mapweave.hybridmap.explanation import FleetExplanation
+    from mapweave.hybridmap.ids import MapId
+    from mapweave.hybridmap.named_nodes import own_ids_of
+    from mapweave.hybridmap.query import ExplainRequest
+
+    ends = different_ends_of(own_ids_of(arguments.ends, *names_of(arguments)))
+    first, second = (MapId(end[0], end[1]) for end in ends)
+
+    def reasons() -> list[str]:
+        found = explanation_of(arguments, ExplainRequest((first, second)))
+        assert isinstance(found, FleetExplanation), "maps were asked about"
+        return [explanation.reason for explanation in found.maps]
+
+    constrain(arguments, Apart(ends), reasons if first != second else list)
+    return 0
+
+
+def _add_retire(actions: Any) -> None:
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "retire",
+        help="retire a map, nodes, an area or a time window: they take no part in anything",
+        description="Retire a map (r0.1), some nodes (r0.1.17 r0.1.18), an area (its name, or --area), or "
+        "what a map has of a time (r0.1 --from --until): it takes no part in the merge any more, no route "
+        "leads through it, and no view is recognised by it. Nothing is deleted: it is retired until that is "
+        "taken back with --undo or `mapweave map undo`, also when robots map on and the server starts "
+        "again; nodes that come into an area or a time window later are retired too. A robot's own way "
+        "keeps tying what lies before and behind a retired node; --check says beforehand whether a map "
+        "falls into pieces. What robots map again need not be retired: newer nodes replace the older "
+        "ones by themselves.",
+    )
+    parser.add_argument(
+        "which", nargs="*", metavar="MAP|NODE|PLACE",
+        help="one map, as r0.1, or nodes, as r0.1.17, or the name of an area, of which all nodes are retired",
+    )  # fmt: skip
+    parser.add_argument(
+        "--area", nargs=2, metavar=("NODE|PLACE", "CORNERS"),
+        help='what lies in a polygon in the frame of a node, m: --area r0.1.17 "0,-1 2,-1 2,1 0,1"',
+    )  # fmt: skip
+    parser.add_argument("--from", dest="begin", type=values.given, metavar="TIME",
+                        help="nodes of the map from then on: 2026-03-01T12:00, or ns")  # fmt: skip
+    parser.add_argument("--until", dest="end", type=values.given, metavar="TIME", help="until then")
+    add_constraint_options(parser)
+    parser.set_defaults(run=run_retire)
+
+
+def run_retire(arguments: argparse.Namespace) -> int:
+    """Retire maps, nodes, areas or times."""
+    constrain(arguments, _subject(arguments))
+    return 0
+
+
+def _subject(arguments: argparse.Namespace) -> Subject:
+    from mapweave.commands.map_ends import map_of, names_of, node_of
+    from mapweave.hybridmap.area import Area, read_corner
+    from mapweave.hybridmap.constraint_subject import RetiredArea, read_window
+    from mapweave.hybridmap.named_nodes import own_ids_of, retired_of
+
+    in_time = bool(arguments.begin or arguments.end)
+    if (arguments.area is not None) == bool(arguments.which) or (in_time and len(arguments.which) != 1):
+        raise UsageError("give a map or nodes, or --area; --from and --until go with one map")
+    with arguments_read():
+        if arguments.area is not None:
+            anchor, corners = arguments.area
+            (node,) = map(node_of, own_ids_of([anchor], *names_of(arguments)))
+            return RetiredArea(Area(node, tuple(map(read_corner, corners.split()))))
+        if in_time:
+            which, now = map_of(arguments.which[0]), time.time_ns()
+            if arguments.begin and arguments.end:
+                begin = read_window(which, arguments.begin, "", now, None).begin_ns
+                end = read_window(which, "", arguments.end, now, None).end_ns
+                if begin > end:
+                    raise UsageError(f"--until {arguments.end} is before --from {arguments.begin}")
+            return read_window(which, arguments.begin or "", arguments.end or "", now, None)
+        return retired_of(arguments.which, *names_of(arguments))
+
+
+def _add_undo(actions: Any) -> None:
+    parser: argparse.ArgumentParser = actions.add_parser(
+        "undo",
+        help="list what people have linked, unmerged and retired, and take it back",
+        description="List the manual constraints that hold, each with its number; with a number take that "
+        "one back: `mapweave map undo 3`. Nothing is deleted: the record keeps who did what, when and why.",
+    )
+    parser.add_argument("number", nargs="?", type=int, metavar="NUMBER", help="take this one back")
+    add_constraint_options(parser, undo=False)
+    parser.set_defaults(run=run_undo, undo=True)
+
+
+def run_undo(arguments: argparse.Namespace) -> int:
+    """List the constraints that hold, or take one back."""
+    from mapweave.hybridmap.manual_constraint import event_words, to_take_back
+    from mapweave.mapserver.http.json_values import constraint_values
+    from mapweave.refusals import refusals
+
+    record = constraints_of(arguments)
+    if arguments.number is not None:
+        with refusals():
+            about = to_take_back(record.made, arguments.number)
+        constrain(arguments, about)
+        return 0
+    if arguments.json:
+        print(json.dumps(constraint_values(record)))
+        return 0
+    holding = record.in_force
+    lines = [f"{k:4}  {event_words(c)}" for k, c in enumerate(record.made, 1) if c in holding]
+    print("\n".join(lines) or "no manual constraint holds")
+    return 0

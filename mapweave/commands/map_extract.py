@@ -11,6 +11,7 @@ from typing import Any
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.exit_status import DONE, FAILED, NO
 from mapweave.hybridmap.counted import counted
+from mapweave.hybridmap.errors import InvalidValue
 
 
 def add_to(actions: Any) -> None:
@@ -33,33 +34,41 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Write them, and print which; 1 if a part of a map could not be read, 4 if there is none to write."""
-    from mapweave.map_extraction import extract_maps
+    from mapweave.hybridmap.hybrid_map import HybridMap
+    from mapweave.mapserver.own_maps import maps_of
+    from mapweave.opened_map import open_map
+    from mapweave.storage.map_file import MapFile, write_map_file
 
-    maps, lost, source = extract_maps(arguments.source, arguments.out)
+    opened = open_map(arguments.source)
+    maps, lost = maps_of(opened.content), opened.complaints.get(None, "")
+    paths = {map_id: arguments.out / f"{map_id}.mapweave" for map_id in opened.maps}
+    for path in paths.values():
+        if path.exists():
+            raise InvalidValue(f"{path}: is there already; choose another folder with -o")
+    arguments.out.mkdir(parents=True, exist_ok=True)
+    rows: list[dict[str, Any]] = []
+    for map_id, path in paths.items():
+        hybrid = maps.get(map_id, HybridMap())
+        nodes, edges = len(hybrid.nodes), len(hybrid.edges)
+        if nodes or edges:
+            refused = {m: why for m, why in opened.content.refused_changes.items() if m == map_id}
+            content = MapFile("agent", str(map_id), tuple(hybrid.contents()), refused_changes=refused)
+            write_map_file(path, content)
+        rows.append({
+            "map": str(map_id), "path": str(path) if nodes or edges else None, "nodes": nodes, "edges": edges,
+            "complaint": opened.complaints.get(map_id, ""),
+        })  # fmt: skip
     if arguments.json:
-        rows = [
-            {
-                "map": str(extracted.map), "path": str(extracted.path) if extracted.path else None,
-                "nodes": extracted.nodes, "edges": extracted.edges, "complaint": extracted.complaint,
-            }
-            for extracted in maps
-        ]  # fmt: skip
         print(json.dumps({"maps": rows, "lost": lost}))
     else:
-        for extracted in maps:
-            content = (
-                f"{counted(extracted.nodes, 'node')}, {counted(extracted.edges, 'edge')}"
-                if extracted.path
-                else "empty, not written"
-            )
-            print(f"{extracted.path or extracted.map}: {content}")
-        if not maps:
-            print(f"{source}: holds no map")
-    for extracted in maps:
-        if extracted.complaint:
-            print(f"mapweave: {extracted.complaint}", file=sys.stderr)
-    if lost:
-        print(f"mapweave: {lost}", file=sys.stderr)
-    if lost or any(extracted.complaint for extracted in maps):
+        for row in rows:
+            words = f"{counted(row['nodes'], 'node')}, {counted(row['edges'], 'edge')}"
+            print(f"{row['path'] or row['map']}: {words if row['path'] else 'empty, not written'}")
+        if not rows:
+            print(f"{opened.path}: holds no map")
+    complaints = [*filter(None, (*(row["complaint"] for row in rows), lost))]
+    for complaint in complaints:
+        print(f"mapweave: {complaint}", file=sys.stderr)
+    if complaints:
         return FAILED
-    return DONE if any(extracted.path for extracted in maps) else NO
+    return DONE if any(row["path"] for row in rows) else NO

@@ -7,6 +7,7 @@ from typing import Any
 
 from mapweave.commands import (
     map_backup,
+    map_constraint,
     map_diff,
     map_explain,
     map_export,
@@ -14,16 +15,12 @@ from mapweave.commands import (
     map_fetch,
     map_history,
     map_import,
-    map_link,
     map_merge,
     map_photographs,
     map_pin,
     map_portal,
-    map_retire,
     map_route,
     map_show,
-    map_undo,
-    map_unmerge,
 )
 
 
@@ -36,8 +33,7 @@ def add_to(commands: Any) -> None:
     )
     actions = parser.add_subparsers(title="actions", metavar="ACTION", required=True)
     for action in (
-        map_show, map_diff, map_explain, map_route, map_history, map_link, map_unmerge, map_retire, map_undo,
-        map_pin, map_portal,
+        map_show, map_diff, map_explain, map_route, map_history, map_constraint, map_pin, map_portal,
         map_merge, map_fetch, map_backup, map_export, map_extract, map_import, map_photographs,
     ):  # fmt: skip
         action.add_to(actions)

@@ -4,16 +4,19 @@ from __future__ import annotations
 
 import json
 import shutil
-from pathlib import Path
 
-from mapweave.demo.options import DemoOptions
 from mapweave.demo.report import Report
 from mapweave.scenarios.run import TrialOptions, run_trial
 from mapweave.scenarios.scenario import load_scenario, scenario_path
 
 
-def run_demo(options: DemoOptions) -> Report:
+def run_demo(options: TrialOptions, robots: int = 3, rooms: int = 3) -> Report:
     """Run everything; leave report, picture, film and maps in the output folder.
+
+    Args:
+        options: of the trial.
+        robots: how many map; the first is kidnapped.
+        rooms: along the corridor.
 
     Returns:
         The report, also when the robot did not arrive: `notes` lists what was missed.
@@ -21,19 +24,11 @@ def run_demo(options: DemoOptions) -> Report:
     Raises:
         MapweaveError: something could not be started, or ended.
     """
-    overrides = (f"robots={options.robots}", f"world.rooms={options.rooms}")
-    scenario = load_scenario(scenario_path("demo"), overrides)
-    trial = run_trial(
-        scenario,
-        TrialOptions(seed=options.seed, out=options.out, quiet=options.quiet, film_every=options.film_every),
-    )
+    overrides = (f"robots={robots}", f"world.rooms={rooms}")
+    trial = run_trial(load_scenario(scenario_path("demo"), overrides), options)
     report = Report.of(trial)
     for own in (options.out / "agents").glob("*.mapweave"):
         shutil.copyfile(own, options.out / own.name)
-    write_report(options.out, report)
+    text = json.dumps(report.as_dict(), indent=2) + "\n"
+    (options.out / "report.json").write_text(text, encoding="utf-8")
     return report
-
-
-def write_report(out: Path, report: Report) -> None:
-    """Write `report.json`."""
-    (out / "report.json").write_text(json.dumps(report.as_dict(), indent=2) + "\n", encoding="utf-8")

@@ -8,7 +8,6 @@ import time
 import numpy as np
 import pytest
 
-from mapweave.demo.options import DemoOptions
 from mapweave.demo.run import run_demo
 from mapweave.evaluation.map_score import pose_error, score_map
 from mapweave.fleet import send_order
@@ -18,6 +17,7 @@ from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.children import Children, free_port
 from mapweave.scenarios.reports import Reports
+from mapweave.scenarios.run import TrialOptions
 from mapweave.sim.ground_truth_client import SimControl
 from mapweave.storage.map_file import read_map_file, unpack_map_file
 from mapweave.wire.bus_settings import BusSettings
@@ -124,7 +124,7 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path):
 @pytest.mark.timeout(420)
 def test_the_demo_of_another_seed(tmp_path):
     """`mapweave demo` with a world that no other test uses, against what the README promises."""
-    report = run_demo(DemoOptions(seed=1234, out=tmp_path, quiet=True))
+    report = run_demo(TrialOptions(seed=1234, out=tmp_path, quiet=True))
     print(json.dumps(report.as_dict()))
     assert report.components == 1
     assert report.false_links == 0
