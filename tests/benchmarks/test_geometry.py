@@ -14,7 +14,7 @@ from benchmarks.geometry.benchmark import drawn_wheels, main
 from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.drivers.replay import Replay
 from mapweave.evaluation.truth import Truth
-from synthetic.room_drive import CAMERA, drive, write
+from tests.agent.calibration.room_drive import CAMERA, drive, write
 
 
 @pytest.mark.slow

@@ -18,7 +18,7 @@ from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.recordings.geometry_file import read_geometry
 from mapweave.cli import main
 from mapweave.exit_status import INTERRUPTED, NO, USAGE
-from synthetic.room_drive import CAMERA, drive, write
+from tests.agent.calibration.room_drive import CAMERA, drive, write
 from tests.mapweave.command_line import complaint
 
 SMALL = replace(CAMERA, width=160, height=120, fx=138.5, fy=138.5, cx=79.5, cy=59.5)

@@ -24,7 +24,7 @@ from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from synthetic.room_drive import CAMERA, RoomDrive, drive, render
+from tests.agent.calibration.room_drive import CAMERA, RoomDrive, drive, render
 from tests.agent.conftest import DESCRIPTION
 
 KEYS = Keys("fleet")

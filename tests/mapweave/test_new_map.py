@@ -13,7 +13,7 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.merging import changes
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.merging.merger import Merger
-from synthetic.room_drive import CAMERA, drive, render
+from tests.agent.calibration.room_drive import CAMERA, drive, render
 
 FIRST, LAST = 150, 250
 """Images of the first map. The robot is then carried to where image 0 is, and comes past them again."""

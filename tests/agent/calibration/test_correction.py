@@ -9,7 +9,7 @@ from mapweave.agent.calibration.camera_motions import robot_from_camera
 from mapweave.agent.calibration.correction import OdometryCorrection, corrected, frame_change, geometry_of
 from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from synthetic.room_drive import CAMERA
+from tests.agent.calibration.room_drive import CAMERA
 
 BENT = (-0.2, 0.05, 0.001, -0.001, 0.0)
 TRUE = DriveGeometry(forward=0.2, heading=0.04, pitch=-0.06, roll=0.02, height=0.3)

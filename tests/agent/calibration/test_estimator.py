@@ -16,7 +16,7 @@ from mapweave.agent.calibration.image_pairs import sigma_of
 from mapweave.agent.calibration.pair_information import ImagePair
 from mapweave.agent.calibration.report import causes
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
-from synthetic.room_drive import CAMERA, RoomDrive, drive, pairs
+from tests.agent.calibration.room_drive import CAMERA, RoomDrive, drive, pairs
 from tests.quick import first_quick
 
 P = Parameter

@@ -17,7 +17,7 @@ from mapweave.agent.calibration.pair_information import ImagePair, floor_ratios
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import NO_DISTORTION, Distortion, Lens
-from synthetic.room_drive import CAMERA
+from tests.agent.calibration.room_drive import CAMERA
 
 HEIGHT = 0.25
 TEXEL = 0.01

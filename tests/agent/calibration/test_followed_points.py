@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 
 from mapweave.agent.calibration.image_pairs import corners
-from synthetic.room_drive import CAMERA
+from tests.agent.calibration.room_drive import CAMERA
 
 
 def test_points_on_an_edge_are_not_followed():

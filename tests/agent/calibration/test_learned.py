@@ -17,7 +17,7 @@ from mapweave.agent.drive_geometry import Parameter
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.recordings.learned_file import read_learned, write_learned
 from mapweave.hybridmap.errors import DeviceError
-from synthetic.room_drive import CAMERA, drive
+from tests.agent.calibration.room_drive import CAMERA, drive
 from tests.agent.calibration.test_online import TRUE, watched
 
 P = Parameter

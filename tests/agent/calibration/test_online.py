@@ -14,7 +14,7 @@ from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.online import NAMED_ONLY, OnlineCalibration, _common
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from synthetic.room_drive import CAMERA, SIDE, RoomDrive, camera_poses, drive
+from tests.agent.calibration.room_drive import CAMERA, SIDE, RoomDrive, camera_poses, drive
 from tests.quick import first_quick
 
 BLANK = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
