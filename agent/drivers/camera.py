@@ -6,6 +6,7 @@ For a Raspberry Pi's own camera see docs/robot.md.
 from __future__ import annotations
 
 import logging
+import os
 import re
 import threading
 import time
@@ -26,6 +27,13 @@ RETRY = 1.0
 """s between two attempts to open a camera."""
 SETTLING = 1.0
 """s of automatic exposure before it is locked."""
+STREAM_PATIENCE = 5.0
+"""s in which a stream may come back: rpicam-vid ends with the program that it served, and is started anew."""
+FFMPEG_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
+"""The environment's variable that OpenCV reads when it opens a source."""
+RAW_STREAM = "fflags;nobuffer|analyzeduration;500000"
+"""For images on TCP without a container. By default FFmpeg examines them for 5 s, keeps them, and delivers
+them first: for some seconds each image would be as old as that, with the stamp of now."""
 FARTHEST_STAMP_NS = 1_000_000_000
 """Largest age of a frame; a greater difference means that the device uses another clock."""
 
@@ -65,7 +73,7 @@ class Capture:
         self._changed = threading.Condition()
         self._newest: StampedImage | None = None
         self._closing = False
-        self._capture = self._open()
+        self._capture = self._open_in_time()
         self._thread = threading.Thread(target=self._serve, name="camera", daemon=True)
         self._thread.start()
 
@@ -86,6 +94,16 @@ class Capture:
             self._changed.notify_all()
         self._thread.join(2.0)
 
+    def _open_in_time(self) -> cv2.VideoCapture:
+        end = time.monotonic() + (STREAM_PATIENCE if "://" in self._settings.source else 0.0)
+        while True:
+            try:
+                return self._open()
+            except DeviceError:
+                if time.monotonic() >= end:
+                    raise
+                time.sleep(RETRY / 5)
+
     def _open(self) -> cv2.VideoCapture:
         settings, source = self._settings, self._settings.source
         # OpenCV writes lines of its own about devices that are no cameras, beside the error here.
@@ -101,8 +119,13 @@ class Capture:
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
             capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         else:
+            raw = source.startswith("tcp://") and FFMPEG_OPTIONS not in os.environ
+            if raw:
+                os.environ[FFMPEG_OPTIONS] = RAW_STREAM
             # FFmpeg with n threads decodes n frames at once, which delays each by n frames.
             capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
+            if raw:
+                del os.environ[FFMPEG_OPTIONS]
         if not capture.isOpened():
             capture.release()
             raise DeviceError(

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import socket
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -124,6 +126,74 @@ def test_a_stream_over_http_is_no_more_than_two_frames_behind(stream: Stream) ->
         behind.append((stream.number - round(int(frame.image[0, 0]) / 5)) % 50)
     assert np.median(behind) <= 2
     camera.close()
+
+
+class OneAtATime:
+    """Frames on TCP that say their number, as of `rpicam-vid --listen` in a loop of the shell.
+
+    That ends with each program that it has served, and is there again after a while.
+    """
+
+    AWAY = 0.5
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._scene = np.random.default_rng(1).integers(0, 255, (240, 320), np.uint8)
+        self._closing = threading.Event()
+        with socket.create_server(("127.0.0.1", 0)) as free:
+            self._place = free.getsockname()
+        self.url = f"tcp://127.0.0.1:{self._place[1]}"
+        self._thread = threading.Thread(target=self._serve)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while not self._closing.is_set():
+            client = None
+            with socket.create_server(self._place) as listening:
+                listening.settimeout(0.1)
+                while client is None and not self._closing.is_set():
+                    with suppress(TimeoutError):
+                        client, _ = listening.accept()
+            if client is not None:
+                with client, suppress(OSError):
+                    self._send(client)
+                self._closing.wait(self.AWAY)
+
+    def _send(self, client: socket.socket) -> None:
+        client.settimeout(5.0)
+        self.number = 0
+        while not self._closing.wait(1 / RATE):
+            self.number += 1
+            self._scene[:40, :40] = self.number % 256
+            client.sendall(cv2.imencode(".jpg", self._scene)[1].tobytes())
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join()
+
+
+@pytest.fixture
+def raw_stream() -> Iterator[OneAtATime]:
+    made = OneAtATime()
+    yield made
+    made.close()
+
+
+def test_images_without_a_container_begin_with_that_of_now(raw_stream: OneAtATime) -> None:
+    """They were five seconds old, with the stamp of now."""
+    camera = Capture(settings(raw_stream.url))
+    frame = camera.newer(0, 5.0)
+    assert frame is not None
+    assert (raw_stream.number - int(frame.image[20, 20])) % 256 <= 3
+    camera.close()
+
+
+def test_a_stream_that_serves_one_program_after_the_other_is_waited_for(raw_stream: OneAtATime) -> None:
+    """As `mapweave doctor` opens the camera twice."""
+    for _ in range(2):
+        camera = Capture(settings(raw_stream.url))
+        assert camera.newer(0, 5.0) is not None
+        camera.close()
 
 
 def test_a_stream_that_ends_is_opened_again(stream: Stream) -> None:
