@@ -187,12 +187,12 @@ class Ros2Base:
 
     def publish(self, command: Command) -> None:
         """Publish a command in the type or types of its subscribers."""
-        twist = making.twist(make, command)
+        twist = making.twist(command)
         for publisher in self._publishers():
             if publisher is self._twist:
                 publisher.publish(twist)
             else:
-                head = making.header(make, self._clock.remote(now_ns()), BASE)
+                head = making.header(self._clock.remote(now_ns()), BASE)
                 publisher.publish(make(STAMPED_TYPE, header=head, twist=twist))
 
     def read(self) -> BaseReading:
@@ -341,9 +341,9 @@ class Ros2Base:
 
     def _stops(self) -> dict[str, bytes]:
         """What stops the wheels, on each key."""
-        zero = making.twist(make, Command())
+        zero = making.twist(Command())
         # ros2_control takes a time of zero for the time of arrival.
-        stamped = make(STAMPED_TYPE, header=making.header(make, 0, BASE), twist=zero)
+        stamped = make(STAMPED_TYPE, header=making.header(0, BASE), twist=zero)
         return {
             key: encode(zero if publisher is self._twist else stamped)
             for publisher in self._publishers()

@@ -8,7 +8,6 @@ import queue
 import struct
 import threading
 from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -23,6 +22,7 @@ from mapweave.agent.ros_messages.values import KIDNAP_TYPE
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Pose2
 from mapweave.storage.os_errors import reason_of
+from mapweave.wire.ros2.messages import make, typestore
 
 if TYPE_CHECKING:
     from rosbags.interfaces import Qos
@@ -156,9 +156,9 @@ class McapWriter:
 class McapTopics:
     """Messages of ROS 2 in a bag; a topic is there once it has a message."""
 
-    def __init__(self, writer: Writer, store: Any) -> None:
-        """Take a bag that is open, and a store with the types of all messages."""
-        self._writer, self._store = writer, store
+    def __init__(self, writer: Writer) -> None:
+        """Take a bag that is open."""
+        self._writer, self._store = writer, typestore()
         self._connections: dict[str, Any] = {}
 
     def send(self, topic: str, message: Any, stamp_ns: int) -> None:
@@ -179,28 +179,20 @@ class _Part:
     def __init__(self, path: Path, description: RobotDescription, begun_ns: int, lossless: bool) -> None:
         from rosbags.rosbag2 import StoragePlugin, Writer
 
-        from mapweave.wire.ros2.messages import typestore
-
         self.begun_ns = self._flushed_ns = begun_ns
         self._lossless = lossless
         self._kidnapped: bool | None = None
-        self._store = typestore()
-        self._types = self._store.types
-        self._header, self._pose, self._twist, self._transform = (
-            partial(function, self._make)
-            for function in (making.header, making.pose, making.twist, making.transform)
-        )
         self._writer = Writer(path, version=9, storage_plugin=StoragePlugin.MCAP)
         for key, value in wheel_data(description).items():
             self._writer.set_custom_data(key, value)
         self._writer.open()
-        self._topics = McapTopics(self._writer, self._store)
+        self._topics = McapTopics(self._writer)
         self._description = description
         self._put(
             "/tf_static",
             "tf2_msgs/msg/TFMessage",
             begun_ns,
-            transforms=[making.mount(self._make, begun_ns, description.camera), *self._ranger_mounts()],
+            transforms=[making.mount(begun_ns, description.camera), *self._ranger_mounts()],
         )
         self._flush()
 
@@ -210,39 +202,37 @@ class _Part:
             kind = ".png" if self._lossless else ".jpg"
             quality = [] if self._lossless else [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]
             data = cv2.imencode(kind, observation.image, quality)[1].reshape(-1)
-            header = self._header(stamp, making.OPTICAL)
+            header = making.header(stamp, making.OPTICAL)
             name = "sensor_msgs/msg/CompressedImage"
             word = "png" if self._lossless else "jpeg"
             self._put("/camera/image/compressed", name, stamp, header=header, format=word, data=data)
-            info = making.camera_info(
-                self._make, header, self._description.camera, self._description.distortion
-            )
+            info = making.camera_info(header, self._description.camera, self._description.distortion)
             self._topics.send("/camera/camera_info", info, stamp)
         unknown = np.zeros(36)
-        pose = self._make(
-            "geometry_msgs/msg/PoseWithCovariance", pose=self._pose(odom_from_robot), covariance=unknown
+        pose = make(
+            "geometry_msgs/msg/PoseWithCovariance", pose=making.pose(odom_from_robot), covariance=unknown
         )
-        twist = self._make(
-            "geometry_msgs/msg/TwistWithCovariance", twist=self._twist(Command()), covariance=unknown
+        twist = make(
+            "geometry_msgs/msg/TwistWithCovariance", twist=making.twist(Command()), covariance=unknown
         )
-        header, name = self._header(stamp, ODOM), "nav_msgs/msg/Odometry"
+        header, name = making.header(stamp, ODOM), "nav_msgs/msg/Odometry"
         self._put("/odom", name, stamp, header=header, child_frame_id=BASE, pose=pose, twist=twist)
-        moved = self._transform(stamp, ODOM, BASE, odom_from_robot)
+        moved = making.transform(stamp, ODOM, BASE, odom_from_robot)
         self._put("/tf", "tf2_msgs/msg/TFMessage", stamp, transforms=[moved])
         name = "geometry_msgs/msg/TwistStamped"
-        self._put("/cmd_vel", name, stamp, header=self._header(stamp, BASE), twist=self._twist(command))
+        self._put("/cmd_vel", name, stamp, header=making.header(stamp, BASE), twist=making.twist(command))
         if observation.bumped:
             self._put("/bumper", "std_msgs/msg/Bool", stamp, data=True)
         if observation.kidnapped != self._kidnapped:
             self._kidnapped = observation.kidnapped
-            header = self._header(stamp, BASE)
+            header = making.header(stamp, BASE)
             self._put("/kidnap_status", KIDNAP_TYPE, stamp, header=header, is_kidnapped=self._kidnapped)
         d = self._description
         # There are none while the sensors have failed.
         for k, distance in enumerate(observation.proximity):
             self._put(
                 f"/proximity/{k}", "sensor_msgs/msg/Range", stamp,
-                header=self._header(stamp, f"proximity_{k}"), radiation_type=1, field_of_view=0.1,
+                header=making.header(stamp, f"proximity_{k}"), radiation_type=1, field_of_view=0.1,
                 min_range=0.0, max_range=d.ranger_reach, range=float(distance), variance=0.0,
             )  # fmt: skip
 
@@ -270,17 +260,14 @@ class _Part:
             self._writer.storage = storage
 
     def _put(self, topic: str, name: str, stamp_ns: int, **fields: Any) -> None:
-        self._topics.send(topic, self._make(name, **fields), stamp_ns)
-
-    def _make(self, name: str, **fields: Any) -> Any:
-        return self._types[name](**fields)
+        self._topics.send(topic, make(name, **fields), stamp_ns)
 
     def _ranger_mounts(self) -> list[Any]:
         """The proximity sensors, each at the robot's edge along its bearing."""
         d, mounts = self._description, []
         for k, bearing in enumerate(d.ranger_bearings):
             at = Pose2(d.radius * math.cos(bearing), d.radius * math.sin(bearing), bearing)
-            mounts.append(self._transform(self.begun_ns, BASE, f"proximity_{k}", at))
+            mounts.append(making.transform(self.begun_ns, BASE, f"proximity_{k}", at))
         return mounts
 
 

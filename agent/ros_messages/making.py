@@ -1,9 +1,8 @@
-"""The agent's values as ROS messages, by whatever makes messages of a type from their fields."""
+"""The agent's values as ROS messages."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -14,72 +13,70 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.vision.equidistant import Equidistant
 from mapweave.vision.lens import NO_DISTORTION, Distortion
+from mapweave.wire.ros2.messages import make
 
-Make = Callable[..., Any]
-"""Makes a message: `make(type, **fields)`."""
 OPTICAL = "camera_optical_frame"
 """Frame of a camera, by REP 103: x right, y down, z forward."""
 
 
-def header(make: Make, stamp_ns: int, frame: str) -> Any:
+def header(stamp_ns: int, frame: str) -> Any:
     """A Header."""
     sec, nanosec = divmod(stamp_ns, 1_000_000_000)
     stamp = make("builtin_interfaces/msg/Time", sec=sec, nanosec=nanosec)
     return make("std_msgs/msg/Header", stamp=stamp, frame_id=frame)
 
 
-def pose(make: Make, at: Pose2) -> Any:
+def pose(at: Pose2) -> Any:
     """A Pose."""
     position = make("geometry_msgs/msg/Point", x=at.x, y=at.y, z=0.0)
-    return make("geometry_msgs/msg/Pose", position=position, orientation=quaternion(make, at.heading))
+    return make("geometry_msgs/msg/Pose", position=position, orientation=quaternion(at.heading))
 
 
-def pose_with_covariance(make: Make, at: PoseGaussian) -> Any:
+def pose_with_covariance(at: PoseGaussian) -> Any:
     """A PoseWithCovariance: its position's covariance is along the axes of the frame, not of the robot."""
     c, s = math.cos(at.mean.heading), math.sin(at.mean.heading)
     turned = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
     covariance = np.zeros((6, 6))
     covariance[np.ix_((0, 1, 5), (0, 1, 5))] = turned @ at.covariance @ turned.T
     name = "geometry_msgs/msg/PoseWithCovariance"
-    return make(name, pose=pose(make, at.mean), covariance=covariance.ravel())
+    return make(name, pose=pose(at.mean), covariance=covariance.ravel())
 
 
-def quaternion(make: Make, heading: float) -> Any:
+def quaternion(heading: float) -> Any:
     """A Quaternion about the vertical."""
     half = heading / 2
     return make("geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=math.sin(half), w=math.cos(half))
 
 
-def transform(make: Make, stamp_ns: int, parent: str, child: str, parent_from_child: Pose2) -> Any:
+def transform(stamp_ns: int, parent: str, child: str, parent_from_child: Pose2) -> Any:
     """A TransformStamped on the floor."""
     at = make("geometry_msgs/msg/Vector3", x=parent_from_child.x, y=parent_from_child.y, z=0.0)
-    turn = quaternion(make, parent_from_child.heading)
+    turn = quaternion(parent_from_child.heading)
     moved = make("geometry_msgs/msg/Transform", translation=at, rotation=turn)
-    name, head = "geometry_msgs/msg/TransformStamped", header(make, stamp_ns, parent)
+    name, head = "geometry_msgs/msg/TransformStamped", header(stamp_ns, parent)
     return make(name, header=head, child_frame_id=child, transform=moved)
 
 
-def twist(make: Make, command: Command) -> Any:
+def twist(command: Command) -> Any:
     """A Twist."""
     linear = make("geometry_msgs/msg/Vector3", x=command.forward, y=0.0, z=0.0)
     angular = make("geometry_msgs/msg/Vector3", x=0.0, y=0.0, z=command.turn)
     return make("geometry_msgs/msg/Twist", linear=linear, angular=angular)
 
 
-def mount(make: Make, stamp_ns: int, camera: Camera) -> Any:
+def mount(stamp_ns: int, camera: Camera) -> Any:
     """A TransformStamped: the camera in the robot. It looks ahead, turned into the optical axes."""
     at = make("geometry_msgs/msg/Vector3", x=camera.mount_forward, y=0.0, z=camera.mount_height)
     turn = make("geometry_msgs/msg/Quaternion", x=-0.5, y=0.5, z=-0.5, w=0.5)
     moved = make("geometry_msgs/msg/Transform", translation=at, rotation=turn)
-    name, head = "geometry_msgs/msg/TransformStamped", header(make, stamp_ns, FOOTPRINT)
+    name, head = "geometry_msgs/msg/TransformStamped", header(stamp_ns, FOOTPRINT)
     return make(name, header=head, child_frame_id=OPTICAL, transform=moved)
 
 
-def camera_info(make: Make, head: Any, camera: Camera, lens: Distortion = NO_DISTORTION) -> Any:
+def camera_info(head: Any, camera: Camera, lens: Distortion = NO_DISTORTION) -> Any:
     """A CameraInfo.
 
     Args:
-        make: makes messages.
         head: of the image.
         camera: ideal, into which images are rectified.
         lens: of the real one.

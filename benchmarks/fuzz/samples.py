@@ -179,19 +179,17 @@ class Samples:
 
     def ros2(self, kinds: tuple[str, ...]) -> list[bytes]:
         """ROS 2 messages as CDR; the number of its kind comes first."""
-        now, at = making.header(make, 10**18, "camera"), Pose2(1.0, 2.0, 0.3)
+        now, at = making.header(10**18, "camera"), Pose2(1.0, 2.0, 0.3)
         pixels = np.arange(12, dtype=np.uint8)
         region = make(
             "sensor_msgs/msg/RegionOfInterest", x_offset=0, y_offset=0, height=0, width=0, do_rectify=False
         )
         twist = make(
-            "geometry_msgs/msg/TwistWithCovariance", twist=making.twist(make, Command(0.1, 0.2)),
+            "geometry_msgs/msg/TwistWithCovariance", twist=making.twist(Command(0.1, 0.2)),
             covariance=np.zeros(36),
         )  # fmt: skip
-        pose = make(
-            "geometry_msgs/msg/PoseWithCovariance", pose=making.pose(make, at), covariance=np.zeros(36)
-        )
-        tree = [making.transform(make, 10**18, "odom", "base_link", at)]
+        pose = make("geometry_msgs/msg/PoseWithCovariance", pose=making.pose(at), covariance=np.zeros(36))
+        tree = [making.transform(10**18, "odom", "base_link", at)]
         values = {
             "Image": {"header": now, "height": 3, "width": 4, "encoding": "mono8", "is_bigendian": 0,
                       "step": 4, "data": pixels},

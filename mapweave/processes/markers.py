@@ -9,11 +9,11 @@ import cv2
 import numpy as np
 
 from mapweave.agent.ros_messages import making
-from mapweave.agent.ros_messages.making import Make
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.processes.edge_colours import COLOURS
+from mapweave.wire.ros2.messages import make
 
 MAP = "map"
 SPHERE, SPHERES, LINES = 2, 7, 5
@@ -24,53 +24,49 @@ ORANGE = (0.94, 0.63, 0.16)
 """Red, green and blue of landmarks."""
 
 
-def map_markers(make: Make, places: Mapping[NodeId, Pose2], edges: Iterable[Edge]) -> Any:
+def map_markers(places: Mapping[NodeId, Pose2], edges: Iterable[Edge]) -> Any:
     """A MarkerArray in the frame `map`: nodes, and edges by their kind."""
-    points = {node: _point(make, np.array([at.x, at.y, 0.0])) for node, at in places.items()}
-    markers = [_marker(make, MAP, "nodes", 0, SPHERES, (0.08,) * 3, (0.9, 0.9, 0.9), list(points.values()))]
+    points = {node: _point(np.array([at.x, at.y, 0.0])) for node, at in places.items()}
+    markers = [_marker(MAP, "nodes", 0, SPHERES, (0.08,) * 3, (0.9, 0.9, 0.9), list(points.values()))]
     known = [edge for edge in edges if edge.a in points and edge.b in points]
     for number, (kind, colour) in enumerate(COLOURS.items(), 1):
         ends = [points[end] for edge in known if edge.kind is kind for end in (edge.a, edge.b)]
-        markers.append(_marker(make, MAP, kind.name.lower(), number, LINES, (0.03,) * 3, colour, ends))
+        markers.append(_marker(MAP, kind.name.lower(), number, LINES, (0.03,) * 3, colour, ends))
     return make("visualization_msgs/msg/MarkerArray", markers=markers)
 
 
-def landmark_markers(
-    make: Make, stamp_ns: int, frame: str, points: Array, drawn: tuple[Array, Array, Array]
-) -> Any:
+def landmark_markers(stamp_ns: int, frame: str, points: Array, drawn: tuple[Array, Array, Array]) -> Any:
     """A MarkerArray of landmarks, in place of those before.
 
     Args:
-        make: makes messages.
         stamp_ns: of the image.
         frame: of the points.
         points: (M, 3) m, all landmarks.
         drawn: of `mapweave.processes.tick_log.ellipsoids`.
     """
-    nothing = _marker(make, frame, "", 0, SPHERES, (0.0,) * 3, ORANGE, [], action=DELETE_ALL)
-    dots = [_point(make, point) for point in points[np.isfinite(points).all(axis=1)]]
-    markers = [nothing, _marker(make, frame, "landmarks", 0, SPHERES, (0.02,) * 3, ORANGE, dots, stamp_ns)]
+    nothing = _marker(frame, "", 0, SPHERES, (0.0,) * 3, ORANGE, [], action=DELETE_ALL)
+    dots = [_point(point) for point in points[np.isfinite(points).all(axis=1)]]
+    markers = [nothing, _marker(frame, "landmarks", 0, SPHERES, (0.02,) * 3, ORANGE, dots, stamp_ns)]
     for number, (centre, half, axes) in enumerate(zip(*drawn, strict=True)):
         vector = cv2.Rodrigues(axes)[0].ravel()
         angle = float(np.linalg.norm(vector))
         x, y, z = vector / max(angle, 1e-12) * np.sin(angle / 2.0)
         turn = make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=float(np.cos(angle / 2.0)))
-        pose = make("geometry_msgs/msg/Pose", position=_point(make, centre), orientation=turn)
+        pose = make("geometry_msgs/msg/Pose", position=_point(centre), orientation=turn)
         size = tuple(np.maximum(2.0 * half, 1e-3).tolist())
         marker = _marker(
-            make, frame, "ellipsoids", number, SPHERE, size, ORANGE, [], stamp_ns, pose, ADD, alpha=0.25
+            frame, "ellipsoids", number, SPHERE, size, ORANGE, [], stamp_ns, pose, ADD, alpha=0.25
         )
         markers.append(marker)
     return make("visualization_msgs/msg/MarkerArray", markers=markers)
 
 
-def _point(make: Make, at: Array) -> Any:
+def _point(at: Array) -> Any:
     x, y, z = map(float, at)
     return make("geometry_msgs/msg/Point", x=x, y=y, z=z)
 
 
 def _marker(
-    make: Make,
     frame: str,
     name: str,
     number: int,
@@ -86,15 +82,15 @@ def _marker(
     red, green, blue = colour
     x, y, z = size
     nothing = make(
-        "sensor_msgs/msg/CompressedImage", header=making.header(make, 0, ""), format="",
+        "sensor_msgs/msg/CompressedImage", header=making.header(0, ""), format="",
         data=np.zeros(0, np.uint8),
     )  # fmt: skip
     if action is None:
         action = ADD if points else DELETE
     return make(
         "visualization_msgs/msg/Marker",
-        header=making.header(make, stamp_ns, frame), ns=name, id=number, type=form, action=action,
-        pose=making.pose(make, Pose2()) if pose is None else pose,
+        header=making.header(stamp_ns, frame), ns=name, id=number, type=form, action=action,
+        pose=making.pose(Pose2()) if pose is None else pose,
         scale=make("geometry_msgs/msg/Vector3", x=x, y=y, z=z),
         color=make("std_msgs/msg/ColorRGBA", r=red, g=green, b=blue, a=alpha),
         lifetime=make("builtin_interfaces/msg/Duration", sec=0, nanosec=0), frame_locked=False,

@@ -28,7 +28,7 @@ from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.markers import MAP, landmark_markers, map_markers
 from mapweave.processes.tick_log import QUALITY, STEP, LoggedTick, TickLog, ellipsoids
-from mapweave.wire.ros2.messages import make, typestore
+from mapweave.wire.ros2.messages import make
 
 POINTS, TRACK_PX = 1, 4.0
 """Of foxglove_msgs/msg/PointsAnnotation: type, and size of a point."""
@@ -62,7 +62,7 @@ class McapLog(TickLog):
             self._writer.open()
         except (DeviceError, OSError) as error:
             raise SettingsError(f"--mcap-log {error}") from None
-        self._topics = McapTopics(self._writer, typestore())
+        self._topics = McapTopics(self._writer)
         self._camera: Any = None
         self._path: list[Any] = []
         self._last: Pose2 | None = None
@@ -72,12 +72,11 @@ class McapLog(TickLog):
         send = partial(self._topics.send, stamp_ns=moment.stamp_ns)
         if moment.camera != self._camera:
             self._camera = moment.camera
-            mount = making.mount(make, moment.stamp_ns, moment.camera)
+            mount = making.mount(moment.stamp_ns, moment.camera)
             send("/tf_static", make(TF_TYPE, transforms=[mount]))
         self._write_image(moment, send)
         self._write_pose(moment, send)
         markers = landmark_markers(
-            make,
             moment.stamp_ns,
             FOOTPRINT,
             moment.landmarks,
@@ -112,12 +111,12 @@ class McapLog(TickLog):
         return ""
 
     def _write_image(self, moment: LoggedTick, send: Any) -> None:
-        head = making.header(make, moment.stamp_ns, making.OPTICAL)
+        head = making.header(moment.stamp_ns, making.OPTICAL)
         if moment.image is not None:
             data = cv2.imencode(".jpg", moment.image, [cv2.IMWRITE_JPEG_QUALITY, QUALITY])[1].reshape(-1)
             image = make("sensor_msgs/msg/CompressedImage", header=head, format="jpeg", data=data)
             send("/camera/image/compressed", image)
-        send("/camera/camera_info", making.camera_info(make, head, moment.camera))
+        send("/camera/camera_info", making.camera_info(head, moment.camera))
         point, green = (
             "foxglove_msgs/msg/Point2",
             make("foxglove_msgs/msg/Color", r=0.24, g=0.86, b=0.35, a=1.0),
@@ -132,28 +131,26 @@ class McapLog(TickLog):
         send("/camera/tracks", annotations)
 
     def _write_pose(self, moment: LoggedTick, send: Any) -> None:
-        head = making.header(make, moment.stamp_ns, FOOTPRINT)
+        head = making.header(moment.stamp_ns, FOOTPRINT)
         send(
             "/cmd_vel",
-            make("geometry_msgs/msg/TwistStamped", header=head, twist=making.twist(make, moment.command)),
+            make("geometry_msgs/msg/TwistStamped", header=head, twist=making.twist(moment.command)),
         )
         if moment.map_from_robot is None:
             return
-        pose, head = moment.map_from_robot.mean, making.header(make, moment.stamp_ns, MAP)
-        moved = making.transform(make, moment.stamp_ns, MAP, FOOTPRINT, pose)
+        pose, head = moment.map_from_robot.mean, making.header(moment.stamp_ns, MAP)
+        moved = making.transform(moment.stamp_ns, MAP, FOOTPRINT, pose)
         send("/tf", make(TF_TYPE, transforms=[moved]))
-        known = making.pose_with_covariance(make, moment.map_from_robot)
+        known = making.pose_with_covariance(moment.map_from_robot)
         send("/pose", make("geometry_msgs/msg/PoseWithCovarianceStamped", header=head, pose=known))
         if self._last is None or pose.distance(self._last) > STEP:
             self._last = pose
-            self._path.append(
-                make("geometry_msgs/msg/PoseStamped", header=head, pose=making.pose(make, pose))
-            )
+            self._path.append(make("geometry_msgs/msg/PoseStamped", header=head, pose=making.pose(pose)))
 
     def _write_map(self, stamp_ns: int, nodes: tuple[Node, ...], edges: tuple[Edge, ...]) -> None:
         places = {node.id: node.map_from_robot.mean for node in nodes}
-        self._topics.send("/map", map_markers(make, places, edges), stamp_ns)
-        head = making.header(make, stamp_ns, MAP)
+        self._topics.send("/map", map_markers(places, edges), stamp_ns)
+        head = making.header(stamp_ns, MAP)
         self._topics.send("/path", make("nav_msgs/msg/Path", header=head, poses=self._path), stamp_ns)
 
 
@@ -168,10 +165,10 @@ def _floor(cells: GridCells, stamp_ns: int) -> Any:
     )
     x, y = cells.corner.tolist()
     info = make(
-        "nav_msgs/msg/MapMetaData", map_load_time=making.header(make, stamp_ns, MAP).stamp,
+        "nav_msgs/msg/MapMetaData", map_load_time=making.header(stamp_ns, MAP).stamp,
         resolution=cells.side, width=seen.shape[0], height=seen.shape[1],
-        origin=making.pose(make, Pose2(x, y)),
+        origin=making.pose(Pose2(x, y)),
     )  # fmt: skip
     data = seen.T.astype(np.int8).ravel()
-    head = making.header(make, stamp_ns, MAP)
+    head = making.header(stamp_ns, MAP)
     return make("nav_msgs/msg/OccupancyGrid", header=head, info=info, data=data)

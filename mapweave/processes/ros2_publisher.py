@@ -215,8 +215,8 @@ class Ros2Publisher:
         assert moment.map_from_robot is not None
         at = PoseGaussian(merged_from_map @ moment.map_from_robot.mean, moment.map_from_robot.covariance)
         stamp_ns = self._clock.remote(moment.stamp_ns)
-        head = making.header(make, stamp_ns, MAP)
-        pose = making.pose_with_covariance(make, at)
+        head = making.header(stamp_ns, MAP)
+        pose = making.pose_with_covariance(at)
         self._pose.publish(make(self._pose.kind, header=head, pose=pose))
         odom_from_robot, name = self._odometry.at(moment.stamp_ns), self._odometry.name
         transforms = []
@@ -224,21 +224,21 @@ class Ros2Publisher:
             if time.monotonic() - self._began < PATIENCE:
                 return
             odom_from_robot, name = moment.odom_from_robot, ODOM
-            transforms.append(making.transform(make, stamp_ns, ODOM, FOOTPRINT, odom_from_robot))
+            transforms.append(making.transform(stamp_ns, ODOM, FOOTPRINT, odom_from_robot))
         map_from_odom = at.mean @ odom_from_robot.inverse()
-        transforms.append(making.transform(make, stamp_ns + AHEAD_NS, MAP, name, map_from_odom))
+        transforms.append(making.transform(stamp_ns + AHEAD_NS, MAP, name, map_from_odom))
         self._tf.publish(make(TF_TYPE, transforms=transforms))
 
     def _publish_path(self, path: Iterable[tuple[int, Pose2]], merged_from_map: Pose2) -> None:
         stamped = [
             make(
                 "geometry_msgs/msg/PoseStamped",
-                header=making.header(make, self._clock.remote(stamp_ns), MAP),
-                pose=making.pose(make, merged_from_map @ pose),
+                header=making.header(self._clock.remote(stamp_ns), MAP),
+                pose=making.pose(merged_from_map @ pose),
             )
             for stamp_ns, pose in path
         ]
-        head = making.header(make, 0, MAP)
+        head = making.header(0, MAP)
         self._path.publish(make(self._path.kind, header=head, poses=stamped))
 
 
@@ -266,4 +266,4 @@ def _markers(
         points[node.id] = (
             merged_from_map @ node.map_from_robot.mean if placed is None else placed.merged_from_node
         )
-    return map_markers(make, points, moment.edges)
+    return map_markers(points, moment.edges)

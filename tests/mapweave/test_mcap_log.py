@@ -29,7 +29,6 @@ from mapweave.scenarios.fleet import TrialStage
 from mapweave.scenarios.process_fleet import ProcessFleet
 from mapweave.scenarios.scenario import load_scenario, scenario_path
 from mapweave.storage.map_file import read_map_file
-from mapweave.wire.ros2.messages import make
 from tests.mapweave.command_line import complaint
 from tests.mapweave.wall_drive import COUNT, STEP, wall_drive
 from tests.simulator import needs_simulator
@@ -123,7 +122,7 @@ def test_ellipsoids_have_the_covariance() -> None:
     roots, points = rng.normal(0, 0.2, (5, 3, 3)), rng.normal(0, 1, (5, 3))
     covariances = roots @ np.swapaxes(roots, 1, 2)
     covariances[4] = np.inf
-    array = landmark_markers(make, 0, "base_footprint", points, ellipsoids(points, covariances))
+    array = landmark_markers(0, "base_footprint", points, ellipsoids(points, covariances))
     drawn = [marker for marker in array.markers if marker.type == SPHERE]
     assert len(drawn) == 4
     for marker, point, covariance in zip(drawn, points, covariances, strict=False):
