@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+
+import numpy as np
 
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
@@ -61,3 +64,9 @@ def wheel_step(odometry: Odometry, description: RobotDescription) -> tuple[PoseG
     way = description.wheel_noise * (abs(odometry.forward) + abs(odometry.turn) * axle)
     step = PoseGaussian.from_sigmas(odometry.motion(), way + 1e-5, way / axle + 1e-5)
     return step, abs(odometry.forward) + TURN_SHARE * abs(odometry.turn)
+
+
+def position_sigma(pose: PoseGaussian) -> float:
+    """Standard deviation of a position in the direction in which it is known least, m."""
+    widest = float(np.linalg.eigvalsh(pose.covariance[:2, :2])[-1])
+    return math.sqrt(max(widest, 0.0))

@@ -37,7 +37,7 @@ from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
-HIDDEN = "twice, by what is seen of nodes nearby; of its own landmarks not enough is recognised"
+HIDDEN = ", twice by what is seen of nodes nearby; of its own landmarks not enough is recognised"
 UNDERWAY = (RouteProgress.DRIVING, RouteProgress.PARKING)
 
 ANSWER_PATIENCE = 100
@@ -325,7 +325,8 @@ class Navigator:
                 and not (self._via and self._portal is None)
                 and known
             ):
-                self.stage, self.detail = NavigationStage.ARRIVED, HIDDEN
+                self.stage = NavigationStage.ARRIVED
+                self.detail = f"at the goal, {follower.off_goal}{HIDDEN}"
                 self._reach()
             case RouteProgress.UNSURE:
                 # It is at the goal by what it knows, yet it sees none of the goal's landmarks.

@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from mapweave.agent.localization.fix import Fix
+from mapweave.agent.localization.fix import Fix, position_sigma
 from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.navigation.local_planner import LocalPlanner
@@ -53,6 +53,13 @@ SKIP = 2
 """Nodes further along the route that are searched for as well."""
 GOAL_VIEWS = 4
 """Detections at the goal, averaged, that decide whether the robot is there."""
+WITHIN = 0.01
+"""A robot within this of the goal has parked, m."""
+SIGMAS = 2.0
+"""A robot whose distance from the goal and so many of its standard deviations are together within that has
+arrived; else it drives the rest."""
+CORRECTIONS = 2
+"""How often it does so. Where what is in view says too little, it is then as near as it gets."""
 HIDDEN = 2.0
 """After this time at the goal without its landmarks visible, or recognised, the robot is not there, s."""
 PATIENCE = 6.0
@@ -135,6 +142,7 @@ class RouteFollower:
         self._hidden = 0.0
         self._confirmed = False
         self._goal_poses: list[PoseGaussian] = []
+        self._corrections = 0
 
     @property
     def blocked(self) -> tuple[NodeId, NodeId]:
@@ -151,6 +159,15 @@ class RouteFollower:
     def to_goal(self) -> float:
         """How far the robot is from the last node, m."""
         return self.distance(self._last)
+
+    @property
+    def off_goal(self) -> str:
+        """How far the robot is from the last node by its own estimate, with the standard deviation."""
+        goal_from_robot = self.fix.node_from_robot
+        for hop in self._route[self._reference + 1 :]:
+            goal_from_robot = hop.previous_from_node.inverse() @ goal_from_robot
+        distance = math.hypot(goal_from_robot.mean.x, goal_from_robot.mean.y)
+        return f"{1e3 * distance:.0f} +- {1e3 * position_sigma(goal_from_robot):.0f} mm off"
 
     def distance(self, leg: int) -> float:
         """Distance of the robot from a leg's node, m."""
@@ -196,7 +213,7 @@ class RouteFollower:
             step = self._servo.command(target, points, visible, obstacles)
             if parking:
                 self.progress = RouteProgress.PARKING
-                self.detail = f"{step.reason}, {distance * 1000:.0f} mm off"
+                self.detail = f"{step.reason}, {self.off_goal}"
                 self._confirm(step.state, observation)
             if step.state != "stuck":
                 self._approaching = False
@@ -241,7 +258,9 @@ class RouteFollower:
         """At the goal detect it again: tracks have drifted a little on the way, all in the same direction.
 
         A view from the node's own pose shows its features at their own scale, so this is the most precise
-        measurement of the pose; several are averaged. The robot has arrived if it is then still at the goal.
+        measurement of the pose; several are averaged. The robot has arrived if it is then still at the goal,
+        and surely near enough: the servo ends ways at several millimetres, which is right while the pose is
+        known no better.
         """
         if state != "arrived":
             self._confirmed, self._hidden, self._goal_poses = False, 0.0, []
@@ -251,11 +270,22 @@ class RouteFollower:
             self._goal_poses.append(localizer.pose)
             if len(self._goal_poses) == GOAL_VIEWS:
                 localizer.restart(averaged(self._goal_poses))
-                self._goal_poses, self._confirmed, self.fix = [], True, Fix.of(localizer)
+                self._goal_poses, self.fix = [], Fix.of(localizer)
+                self._confirmed = not self._drives_the_rest()
         else:
             self._hidden += self._description.tick
             if self._hidden > HIDDEN:
                 self.progress = RouteProgress.UNSURE
+
+    def _drives_the_rest(self) -> bool:
+        """Whether the robot, measured at rest by the goal itself, may be too far off and drives on."""
+        near = self._off_reference() + SIGMAS * position_sigma(self.fix.node_from_robot) <= WITHIN
+        if near or self._corrections == CORRECTIONS:
+            return False
+        if not self._servo.come_nearer(self.fix.node_from_robot.mean):
+            return False
+        self._corrections += 1
+        return True
 
     # Nodes ahead
 

@@ -105,6 +105,26 @@ class Servo:
         """The plan at work, if legs and no law drive."""
         return self._plan
 
+    def come_nearer(self, goal_from_robot: Pose2) -> bool:
+        """At the goal, yet not near enough for the caller: drive one more way to it.
+
+        Args:
+            goal_from_robot: where the robot is, in the goal's robot frame, as it was measured at rest.
+
+        Returns:
+            Whether a way is known; if not, the robot stays where it is.
+        """
+        pose = Pose2(goal_from_robot.x, goal_from_robot.y, wrap_angle(goal_from_robot.heading))
+        if math.hypot(pose.x, pose.y) <= DEAD_ZONE:
+            return False
+        plan = quick_plan(self._surroundings(pose), pose)
+        if plan is None:
+            return False
+        self._plan, self._leg, self._follower = plan, 0, None
+        self._in_dead_zone, self._settled = False, 0
+        self.switches += 1
+        return True
+
     def command(
         self,
         goal_from_robot: Pose2,

@@ -100,6 +100,45 @@ def test_it_parks_where_a_photograph_was_taken_by_hand(walls, node, scale, pitch
     assert abs(pose.heading) < np.radians(1.0)
 
 
+class Measured(Deluded):
+    """A localizer that knows where the robot is, and says how well it does."""
+
+    def __init__(self, node: Node, pose: Pose2, sigma: float) -> None:
+        super().__init__(node)
+        self.pose = PoseGaussian.from_sigmas(pose, sigma, 0.001)
+        self._covariance = self.pose.covariance
+
+    def step(self, observation: Observation) -> None:
+        self.pose = PoseGaussian(self.pose.mean @ observation.odometry.motion(), self._covariance)
+
+    def restart(self, pose: PoseGaussian) -> None:
+        """It knows already."""
+
+
+@pytest.mark.parametrize(
+    ("sigma", "nearer"), [(0.0015, False), (0.003, True), (0.02, True)], ids=["sure", "unsure", "blurred"]
+)
+def test_a_robot_that_may_be_a_centimetre_off_drives_the_rest(node, monkeypatch, sigma, nearer):
+    """It arrives 6.5 mm off by its tracks. With how well the goal itself says so, that may be too much."""
+    begin = Pose2(0.0, 0.0065, 0.0)
+    follower, true = follower_at_the_goal(node), Measured(node, begin, sigma)
+    monkeypatch.setattr(RouteFollower, "_detect_goal", lambda *_: true)
+    monkeypatch.setattr(RouteFollower, "_detect", lambda *_: False)
+    odometry, dark, said = Odometry(0.0, 0.0), np.full((CAMERA.height, CAMERA.width), 3, np.uint8), ""
+    for tick in range(400):
+        command = follower.step(Observation(tick * 10**8, odometry, dark))
+        if follower.fix.localizer is not true:
+            true.step(Observation(0, odometry, dark))
+        said = follower.detail
+        if follower.progress is RouteProgress.ARRIVED:
+            break
+        odometry = Odometry(command.forward * ROBOT.tick, command.turn * ROBOT.tick)
+    assert follower.progress is RouteProgress.ARRIVED
+    off = 1e3 * true.pose.mean.distance(Pose2())
+    assert off <= 4.0 if nearer else off == pytest.approx(6.5)
+    assert said == f"at the goal, {off:.0f} +- {1e3 * sigma:.0f} mm off"
+
+
 def test_a_robot_that_sees_nothing_of_the_goal_has_not_arrived(walls, node):
     follower = follower_at_the_goal(node)
     dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)

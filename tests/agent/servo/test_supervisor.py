@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mapweave.agent.observation import RobotDescription
-from mapweave.agent.servo.supervisor import Servo
+from mapweave.agent.servo.supervisor import DEAD_ZONE, Servo
 from mapweave.agent.servo.visibility import Visibility
 from mapweave.hybridmap.pose import Array, Pose2
 
@@ -96,6 +96,38 @@ def test_starts_parked(robot: RobotDescription, simulate: Callable[..., Any]) ->
     assert run.parked
     assert len(run.steps) == 3
     assert all(s.command.forward == 0.0 for s in run.steps)
+
+
+@pytest.mark.parametrize("aside", [-0.007, 0.0055])
+def test_it_comes_nearer_to_the_goal_at_which_it_has_arrived(
+    robot: RobotDescription, integrate: Callable[..., list[Pose2]], aside: float
+) -> None:
+    """It has arrived by an estimate that was off, is told where it is, and drives the rest."""
+    servo, tracked, pose = Servo(robot), np.ones(len(WALL_OF_POINTS), dtype=bool), Pose2(0.0, aside, 0.0)
+    servo.start(Pose2(), WALL_OF_POINTS)
+    while servo.command(Pose2(), WALL_OF_POINTS, tracked, NOTHING).state != "arrived":
+        pass
+    assert servo.command(pose, WALL_OF_POINTS, tracked, NOTHING).state == "arrived", "within its tolerance"
+    assert servo.come_nearer(pose)
+    for _ in range(150):
+        step = servo.command(pose, WALL_OF_POINTS, tracked, NOTHING)
+        if step.state == "arrived":
+            break
+        pose = integrate(pose, step.command, robot.tick, 5)[-1]
+    assert step.state == "arrived"
+    assert pose.distance(Pose2()) <= DEAD_ZONE
+
+
+def test_it_stays_where_it_has_arrived_without_a_way_nearer(robot: RobotDescription) -> None:
+    servo, tracked = Servo(robot), np.ones(len(WALL_OF_POINTS), dtype=bool)
+    angles = np.linspace(0, 2 * math.pi, 63)
+    ring = robot.radius * np.column_stack([np.cos(angles), np.sin(angles)])
+    for pose, obstacles in ((Pose2(0.003, 0.001, 0.0), NOTHING), (Pose2(0.0, 0.007, 0.0), ring)):
+        servo.start(Pose2(), WALL_OF_POINTS)
+        for _ in range(4):
+            servo.command(Pose2(), WALL_OF_POINTS, tracked, obstacles)
+        assert not servo.come_nearer(pose)
+        assert servo.command(pose, WALL_OF_POINTS, tracked, obstacles).state == "arrived"
 
 
 def test_landmarks_that_are_not_tracked_are_not_counted_on(robot: RobotDescription) -> None:
