@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 
 from benchmarks.parking.scene import ROBOT, ParkingScene
+from mapweave.agent.localization.fix import position_sigma
 from mapweave.agent.mission import ServerAnswer
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.navigation.route_follower import RouteProgress
@@ -59,6 +60,9 @@ class ParkingOutcome:
         error_m: distance from the goal at the end.
         error_deg: of the heading.
         believed_m: what the robot believes its distance from the goal to be.
+        sigma_m: standard deviation that it gives its position, in the direction in which it knows it least;
+            NaN where it does not know itself by the goal.
+        nees: normalised squared error of the pose that it believes, 3 if its covariance is right; NaN there.
         time_s: until it arrived or the time was over.
         path_ratio: way over the shortest one that keeps the landmarks in view.
         switches: how often another law or leg has taken the wheels.
@@ -74,6 +78,8 @@ class ParkingOutcome:
     error_m: float
     error_deg: float
     believed_m: float
+    sigma_m: float
+    nees: float
     time_s: float
     path_ratio: float
     switches: int
@@ -107,7 +113,8 @@ def park(scene: ParkingScene, start: Pose2, shortest: float, seed: int) -> Parki
         for _ in range(REST):
             simulation.advance({})
         off, collisions = _true(scene, simulation), simulation.collisions(ROBOT)
-    believed = record.believed[-1]
+    believed, fix = record.believed[-1], navigator.fix
+    known = fix if fix is not None and fix.node == scene.goal.id else None
     error_m, error = math.hypot(off.x, off.y), abs(wrap_angle(off.heading))
     parking = [doing.startswith(RouteProgress.PARKING) for doing in record.doing]
     violations = sum(p and n < LEAST_VISIBLE for p, n in zip(parking, record.seen, strict=True))
@@ -127,6 +134,8 @@ def park(scene: ParkingScene, start: Pose2, shortest: float, seed: int) -> Parki
         error_m=error_m,
         error_deg=math.degrees(error),
         believed_m=float(np.hypot(*believed[:2])),
+        sigma_m=math.nan if known is None else position_sigma(known.node_from_robot),
+        nees=math.nan if known is None else known.node_from_robot.mahalanobis2(off),
         time_s=len(record.doing) * description.tick,
         path_ratio=float(np.hypot(way[:, 0], way[:, 1]).sum()) / shortest,
         switches=_switches(record.doing),
