@@ -86,11 +86,7 @@ class RobotsInView:
     """
 
     def __init__(self, description: RobotDescription) -> None:
-        """Know of no other robot.
-
-        Args:
-            description: of this one.
-        """
+        """Know of no other robot; the description is that of this one."""
         self.description = description
         self.aside: NodeId | None = None
         self._odom_from_robot = Pose2()

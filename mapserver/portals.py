@@ -36,12 +36,7 @@ class Portals:
     """
 
     def __init__(self, merged: MergedMap, annotations: Annotations) -> None:
-        """Take a map.
-
-        Args:
-            merged: the map.
-            annotations: the record.
-        """
+        """Take a map and its record of annotations."""
         self.merged = merged
         self._floors = annotations.floors
         self._portals = {

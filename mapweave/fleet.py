@@ -235,11 +235,8 @@ class Fleet(FleetMap, FleetConstraints):
         return sorted(found)
 
     def missions(self, robot: str = "") -> tuple[MissionReport, ...]:
-        """The missions that the map server knows of, oldest first; none is in an older state than `wait` has
-        returned.
-
-        Args:
-            robot: of this robot alone.
+        """The missions that the map server knows of, or those of one robot, oldest first; none is in an older
+        state than `wait` has returned.
 
         Raises:
             NotConnected: no map server answers.

@@ -134,11 +134,7 @@ class OpenedMap:
         )  # fmt: skip
 
     def file(self, merged: MergedMap) -> MapFile:
-        """The content of a map file that holds the whole map.
-
-        Args:
-            merged: see `merged`.
-        """
+        """The content of a map file that holds the whole map, as `merged` returned it."""
         if self.source is MapSource.FILE or (len(merged.maps) < 2 and not merged.constraints.in_force):
             return self.content
         from mapweave.mapserver.map_files import map_file_of

@@ -110,12 +110,7 @@ class Stage:
             self.lamps = factor
 
     def enter(self, actor: Actor, seed: Sequence[int]) -> None:
-        """Add an actor.
-
-        Args:
-            actor: to add.
-            seed: of the appearance.
-        """
+        """Add an actor; the seed is that of its appearance."""
         p, figure = self.physics, actor.figure
         half = [figure.length / 2, figure.width / 2, figure.height / 2]
         number = int(p.createMultiBody(0, p.createCollisionShape(p.GEOM_BOX, halfExtents=half)))

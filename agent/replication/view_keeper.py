@@ -58,12 +58,7 @@ class ViewKeeper(BusClient):
         self._closing = [bus.serve(key, self._asked), bus.announce(key)]
 
     def keep(self, images: Iterable[tuple[NodeId, RawImage]], changes: Iterable[ChangeBody]) -> None:
-        """Keep images of new nodes, and remove those of retired nodes; never waits.
-
-        Args:
-            images: of nodes.
-            changes: to the map.
-        """
+        """Keep images of new nodes, and remove those of retired nodes; never waits."""
         for node, image in images:
             if self._tasks.qsize() < MOST_WAITING:
                 self._tasks.put(partial(self._write, node, image))

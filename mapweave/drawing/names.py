@@ -73,12 +73,7 @@ class NamePlacement:
     """Finds free room, in pixels from the lower left corner of the picture."""
 
     def __init__(self, width: float, height: float) -> None:
-        """Begin with an empty picture.
-
-        Args:
-            width: px.
-            height: px.
-        """
+        """Begin with an empty picture of a size in px."""
         self._width, self._height = width, height
         self._marks, self._names = np.zeros((2, int(height / CELL) + 1, int(width / CELL) + 1), np.bool_)
 

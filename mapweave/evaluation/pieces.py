@@ -72,12 +72,7 @@ def check_folder(folder: Path, needs: str) -> None:
 
 
 def cut(count: int, robots: int) -> list[range]:
-    """Consecutive ranges of images that overlap; of neighbours, one takes the even images, one the odd.
-
-    Args:
-        count: images.
-        robots: pieces.
-    """
+    """Consecutive ranges of images that overlap; of neighbours, one takes the even images, one the odd."""
     length = count / (robots - (robots - 1) * OVERLAP)
     ranges = []
     for k in range(robots):

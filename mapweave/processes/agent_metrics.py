@@ -72,11 +72,7 @@ class AgentMetrics(Collector):
     """The metrics of one agent during its life. The loop calls `step`, and never waits for a scrape."""
 
     def __init__(self, robot: str) -> None:
-        """Begin with nothing counted.
-
-        Args:
-            robot: its name.
-        """
+        """Begin with nothing counted of a robot."""
         self._robot = robot
         self._ticks, self._seconds = 0, 0.0
         self._buckets = [0] * (len(TICK_BUCKETS) + 1)

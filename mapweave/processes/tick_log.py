@@ -83,11 +83,7 @@ class TickLog(ABC):
     title: ClassVar[str]
 
     def __init__(self, name: str) -> None:
-        """Start the thread; what it writes to must be there.
-
-        Args:
-            name: of the thread.
-        """
+        """Start the thread; what it writes to must be there."""
         self.left_out = 0
         self._pipeline: Pipeline | None = None
         self._stamp_ns = 0

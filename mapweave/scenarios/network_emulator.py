@@ -36,12 +36,7 @@ class NetworkEmulator:
     """
 
     def __init__(self, target_port: int, seed: int) -> None:
-        """Listen on a free port, and forward to another.
-
-        Args:
-            target_port: of the router.
-            seed: of the losses.
-        """
+        """Listen on a free port, and forward to the router's; the seed is that of the losses."""
         self._target = target_port
         self._random = np.random.default_rng([seed, 0xCAB1E])
         self._lock = threading.Lock()
