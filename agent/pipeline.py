@@ -34,6 +34,7 @@ from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.robots_in_view import RobotsInView, nodes_around
 from mapweave.agent.sensor_health.odometry_convention import OdometryConvention
 from mapweave.agent.sensor_health.sensor_monitor import SensorFault, SensorMonitor
+from mapweave.agent.sensor_health.silent_wheel import SilentWheel
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
@@ -112,6 +113,7 @@ class Pipeline:
         self._caution = CautiousDriving(description) if lacks_rangers(description) else None
         self._driven: Driven | None = None
         self._sensors = SensorMonitor(description)
+        self._silent = SilentWheel(description)
         self._blind_zone = BlindZone(description)
         self._others = RobotsInView(description)
         self._command: Command | None = None
@@ -130,7 +132,9 @@ class Pipeline:
     @property
     def complaints(self) -> list[str]:
         """What was found to be wrong with the odometry and with the declared geometry, a line each."""
-        odometry = (f"the map is wrong: {line}" for line in self._convention.complaints)
+        # A dead encoder explains what else is strange about the odometry.
+        odometry = [self._silent.complaint] if self._silent.complaint else self._convention.complaints
+        odometry = [f"the map is wrong: {line}" for line in odometry]
         return [*odometry, *map(str, self.calibration.causes), *self.calibration.contradicted]
 
     @property
@@ -251,6 +255,8 @@ class Pipeline:
             observation = replace(observation, image=self._fisheye.rectified(observation.image))
         self._image = observation.image
         self._convention.see(observation)
+        if self._command is None:
+            self._silent.see(observation)
         observation = self.calibration.correct(observation)
         observation = self._blind_zone.fill(self._sensors.see(observation, self._command))
         if self._sensors.clock_jumped:
