@@ -40,7 +40,7 @@ from mapweave.refusals import listed
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Credentials
-from mapweave.wire.each_robot import each_robot, in_parallel
+from mapweave.wire.each_robot import alive_robots, each_robot, in_parallel
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
@@ -50,8 +50,6 @@ from mapweave.wire.zenoh_bus import ZenohBus
 if TYPE_CHECKING:
     from mapweave.mapserver.plan_answers import StatusOnPlan
 
-SETTLING = 0.5
-"""s; liveliness of agents that are there is known by then."""
 TRIES = 3
 """A mission given by a clock that is behind is given again, later than the robot's present one."""
 
@@ -208,7 +206,7 @@ class Fleet(FleetMap, FleetConstraints):
         replies = self._ask(self._keys.agent_statuses(), b"", ANSWERED)
         if not replies and self._key_holder is not None:
             # A router with keys passes a question to a robot only if it is for that one alone.
-            keys = [self._keys.agent_status(name) for name in self._alive()]
+            keys = [self._keys.agent_status(name) for name in alive_robots(self._bus, self._keys)]
             asked = in_parallel(keys, lambda key: self._ask(key, b"", ANSWERED))
             replies = [reply for one in asked for reply in one]
         robots = []
@@ -218,21 +216,6 @@ class Fleet(FleetMap, FleetConstraints):
         if not robots:
             raise self._no_answer()
         return FleetStatus(tuple(sorted(robots, key=lambda entry: entry.robot)))
-
-    def _alive(self) -> list[str]:
-        """The robots whose agents are there, found by their liveliness."""
-        found: set[str] = set()
-
-        def see(key: str, alive: bool) -> None:
-            if alive:
-                found.add(self._keys.parse_agent_alive(key).agent)
-
-        watching = self._bus.watch(self._keys.agents_alive(), see)
-        try:
-            time.sleep(SETTLING)
-        finally:
-            watching.close()
-        return sorted(found)
 
     def missions(self, robot: str = "") -> tuple[MissionReport, ...]:
         """The missions that the map server knows of, or those of one robot, oldest first; none is in an older

@@ -1,18 +1,39 @@
-"""Asking many robots for one thing, such as to stop."""
+"""Which robots are there, and asking many of them for one thing, such as to stop."""
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import TypeVar
 
 from mapweave.hybridmap.errors import MapweaveError, NotConnected
+from mapweave.wire.bus import Bus
+from mapweave.wire.keys import Keys
 
 S = TypeVar("S")
 T = TypeVar("T")
 
 AT_ONCE = 64
 """Robots that are asked at once."""
+SETTLING = 0.5
+"""s; liveliness of agents that are there is known by then."""
+
+
+def alive_robots(bus: Bus, keys: Keys) -> list[str]:
+    """The robots whose agents are there, found by their liveliness."""
+    found: set[str] = set()
+
+    def see(key: str, alive: bool) -> None:
+        if alive:
+            found.add(keys.parse_agent_alive(key).agent)
+
+    watching = bus.watch(keys.agents_alive(), see)
+    try:
+        time.sleep(SETTLING)
+    finally:
+        watching.close()
+    return sorted(found)
 
 
 def each_robot(robots: Sequence[str], ask: Callable[[str], T]) -> list[T]:

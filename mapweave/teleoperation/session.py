@@ -14,6 +14,7 @@ from mapweave.agent.teleoperation import DEAD_MAN
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import DeviceError, MapweaveError
 from mapweave.wire.bus import Bus
+from mapweave.wire.each_robot import alive_robots
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import sent_by
@@ -114,15 +115,6 @@ class Session:
 
     def _absent(self) -> str:
         """That the agent does not answer, and who is there."""
-        there: set[str] = set()
-
-        def see(key: str, alive: bool) -> None:
-            if alive:
-                there.add(self._keys.parse_agent_alive(key).agent)
-
-        watch = self._bus.watch(self._keys.agents_alive(), see)
-        time.sleep(DEAD_MAN)
-        watch.close()
-        others = ", ".join(sorted(there - {self._name}))
+        others = ", ".join(name for name in alive_robots(self._bus, self._keys) if name != self._name)
         rest = f"; there are {others}" if others else ""
         return f"no agent {self._name} in fleet {self._keys.fleet}: start `mapweave agent {self._name}`{rest}"
