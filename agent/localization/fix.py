@@ -10,8 +10,11 @@ import numpy as np
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.pose import PoseGaussian
+from mapweave.hybridmap.pose import Pose2, PoseGaussian, nearest_covariance
 
+CONTRADICTION = 11.34
+"""Two estimates further apart than this contradict each other: chi-square, 99 % point for 3 degrees of
+freedom."""
 TURN_SHARE = 0.15
 """m/rad; a turn without visible landmarks adds as much uncertainty as this way."""
 
@@ -70,3 +73,26 @@ def position_sigma(pose: PoseGaussian) -> float:
     """Standard deviation of a position in the direction in which it is known least, m."""
     widest = float(np.linalg.eigvalsh(pose.covariance[:2, :2])[-1])
     return math.sqrt(max(widest, 0.0))
+
+
+def joined(measured: PoseGaussian, followed: PoseGaussian) -> PoseGaussian:
+    """One pose from a measurement and from what was followed until then, weighted by their information.
+
+    They use different pixels of the same landmarks. What errors these have in common does not average out;
+    that is no reason to drop either, and both are estimated with care.
+
+    Args:
+        measured: by a view of its own.
+        followed: by tracks, which may have slid, all in the same direction.
+
+    Returns:
+        The pose; the measurement alone if the tracks contradict it.
+    """
+    apart = (measured.mean.inverse() @ followed.mean).vector
+    together = measured.covariance + followed.covariance + 1e-12 * np.eye(3)
+    if float(apart @ np.linalg.solve(together, apart)) > CONTRADICTION:
+        return measured
+    gain = measured.covariance @ np.linalg.inv(together)
+    covariance = measured.covariance - gain @ measured.covariance
+    step = Pose2.from_vector(gain @ apart)
+    return PoseGaussian(measured.mean @ step, nearest_covariance(0.5 * (covariance + covariance.T)))

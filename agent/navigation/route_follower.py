@@ -8,7 +8,7 @@ from enum import StrEnum
 
 import numpy as np
 
-from mapweave.agent.localization.fix import Fix, position_sigma
+from mapweave.agent.localization.fix import Fix, joined, position_sigma
 from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.navigation.local_planner import LocalPlanner
@@ -257,10 +257,12 @@ class RouteFollower:
     def _confirm(self, state: State, observation: Observation) -> None:
         """At the goal detect it again: tracks have drifted a little on the way, all in the same direction.
 
-        A view from the node's own pose shows its features at their own scale, so this is the most precise
-        measurement of the pose; several are averaged. The robot has arrived if it is then still at the goal,
-        and surely near enough: the servo ends ways at several millimetres, which is right while the pose is
-        known no better.
+        A view from the node's own pose shows its features at their own scale, so in most places this is the
+        most precise measurement of the pose. Several are averaged, and joined with what the tracks say: where
+        the goal's landmarks lie close together, the whole way shows more than a look at its end.
+
+        The robot has arrived if it is then still at the goal, and surely near enough: the servo ends ways at
+        several millimetres, which is right while the pose is known no better.
         """
         if state != "arrived":
             self._confirmed, self._hidden, self._goal_poses = False, 0.0, []
@@ -269,7 +271,7 @@ class RouteFollower:
         elif (localizer := self._detect_goal(observation)) is not None:
             self._goal_poses.append(localizer.pose)
             if len(self._goal_poses) == GOAL_VIEWS:
-                localizer.restart(averaged(self._goal_poses))
+                localizer.restart(joined(averaged(self._goal_poses), self.fix.node_from_robot))
                 self._goal_poses, self.fix = [], Fix.of(localizer)
                 self._confirmed = not self._drives_the_rest()
         else:

@@ -139,6 +139,28 @@ def test_a_robot_that_may_be_a_centimetre_off_drives_the_rest(node, monkeypatch,
     assert said == f"at the goal, {off:.0f} +- {1e3 * sigma:.0f} mm off"
 
 
+def test_a_vague_look_does_not_move_a_robot_that_its_way_has_brought_to_the_goal(node, monkeypatch):
+    """Of landmarks close together a look knows little: it says 9 mm, give or take 7. The tracks are right."""
+    follower, restarts = follower_at_the_goal(node), []
+    vague = Measured(node, Pose2(0.0, -0.009, 0.0), 0.007)
+
+    def restart(pose: PoseGaussian) -> None:
+        restarts.append(pose)
+        vague.pose = pose
+
+    monkeypatch.setattr(vague, "restart", restart)
+    monkeypatch.setattr(RouteFollower, "_detect_goal", lambda *_: vague)
+    monkeypatch.setattr(RouteFollower, "_detect", lambda *_: False)
+    dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)
+    for tick in range(20):
+        assert follower.step(Observation(tick * 10**8, Odometry(0.0, 0.0), dark)) == Command()
+        if follower.progress is RouteProgress.ARRIVED:
+            break
+    assert follower.progress is RouteProgress.ARRIVED
+    assert len(restarts) == 1
+    assert restarts[0].mean.distance(Pose2()) < 0.002
+
+
 def test_a_robot_that_sees_nothing_of_the_goal_has_not_arrived(walls, node):
     follower = follower_at_the_goal(node)
     dark = np.full((CAMERA.height, CAMERA.width), 3, np.uint8)
