@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapweave.agent.calibration.correction import declaring, geometry_of
+from mapweave.agent.calibration.correction import corrected, declaring, frame_change, geometry_of
 from mapweave.agent.calibration.learned import LearnedGeometry, LearnedParameter, intrinsics_of
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
@@ -21,11 +21,13 @@ from mapweave.agent.recordings.learned_file import read_learned, write_learned
 from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
 from mapweave.hybridmap.mission_order import MissionKind
+from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from tests.agent.calibration.room_drive import CAMERA, RoomDrive, drive, render
-from tests.agent.conftest import DESCRIPTION
+from tests.agent.conftest import DESCRIPTION, PhotoWalls
+from tests.waiting import eventually
 
 KEYS = Keys("fleet")
 P = Parameter
@@ -64,6 +66,26 @@ def test_the_start_says_what_was_learned_and_how_to_forget_it(bus: MemoryBus, tm
     assert again.pipeline.calibration.geometry.heading == 0.0
     again.close()
     assert not file.exists()
+
+
+def test_a_correction_is_on_the_disk_before_the_process_ends(bus: MemoryBus, tmp_path: Path) -> None:
+    """It may be killed. That a correction is found is tested with the calibration."""
+    agent = started(bus, tmp_path, [])
+    calibration, file = agent.pipeline.calibration, tmp_path / "r0.learned.toml"
+    walls, here = PhotoWalls(), Pose2(-1.0)
+    agent.tick(walls.observe(here, here, 1))
+    assert not file.exists()
+    # As if a solution had been adopted.
+    calibration._used[P.HEADING], calibration._sigmas[P.HEADING] = True, 0.002
+    after = replace(calibration.geometry, heading=0.05)
+    calibration._next, change = after, frame_change(calibration.geometry, after)
+    calibration.pending = (*corrected(DESCRIPTION, after), change)
+    calibration.switched()
+    agent.tick(walls.observe(here, here, 2))
+    eventually(file.exists, 10.0)
+    read = read_learned(file)
+    assert read is not None and read[0].parameters == {P.HEADING: LearnedParameter(0.05, 0.002)}
+    agent.close()
 
 
 def test_a_recording_is_the_same_map_whatever_was_learned(bus: MemoryBus, tmp_path: Path) -> None:
