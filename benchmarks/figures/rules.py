@@ -145,7 +145,7 @@ AGAINST_LIES = {
     "clocks that run backwards": "merge/mutual_exclusion/trajectories.py",
     "bent maps": "merge/outlier_rejection/bent_maps.py",
     "shuffled maps": "merge/outlier_rejection/shuffled_maps.py",
-    "torn maps": "merge/torn_maps.py",
+    "torn maps": "merge/outlier_rejection/wrong_geometry.py",
     "two sources of aliasing": "merge/outlier_rejection/distinctness.py",
     "false places of one robot": "merge/outlier_rejection/fleet_chance.py",
 }

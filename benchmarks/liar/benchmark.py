@@ -43,7 +43,6 @@ from mapweave.merge.outlier_rejection import distinctness, wrong_geometry
 from mapweave.merge.outlier_rejection.fleet_chance import FleetChance
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
 from mapweave.merge.pose_graph.staged_optimization import StagedOptimization
-from mapweave.merge.torn_maps import TornMapSearch
 from mapweave.scenarios.liar.lies import EVERY, WAYS, Map
 from mapweave.scenarios.liar.trial import ContainmentOutcome, LiarTrial, row, totals
 from synthetic.wrong_geometry import ODD, SCENES, FaultyFleet, OdometryFault, draw_fleet, lost_views
@@ -80,7 +79,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     ),
     "false places of one robot": ((FleetChance, "_all_at_one_robot", lambda *_: False),),
     "optimisation in two stages": ((StagedOptimization, "solved", lambda _self, merged, _maps: merged),),
-    "torn maps": ((TornMapSearch, "torn", lambda *_: {}),),
+    "torn maps": ((wrong_geometry, "is_torn", lambda *_: False),),
     "answers without implausible maps": ((answers, "doubted", lambda _: []),),
     "fragments": ((active_nodes, "fragments", lambda *_: []),),
     "unmeasurable edges": ((entry, "unmeasurable", lambda *_: ""),),

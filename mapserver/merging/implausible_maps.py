@@ -13,8 +13,6 @@ from mapweave.mapserver.plausibility import (
     scattered,
 )
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.merge.settings import ConsistencySettings
-from mapweave.merge.torn_maps import TornMapSearch
 
 
 class ImplausibleMaps:
@@ -25,16 +23,11 @@ class ImplausibleMaps:
     disbelieved: dict[MapId, str]
     """Maps of which something said is not believed, and why the first such thing is not."""
 
-    def __init__(self, consistency: ConsistencySettings) -> None:
-        """Nothing is known yet.
-
-        Args:
-            consistency: when links agree.
-        """
+    def __init__(self) -> None:
+        """Nothing is known yet."""
         self._by_itself: dict[MapId, str] = {}
         self.refused = {}
         self.disbelieved = {}
-        self._torn = TornMapSearch(consistency)
 
     def changed(self, map_id: MapId, hybrid_map: HybridMap) -> None:
         """Look at a map that is new or has changed."""
@@ -59,7 +52,7 @@ class ImplausibleMaps:
             merged: as it was just merged.
             pruned: maps that had more nodes, which newer ones have superseded.
         """
-        odd = self._torn.torn(merged) | contradict_each_other(merged) | contradict_themselves(merged)
+        odd = contradict_each_other(merged) | contradict_themselves(merged)
         odd |= {which: reason for which, reason in self._by_itself.items() if reason}
         odd |= scattered(merged.maps, pruned) | self.disbelieved | self.refused
         return {which: odd[which] for which in sorted(odd.keys() & merged.maps.keys())}

@@ -87,7 +87,7 @@ class Merger:
         self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
         self._copies, self._copied = Copies(), dict[MapId, str]()
-        self._implausible = ImplausibleMaps(self.settings.consistency)
+        self._implausible = ImplausibleMaps()
         self._contradictions = WrongGeometrySearch(self.settings.consistency)
         self._wrong: dict[MapId, WrongGeometry] = {}
         self._unlinked: dict[MapPair, str] = {}
