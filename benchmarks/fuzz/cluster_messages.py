@@ -40,7 +40,7 @@ class ClusterMessages:
         shard = Shard()
         shard.change(nodes)
         pairs = [*pairwise(nodes)]
-        nearest, overlaps = Nearest(nodes[0].landmarks.codes, 16), Overlaps(ComparedNodes.of(nodes[:1]))
+        nearest, overlaps = Nearest(nodes[0].landmarks.codes, 16, 1000), Overlaps(ComparedNodes.of(nodes[:1]))
         server = ShardServer()
         state: State = decoded(server.call(encoded(Hello())), State)
         change = ShardChange(state, ComparedNodes.of(nodes[:2]), Ids.of([nodes[2].id]))

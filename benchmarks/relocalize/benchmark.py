@@ -87,7 +87,6 @@ def measured(bench: Bench, size: int, peer: bool, ceilings: list[str]) -> dict[s
             index.extend(some)
             for _ in some:
                 step()
-        index.settle()
     built = spent() - bench.making - began
     grown = (held_bytes() - before) / 1e6
     searches = searched(bench, index)

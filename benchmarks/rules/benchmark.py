@@ -70,7 +70,6 @@ def places(seed: int, count: int, progress: Progress) -> dict[str, dict[str, Any
     bench = Bench(seed, count, QUERIES, progress)
     index = PlaceIndex()
     index.extend(list(bench.nodes(count)))
-    index.settle()
 
     def answers() -> dict[str, Any]:
         replies = bench.asked("questions", Relocalizer(index, bench.node, bench.merged))

@@ -195,6 +195,7 @@ class Nearest:
 
     codes: NDArray[np.uint8]
     count: int
+    wanted: int
     TAG = "nearest"
 
     def __post_init__(self) -> None:
@@ -203,6 +204,8 @@ class Nearest:
         _rows(self.codes, 0, SYMBOLS)
         if self.count < 1 or self.count * len(self.codes) > MOST_NEAREST:
             raise InvalidMessage(f"{self.count} landmarks of each of {len(self.codes)} features")
+        if self.wanted < 0:
+            raise InvalidMessage(f"{self.wanted} landmarks are wanted")
 
 
 @dataclass(frozen=True, eq=False)

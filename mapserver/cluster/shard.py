@@ -57,9 +57,9 @@ class Shard:
         self._nodes.update((node.id, node) for node in nodes)
         self._index.extend(nodes)
 
-    def nearest(self, codes: NDArray[np.uint8], count: int) -> NearestLandmarks:
+    def nearest(self, codes: NDArray[np.uint8], count: int, wanted: int) -> NearestLandmarks:
         """The nearest landmarks of features; see `PlaceIndex.nearest`."""
-        return self._index.nearest(codes, count)
+        return self._index.nearest(codes, count, wanted)
 
     def overlaps(self, node: Node) -> dict[NodeId, float]:
         """Which nodes of this shard overlap with a node; see `PlaceIndex.overlaps`."""
@@ -68,7 +68,7 @@ class Shard:
     def answer(self, question: Question) -> Answer:
         """The answer to a question."""
         if isinstance(question, Nearest):
-            return self.nearest(question.codes, question.count)
+            return self.nearest(question.codes, question.count, question.wanted)
         return self.overlaps(*question.nodes.nodes)
 
 

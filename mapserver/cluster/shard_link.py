@@ -36,6 +36,7 @@ from mapweave.mapserver.cluster.messages import (
     encoded,
 )
 from mapweave.mapserver.cluster.shard import Shard
+from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
 
 log = logging.getLogger(__name__)
 
@@ -48,7 +49,7 @@ MOST_UNACKNOWLEDGED = 16
 STAND_IN_AFTER = 2.0
 """s; Ray restarts a killed actor in 2 s, on a busy machine in 7. A stand-in of 1000 nodes takes 0.2 s."""
 PATIENCE = 30.0
-"""s for a shard that is filled: it learns new cells meanwhile."""
+"""s for a shard that is filled: it may fill smaller cells meanwhile."""
 REACHED_WITHIN = 2.0
 """s for a lost shard to say what it has; while Ray restarts it, it says nothing."""
 PAUSE = 0.2
@@ -71,6 +72,7 @@ class ShardLink:
         self._call, self._stand_in_after = call, stand_in_after
         self._changed = threading.Condition(threading.RLock())
         self._nodes: dict[NodeId, Node] = {}
+        self._landmarks = 0
         self._behind: dict[NodeId, None] = {}
         self._state: State | None = None
         self._current, self._closing = False, False
@@ -123,8 +125,14 @@ class ShardLink:
     def _change(self, nodes: Sequence[Node], gone: Collection[NodeId]) -> None:
         with self._changed:
             news = [node for node in nodes if not _same(self._nodes.get(node.id), node)]
-            removed = [node_id for node_id in gone if self._nodes.pop(node_id, None) is not None]
+            removed = [node_id for node_id in dict.fromkeys(gone) if node_id in self._nodes]
+            self._landmarks -= sum(self._searched(node_id) for node_id in removed)
+            for node_id in removed:
+                del self._nodes[node_id]
+            before = dict.fromkeys(node.id for node in nodes)
+            self._landmarks -= sum(map(self._searched, before))
             self._nodes.update((node.id, node) for node in nodes)
+            self._landmarks += sum(map(self._searched, before))
             if not news and not removed:
                 return
             for shard in (self._stand_in, self._built):
@@ -153,12 +161,22 @@ class ShardLink:
 
     # Ask it.
 
+    def wanted(self, hidden: Collection[NodeId]) -> int:
+        """How many landmarks of its nodes are searched, without those of hidden nodes."""
+        with self._changed:
+            return self._landmarks - sum(map(self._searched, hidden))
+
+    def _searched(self, node_id: NodeId) -> int:
+        """How many landmarks of a node are searched; 0 if it is in another shard."""
+        node = self._nodes.get(node_id)
+        return 0 if node is None else min(len(node.landmarks), MOST_LANDMARKS)
+
     def ask(self, question: Question, message: bytes) -> Callable[[float], Any] | None:
         """Ask.
 
         Args:
             question: for a stand-in.
-            message: the same, encoded once for all shards.
+            message: the same, encoded.
 
         Returns:
             Gives the answer when it is called with the time left, s; raises whatever went wrong. None if

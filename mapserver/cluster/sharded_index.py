@@ -1,7 +1,8 @@
 """The place index in several shards: asked at once, answered as one.
 
-The nearest landmarks of a feature are the nearest of each shard's nearest, so votes, and with them the
-candidates of a view, are those of one index of all nodes. Overlaps of two nodes depend on these two alone.
+The nearest landmarks of a feature are the nearest of each shard's nearest. As long as every landmark is
+compared, votes, and with them the candidates of a view, are those of one index of all nodes. In cells each
+shard searches as many as an index of its share alone. Overlaps of two nodes depend on these two alone.
 """
 
 from __future__ import annotations
@@ -93,7 +94,10 @@ class ShardedIndex:
 
         def search(features: NDArray[np.int64], count: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
             nonlocal answering
-            parts, silent = self._asked(Nearest(view.codes[features], count), answering)
+            codes = view.codes[features]
+            parts, silent = self._asked(
+                [(link, Nearest(codes, count, link.wanted(unwanted))) for link in answering]
+            )
             answering = tuple(link for link in answering if link not in silent)
             nothing = NearestLandmarks.none(len(features), count)
             nearest = NearestLandmarks.together([*parts, nothing], count)
@@ -124,7 +128,7 @@ class ShardedIndex:
         question, left = Overlaps(ComparedNodes.of([node])), self._links
         overlaps_by_node: dict[NodeId, float] = {}
         while left:
-            parts, left = self._asked(question, left)
+            parts, left = self._asked([(link, question) for link in left])
             for part in parts:
                 overlaps_by_node |= part
             for link in left:
@@ -134,14 +138,16 @@ class ShardedIndex:
         return overlaps_by_node
 
     def _asked(
-        self, question: Question, links: Sequence[ShardLink]
+        self, questions: Sequence[tuple[ShardLink, Question]]
     ) -> tuple[list[Any], tuple[ShardLink, ...]]:
         """Ask shards at once: the answers, and the shards that gave none in time."""
-        message = encoded(question)
-        asked = [(link, link.ask(question, message)) for link in links]
+        # The same question to all is encoded once.
+        distinct = {id(question): question for _, question in questions}
+        messages = {name: encoded(question) for name, question in distinct.items()}
+        asked = [(link, link.ask(question, messages[id(question)])) for link, question in questions]
         # Stand-ins work in this thread: others work meanwhile.
         asked.sort(key=lambda item: item[0].current)
-        end = time.monotonic() + max(link.timeout for link in links)
+        end = time.monotonic() + max(link.timeout for link, _ in questions)
         answers, silent = [], []
         for link, answer in asked:
             try:

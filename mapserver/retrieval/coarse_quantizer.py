@@ -1,36 +1,33 @@
-"""Means of means of compact descriptors: k-means twice, so that finding the nearest takes two small searches.
+"""Cells of the space of compact descriptors, in four sizes; they come with the package and never change.
 
-A landmark belongs to the nearest mean of the nearest family. A question asks for the several nearest means of
-the nearest few families.
+A landmark belongs to the nearest centre of the nearest family. A question asks for the several nearest
+centres of the nearest few families. No robot's data moves them: they are made of the project's own pictures,
+by `python -m benchmarks.train_cells --write`.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from importlib import resources
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.landmark_tables import DIMENSIONS
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.landmark_tables import DIMENSIONS, SYMBOLS, VERSION
 
-SEED = 1234
-"""Of the means' starts: the same landmarks make the same means."""
-SAMPLE = 40
-"""Landmarks a mean from which it is learned."""
-ROUNDS = 8
-"""Of k-means."""
-FAMILIES = 8
-"""Among whose means a question finds the nearest."""
+FILE = "cells.npz"
+FAMILIES = (16, 32, 64, 128)
+"""Of each size of cells. A family has as many cells as there are families."""
+SEARCHED = 8
+"""Families among whose centres a question finds the nearest, at least."""
 BLOCK = 1 << 17
 """Codes that are widened to floats at once."""
 FEW = 2048
 """Fewer vectors than these are not parted by families."""
-FAR = 1e6
-"""Coordinates of the mean of nothing."""
 
 Codes = NDArray[np.uint8]
 Ids = NDArray[np.int64]
@@ -39,76 +36,89 @@ Vectors = NDArray[np.float32]
 
 @dataclass(frozen=True, eq=False)
 class CoarseQuantizer:
-    """Means in families.
+    """Centres in families.
 
     Attributes:
-        heads: (F, 32) float32, the mean of each family.
-        means: (M, 32) float32, by families.
-        starts: (F + 1,) where in `means` a family begins, and where the last one ends.
+        heads: (F, 32) uint8, the centre of each family, in steps of the descriptors as codes are.
+        centres: (F * F, 32) uint8, by families.
     """
 
-    heads: Vectors
-    means: Vectors
-    starts: Ids
+    heads: Codes
+    centres: Codes
+
+    def __post_init__(self) -> None:
+        """Refuse what are no families of codes (InvalidFile)."""
+        families = len(self.heads)
+        shapes = self.heads.shape, self.centres.shape
+        if not families or shapes != ((families, DIMENSIONS), (families * families, DIMENSIONS)):
+            raise InvalidFile(f"cells: {shapes} are no families of as many centres")
+        if any(codes.dtype != np.uint8 or codes.max() >= SYMBOLS for codes in (self.heads, self.centres)):
+            raise InvalidFile("cells: centres that are no codes")
 
     def __len__(self) -> int:
-        """How many means."""
-        return len(self.means)
-
-    @classmethod
-    def learn(cls, sample: Codes, count: int) -> CoarseQuantizer:
-        """About so many means of (N, 32) codes, in families about the root of that many."""
-        heads = 1 << round(math.log2(count) / 2)
-        few = sample[:: max(len(sample) // (4 * SAMPLE * heads), 1)]
-        above = _learned(few.astype(np.float32), heads)
-        family = np.concatenate([nearest(part, above) for part in widened(sample)])
-        below = [
-            _learned(sample[family == k].astype(np.float32), max(count // heads, 1))
-            for k in range(len(above))
-        ]  # fmt: skip
-        starts = np.concatenate([[0], np.cumsum([len(cell) for cell in below])])
-        return cls(above, np.concatenate(below), starts.astype(np.int64))
+        """How many cells."""
+        return len(self.centres)
 
     def nearest(self, vectors: Vectors) -> Ids:
-        """(N,) which mean each of (N, 32) vectors belongs to."""
+        """(N,) which cell each of (N, 32) vectors belongs to."""
         if len(vectors) < FEW:
             # The same two searches; family by family costs a call each.
             cells: Ids = self.searched.search(vectors, 1, params=probing(1))[1][:, 0]
             return cells
-        family = nearest(vectors, self.heads)
+        families = len(self.heads)
+        family = nearest(vectors, self.heads.astype(np.float32))
         order = np.argsort(family, kind="stable")
         out = np.empty(len(vectors), np.int64)
         for rows in np.split(order, np.flatnonzero(np.diff(family[order])) + 1):
-            if len(rows):
-                start, end = self.starts[family[rows[0]] :][:2]
-                out[rows] = start + nearest(vectors[rows], self.means[start:end])
+            start = families * family[rows[0]]
+            own = self.centres[start : start + families].astype(np.float32)
+            out[rows] = start + nearest(vectors[rows], own)
         return out
+
+    def probing(self, count: int) -> Any:
+        """Search so many cells, among families that have twice as many."""
+        families = len(self.heads)
+        of_these = min(max(SEARCHED, -(-2 * count // families)), families)
+        return probing(min(count, len(self)), probing(of_these))
 
     @cached_property
     def searched(self) -> Any:
-        """A FAISS index that finds the several nearest means of FAMILIES families."""
+        """A FAISS index that finds the several nearest centres of SEARCHED families."""
         import faiss
 
-        heads = faiss.IndexFlatL2(DIMENSIONS)
-        heads.add(self.heads)
-        index = faiss.IndexIVFFlat(heads, DIMENSIONS, len(self.heads))
+        heads, families = faiss.IndexFlatL2(DIMENSIONS), len(self.heads)
+        heads.add(self.heads.astype(np.float32))
+        index = faiss.IndexIVFFlat(heads, DIMENSIONS, families)
         index.is_trained = True
-        numbers = np.arange(len(self.means))
-        family = np.repeat(np.arange(len(self.heads)), np.diff(self.starts))
+        centres, numbers = self.centres.astype(np.float32), np.arange(len(self.centres))
+        family = numbers // families
         index.add_core(
-            len(numbers), faiss.swig_ptr(self.means), faiss.swig_ptr(numbers), faiss.swig_ptr(family), None
+            len(numbers), faiss.swig_ptr(centres), faiss.swig_ptr(numbers), faiss.swig_ptr(family), None
         )
-        index.nprobe = min(FAMILIES, len(self.heads))
+        index.nprobe = min(SEARCHED, families)
         return index
 
 
-def probing(count: int) -> Any:
-    """Search so many lists of an inverted file."""
+@cache
+def coarse_quantizers() -> tuple[CoarseQuantizer, ...]:
+    """Those of the package, of ever smaller cells.
+
+    Raises:
+        InvalidFile: they are damaged, or made of other codes than those of landmarks are.
+    """
+    path = resources.files("mapweave.mapserver.retrieval").joinpath(FILE)
+    with path.open("rb") as file, np.load(file) as stored:
+        if int(stored["version"]) != VERSION:
+            raise InvalidFile(f"cells: of landmarks of version {int(stored['version'])}, not {VERSION}")
+        return tuple(CoarseQuantizer(stored[f"heads{f}"], stored[f"centres{f}"]) for f in FAMILIES)
+
+
+def probing(count: int, within: Any = None) -> Any:
+    """Search so many lists of an inverted file; likewise where its own centres are searched."""
     import faiss
 
-    parameters: Any = faiss.SearchParametersIVF()
-    parameters.nprobe = count
-    return parameters
+    parameters: Any = faiss.SearchParametersIVF
+    return parameters(nprobe=count, quantizer_params=within)
 
 
 def widened(codes: Codes) -> Iterator[Vectors]:
@@ -117,22 +127,11 @@ def widened(codes: Codes) -> Iterator[Vectors]:
         yield codes[start : start + BLOCK].astype(np.float32)
 
 
-def nearest(vectors: Vectors, means: Vectors) -> Ids:
-    """(N,) which of (M, 32) means is nearest to each of (N, 32) vectors."""
+def nearest(vectors: Vectors, centres: Vectors) -> Ids:
+    """(N,) which of (M, 32) centres is nearest to each of (N, 32) vectors."""
     import faiss
 
     if not len(vectors):
         return np.zeros(0, np.int64)
-    cells: Ids = faiss.knn(vectors, means, 1)[1][:, 0]
+    cells: Ids = faiss.knn(vectors, centres, 1)[1][:, 0]
     return cells
-
-
-def _learned(sample: Vectors, count: int) -> Vectors:
-    """(at most count, 32) means of a sample."""
-    import faiss
-
-    if len(sample) <= count:
-        return sample if len(sample) else np.full((1, DIMENSIONS), FAR, np.float32)
-    means = faiss.Kmeans(DIMENSIONS, count, niter=ROUNDS, seed=SEED, min_points_per_centroid=1)
-    means.train(sample)
-    return np.asarray(means.centroids, np.float32).reshape(-1, DIMENSIONS)

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from mapweave.hybridmap.landmark_tables import DIMENSIONS, landmark_tables
-from mapweave.mapserver.retrieval.coarse_quantizer import BLOCK, CoarseQuantizer, Codes, Ids, Vectors, probing
+from mapweave.mapserver.retrieval.coarse_quantizer import BLOCK, CoarseQuantizer, Codes, Ids, Vectors
 from mapweave.mapserver.retrieval.wanted_landmarks import Hidden, nearest_wanted
 
 STEP2 = np.float32(landmark_tables().step ** 2)
@@ -34,15 +34,19 @@ class CellContents(NamedTuple):
 
 
 class InvertedFile:
-    """Codes with ids, in cells about means that were learned once."""
+    """Codes with ids, in cells that do not change.
 
-    def __init__(self, means: CoarseQuantizer) -> None:
+    Attributes:
+        quantizer: the cells.
+    """
+
+    def __init__(self, quantizer: CoarseQuantizer) -> None:
         """Begin with nothing in them."""
         import faiss
 
-        self.means = means
+        self.quantizer = quantizer
         self._index: Any = faiss.IndexIVFScalarQuantizer(
-            means.searched, DIMENSIONS, len(means), faiss.ScalarQuantizer.QT_8bit_direct,
+            quantizer.searched, DIMENSIONS, len(quantizer), faiss.ScalarQuantizer.QT_8bit_direct,
             faiss.METRIC_L2, False,
         )  # fmt: skip
         self._index.train(np.zeros((1, DIMENSIONS), np.float32))
@@ -56,7 +60,7 @@ class InvertedFile:
         for start in range(0, len(codes), BLOCK):
             part = slice(start, start + BLOCK)
             vectors = codes[part].astype(np.float32)
-            self._put(vectors, ids[part], self.means.nearest(vectors))
+            self._put(vectors, ids[part], self.quantizer.nearest(vectors))
 
     def remove(self, first: int, last: int, codes: Codes | None = None) -> None:
         """Forget the ids from first to last, that one left out.
@@ -79,7 +83,7 @@ class InvertedFile:
 
         lists: Any = self._index.invlists
         count = 0
-        for cell in np.unique(self.means.nearest(codes.astype(np.float32))).tolist():
+        for cell in np.unique(self.quantizer.nearest(codes.astype(np.float32))).tolist():
             size = lists.list_size(cell)
             ids = faiss.rev_swig_ptr(lists.get_ids(cell), size) if size else np.zeros(0, np.int64)
             inside = np.flatnonzero((ids >= first) & (ids < last))
@@ -107,7 +111,7 @@ class InvertedFile:
         Returns:
             (N, k) squared distances of decoded descriptors, and ids; -1 where there are fewer.
         """
-        vectors, searching = codes.astype(np.float32), self._searching(probes)
+        vectors, searching = codes.astype(np.float32), self.quantizer.probing(probes)
 
         def search(features: Ids, count: int) -> tuple[Vectors, Ids]:
             squared, ids = self._index.search(vectors[features], count, params=searching)
@@ -142,6 +146,3 @@ class InvertedFile:
         self._index.add_core(
             len(vectors), faiss.swig_ptr(vectors), faiss.swig_ptr(ids), faiss.swig_ptr(cells), None
         )
-
-    def _searching(self, probes: int) -> Any:
-        return probing(min(probes, self._index.nlist))

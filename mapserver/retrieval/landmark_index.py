@@ -1,32 +1,38 @@
-"""The nearest of all landmarks of the fleet: one by one while they are few, by cells that grow when many.
+"""The nearest of all landmarks of the fleet: one by one while they are few, by cells when many.
 
-Cells are trained again as landmarks come; until new ones are ready the old ones are used, with all landmarks.
+What is found depends on the wanted landmarks alone: not on the order in which they came, nor on those that
+are hidden. Their number decides how large the cells are that are searched, and all landmarks are kept in such
+cells. Where most are hidden, they are kept in cells of two sizes: a question that hides nothing searches
+smaller ones.
 """
 
 from __future__ import annotations
 
-import logging
-import math
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 
-from mapweave.mapserver.retrieval.coarse_quantizer import SAMPLE, CoarseQuantizer, Codes, Ids, Vectors
+from mapweave.mapserver.retrieval.coarse_quantizer import Codes, Ids, Vectors, coarse_quantizers
 from mapweave.mapserver.retrieval.flat_landmarks import FlatLandmarks
 from mapweave.mapserver.retrieval.inverted_file import CellContents, InvertedFile
 from mapweave.mapserver.retrieval.shared_lock import SharedLock
 from mapweave.mapserver.retrieval.wanted_landmarks import Hidden
 
-log = logging.getLogger(__name__)
-
 MOST_WITHIN = 256
 """Largest number of similar landmarks of one: where thousands are similar, their pairs grow by the square.
 While `within` works there are about 200 nodes, and each shows a thing once."""
 AT_ONCE = 1 << 19
-"""Landmarks that are copied at once when new cells are filled from old ones."""
+"""Landmarks that are copied at once when other cells are filled."""
+FLAT = 0
+"""The size of no cells: every landmark is compared."""
+UNUSED = 4
+"""Cells of another size are dropped when they were not searched while a quarter of the landmarks changed."""
+LEAST_PROBES = 2
+"""Cells that are searched at least."""
+
+Landmarks = FlatLandmarks | InvertedFile
 
 
 @dataclass(frozen=True)
@@ -35,37 +41,13 @@ class LandmarkIndexSettings:
 
     Attributes:
         exact: up to as many every one is compared; beyond, those of some cells, and `within` does not work.
-        growth: cells are trained again when there are so many times as many landmarks.
-        probes: cells that are searched for a feature of a view.
-        patience: landmarks beyond which cells are trained in the background of questions, not between them.
+        fill: landmarks in a cell on average beyond which smaller cells are searched.
+        probes: cells that are searched for a feature of a view; fewer where the smallest are fuller.
     """
 
     exact: int = 30_000
-    growth: float = 4.0
-    probes: int = 8
-    patience: int = 100_000
-
-
-class AddedRows(NamedTuple):
-    """Landmarks that came while cells were learned."""
-
-    codes: Codes
-    ids: Ids
-
-
-class RemovedRows(NamedTuple):
-    """Ids that went while cells were learned, the last one left out, and their codes if they are known."""
-
-    first: int
-    last: int
-    codes: Codes | None
-
-
-FILL = 100
-"""Landmarks in a cell when it is learned, on average."""
-MOST_CELLS = 1 << 18
-"""With as many, cells are not learned again: filling new ones takes the memory twice. These are learned at
-40 million landmarks, where twice is still less than a million nodes take once."""
+    fill: int = 400
+    probes: int = 10
 
 
 class LandmarkIndex:
@@ -79,48 +61,60 @@ class LandmarkIndex:
         """Start empty."""
         self.lock = SharedLock()
         self._settings = settings or LandmarkIndexSettings()
-        self._landmarks: FlatLandmarks | InvertedFile = FlatLandmarks()
-        self._learned = 0
-        self._learner: threading.Thread | None = None
-        self._missed: list[AddedRows | RemovedRows] = []
-        self._end = 0
+        self._kept: dict[int, Landmarks] = {FLAT: FlatLandmarks()}
+        self._searched: dict[int, int] = {}
+        """Of each size what `_changed` was when it was last searched."""
+        self._changed = 0
+        self._making = threading.Lock()
 
     def __len__(self) -> int:
         """How many landmarks."""
-        return len(self._landmarks)
+        return len(self._any)
 
-    @property
-    def means(self) -> CoarseQuantizer | None:
-        """What the cells are about; None as long as there are none."""
-        return None if isinstance(self._landmarks, FlatLandmarks) else self._landmarks.means
+    def cells(self, wanted: int) -> int:
+        """How many cells there are where so many landmarks are wanted; 0 where every one is compared."""
+        size = self._size(wanted)
+        return 0 if size == FLAT else len(coarse_quantizers()[size - 1])
 
     def add(self, codes: Codes, ids: Ids) -> None:
         """Take in (N, 32) codes with (N,) ids."""
         if not len(codes):
             return
         with self.lock.writing():
-            self._end = int(ids[-1]) + 1
-            if self._learner is not None:
-                self._missed.append(AddedRows(codes, ids))
-            self._landmarks.add(codes, ids)
-            self._grow()
+            for landmarks in self._kept.values():
+                landmarks.add(codes, ids)
+            self._changed += len(ids)
+            size = self._size(len(self))
+            # Smaller cells as soon as they are needed: many landmarks without cells take much memory.
+            if size > max(self._kept):
+                self._kept[size] = self._made(size)
+            self._drop_unused(size)
 
     def remove(self, first: int, last: int, codes: Codes | None = None) -> None:
         """Forget the ids from first to last, that one left out; quickly, if all their codes are known."""
         with self.lock.writing():
-            if self._learner is not None:
-                self._missed.append(RemovedRows(first, last, codes))
-            self._landmarks.remove(first, last, codes)
+            before = len(self)
+            for landmarks in self._kept.values():
+                landmarks.remove(first, last, codes)
+            self._changed += before - len(self)
 
-    def nearest(self, codes: Codes, k: int, hidden: Hidden | None = None) -> tuple[Vectors, Ids]:
+    def nearest(
+        self, codes: Codes, k: int, hidden: Hidden | None = None, wanted: int | None = None
+    ) -> tuple[Vectors, Ids]:
         """(N, k) squared distances and ids of the nearest landmarks, nearest first; id -1 is none.
 
-        What is hidden is as if it were not there.
+        Args:
+            codes: (N, 32).
+            k: how many of each.
+            hidden: which ids are as if they were not there.
+            wanted: how many are not hidden; all, if it is not given.
         """
         with self.lock.reading():
-            if isinstance(self._landmarks, FlatLandmarks):
-                return self._landmarks.nearest(codes, k, hidden)
-            return self._landmarks.nearest(codes, k, self._settings.probes, hidden)
+            wanted = len(self) if wanted is None else wanted
+            landmarks = self._of_size(self._size(wanted))
+            if isinstance(landmarks, FlatLandmarks):
+                return landmarks.nearest(codes, k, hidden)
+            return landmarks.nearest(codes, k, self._probes(wanted, landmarks), hidden)
 
     def within(self, codes: Codes, reach: float) -> tuple[Ids, Vectors, Ids] | None:
         """(M,) row of the code, squared distance and id of the `MOST_WITHIN` nearest landmarks within reach.
@@ -129,29 +123,16 @@ class LandmarkIndex:
             None if there are too many landmarks for that.
         """
         with self.lock.reading():
-            if isinstance(self._landmarks, FlatLandmarks):
-                return self._landmarks.within(codes, reach, MOST_WITHIN)
-            return None
-
-    def keep_up(self) -> None:
-        """Wait for the training of cells if too many landmarks have come since: they are kept twice."""
-        with self.lock.reading():
-            missed = sum(len(change.ids) for change in self._missed if isinstance(change, AddedRows))
-        if missed > self._settings.patience:
-            self.settle()
-
-    def settle(self) -> None:
-        """Wait until cells that are being learned are in use."""
-        learner = self._learner
-        if learner is not None:
-            learner.join()
+            if len(self) > self._settings.exact:
+                return None
+            landmarks = self._of_size(FLAT)
+            assert isinstance(landmarks, FlatLandmarks)
+            return landmarks.within(codes, reach, MOST_WITHIN)
 
     def blocks(self) -> Iterator[CellContents]:
         """Landmarks by cells, as they are when their turn comes; without cells, all."""
         with self.lock.reading():
-            return self._in_turn(self._landmarks.blocks(AT_ONCE))
-
-    def _in_turn(self, blocks: Iterator[CellContents]) -> Iterator[CellContents]:
+            blocks = self._any.blocks(AT_ONCE)
         while True:
             with self.lock.reading():
                 block = next(blocks, None)
@@ -159,51 +140,54 @@ class LandmarkIndex:
                 return
             yield block
 
-    def _grow(self) -> None:
-        """Learn cells if there are many more landmarks than when it was last done."""
-        s, n = self._settings, len(self)
-        few = self.means is None or len(self.means) < MOST_CELLS
-        if n <= s.exact or n < s.growth * self._learned or self._learner is not None or not few:
-            return
-        self._learned, self._missed = n, []
-        if n <= s.patience:
-            self._landmarks = self._new(n, self._end)
-            return
-        self._learner = threading.Thread(target=self._learn, args=(n, self._end), name="cells", daemon=True)
-        self._learner.start()
+    @property
+    def _any(self) -> Landmarks:
+        """All landmarks, in cells of whichever size."""
+        # A copy: another thread may add cells of another size meanwhile.
+        return next(iter(tuple(self._kept.values())))
 
-    def _learn(self, n: int, end: int) -> None:
-        """In a thread of its own: train new cells, add landmarks that came since, and hand over."""
-        try:
-            cells = self._new(n, end)
-            while True:
-                with self.lock.writing():
-                    missed, self._missed = self._missed, []
-                    if not missed:
-                        self._landmarks, self._learner = cells, None
-                        return
-                _catch_up(cells, missed)
-        except Exception:  # the old cells go on serving, more slowly
-            log.exception("the place index could not be made faster")
-            with self.lock.writing():
-                self._learner, self._missed = None, []
+    def _size(self, wanted: int) -> int:
+        """How small the cells are: FLAT, or 1 for the largest ones, 2 for the next, and so on."""
+        if wanted <= self._settings.exact:
+            return FLAT
+        sizes = coarse_quantizers()
+        full = (size for size, q in enumerate(sizes, 1) if wanted <= self._settings.fill * len(q))
+        return next(full, len(sizes))
 
-    def _new(self, n: int, end: int) -> InvertedFile:
-        """Cells for the landmarks below an id, which are n; what has come since is among what was missed."""
-        count = min(max(2 ** round(math.log2(n / FILL)), 16), MOST_CELLS)
-        step = max(n // (SAMPLE * count), 1)
-        # A part of a block would keep the whole of it.
-        sample = np.concatenate([block.codes[::step].copy() for block in self.blocks()])
-        cells = InvertedFile(CoarseQuantizer.learn(sample, count))
-        for block in self.blocks():
-            old = block.ids < end
-            cells.add(block.codes[old], block.ids[old])
-        return cells
+    def _probes(self, wanted: int, landmarks: InvertedFile) -> int:
+        """How many cells are searched."""
+        s = self._settings
+        share = s.fill * len(landmarks.quantizer) / max(wanted, 1)
+        return s.probes if share >= 1 else min(s.probes, max(round(s.probes * share), LEAST_PROBES))
 
+    def _of_size(self, size: int) -> Landmarks:
+        """All landmarks in cells of a size; they are filled when these are first searched.
 
-def _catch_up(cells: InvertedFile, missed: list[AddedRows | RemovedRows]) -> None:
-    for change in missed:
-        if isinstance(change, AddedRows):
-            cells.add(change.codes, change.ids)
-        else:
-            cells.remove(change.first, change.last, change.codes)
+        Others who search go on meanwhile; who adds or removes waits for them.
+        """
+        landmarks = self._kept.get(size)
+        if landmarks is None:
+            with self._making:
+                landmarks = self._kept.get(size)
+                if landmarks is None:
+                    landmarks = self._kept[size] = self._made(size)
+        self._searched[size] = self._changed
+        return landmarks
+
+    def _made(self, size: int) -> Landmarks:
+        landmarks = FlatLandmarks() if size == FLAT else InvertedFile(coarse_quantizers()[size - 1])
+        codes, ids = map(np.concatenate, zip(*self._any.blocks(AT_ONCE), strict=True))
+        # In the order in which they came: of equally near ones the first is found.
+        order = np.argsort(ids, kind="stable")
+        for start in range(0, len(ids), AT_ONCE):
+            part = order[start : start + AT_ONCE]
+            landmarks.add(codes[part], ids[part])
+        return landmarks
+
+    def _drop_unused(self, needed: int) -> None:
+        """Drop what nobody searches, but not what has the size that is needed for all landmarks."""
+        recent = self._changed - len(self) // UNUSED
+        for size in [size for size in self._kept if size != needed and needed in self._kept]:
+            if self._searched.get(size, -1) < recent:
+                del self._kept[size]
+                self._searched.pop(size, None)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from itertools import islice
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,6 +45,18 @@ class PlaceIndexSettings:
     compared: int = 64
 
 
+class Print(NamedTuple):
+    """By what a node's codes are known.
+
+    Attributes:
+        digest: of them.
+        landmarks: how many they are.
+    """
+
+    digest: int
+    landmarks: int
+
+
 class PlaceIndex:
     """Nodes by the descriptors of their landmarks. A node is searchable as soon as it is added.
 
@@ -58,7 +71,7 @@ class PlaceIndex:
         self._lock = self._landmarks.lock
         self._slots: dict[NodeId, int] = {}
         self._nodes: dict[int, NodeId] = {}
-        self._prints: dict[int, int] = {}
+        self._prints: dict[int, Print] = {}
         self._next = 0
         self._announced: deque[Node] = deque()
 
@@ -92,7 +105,6 @@ class PlaceIndex:
         """
         rest = iter(nodes)
         while some := list(islice(rest, AT_ONCE)):
-            self._landmarks.keep_up()
             with self._current(fills=True):
                 self._take(some)
 
@@ -106,11 +118,11 @@ class PlaceIndex:
         with self._current(fills=True):
             slot = self._slots.pop(node_id, None)
             if slot is not None:
-                seal = self._prints.pop(slot)
+                known = self._prints.pop(slot)
                 del self._nodes[slot]
                 # Others than those that are there would leave some behind.
                 codes = None if codes is None else codes[:MOST_LANDMARKS]
-                codes = codes if codes is not None and _fingerprint(codes) == seal else None
+                codes = codes if codes is not None and _fingerprint(codes) == known else None
                 self._landmarks.remove(slot << SLOT_BITS, (slot + 1) << SLOT_BITS, codes)
 
     def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> Ranked:
@@ -126,17 +138,18 @@ class PlaceIndex:
         """
         return Ranked(self._ranked(view.codes, k, exclude))
 
-    def nearest(self, codes: NDArray[np.uint8], count: int) -> NearestLandmarks:
+    def nearest(self, codes: NDArray[np.uint8], count: int, wanted: int) -> NearestLandmarks:
         """The nearest landmarks of features, for an index that is one of several.
 
         Args:
             codes: (N, 32) of the features.
             count: landmarks of each.
+            wanted: how many of all are not hidden; who asks leaves out those that are.
         """
         with self._current():
             if len(codes) == 0 or len(self._landmarks) == 0:
                 return NearestLandmarks.none(len(codes), count)
-            squared, ids = self._landmarks.nearest(codes, count)
+            squared, ids = self._landmarks.nearest(codes, count, wanted=wanted)
             slots, owners = np.unique(ids >> SLOT_BITS, return_inverse=True)
             owners, first = owners.reshape(ids.shape), int(slots[0] < 0)
             nodes = tuple(self._nodes[slot] for slot in slots[first:].tolist())
@@ -148,9 +161,10 @@ class PlaceIndex:
         with self._current():
             if len(codes) == 0 or len(self._landmarks) == 0:
                 return []
-            hidden = [self._slots[node_id] for node_id in exclude if node_id in self._slots]
+            hidden = [self._slots[node_id] for node_id in set(exclude) if node_id in self._slots]
             unwanted = (lambda ids: np.isin(ids >> SLOT_BITS, hidden)) if hidden else None
-            squared, ids = self._landmarks.nearest(codes, self._settings.votes, unwanted)
+            wanted = len(self._landmarks) - sum(self._prints[slot].landmarks for slot in hidden)
+            squared, ids = self._landmarks.nearest(codes, self._settings.votes, unwanted, wanted)
             # -1 belongs to no node, shifted too.
             return rank(squared, ids >> SLOT_BITS, self._nodes, k)
 
@@ -215,10 +229,6 @@ class PlaceIndex:
             except Exception:  # it is put once more by who merges
                 log.exception("node %s cannot be found yet", node.id)
 
-    def settle(self) -> None:
-        """Wait until cells that are being learned are in use."""
-        self._landmarks.settle()
-
     def _take(self, nodes: list[Node]) -> None:
         """Take in nodes at once."""
         codes, ids = [np.zeros((0, CODE_BYTES), np.uint8)], [np.zeros(0, np.int64)]
@@ -241,6 +251,6 @@ class PlaceIndex:
         del codes[1:], ids[1:]
 
 
-def _fingerprint(codes: NDArray[np.uint8]) -> int:
+def _fingerprint(codes: NDArray[np.uint8]) -> Print:
     """Of a node's (N, 32) codes."""
-    return hash(codes.tobytes())
+    return Print(hash(codes.tobytes()), len(codes))

@@ -66,7 +66,7 @@ SERVER = ShardServer()
 STATE = replace(SERVER._state, number=1)
 SHARD = Shard()
 SHARD.change(NODES)
-NEAREST, OVERLAPS = Nearest(NODES[3].landmarks.codes, 16), Overlaps(ComparedNodes.of([NODES[5]]))
+NEAREST, OVERLAPS = Nearest(NODES[3].landmarks.codes, 16, 1000), Overlaps(ComparedNodes.of([NODES[5]]))
 
 
 def same_landmarks(one: Landmarks, other: Landmarks) -> bool:
@@ -102,7 +102,7 @@ def test_answers_arrive_as_they_are() -> None:
     overlaps = SHARD.answer(decoded(encoded(OVERLAPS), Question))
     assert isinstance(overlaps, dict) and overlaps == SHARD.overlaps(NODES[5])
     assert answer_to(OVERLAPS, encoded(answer_message(overlaps))) == overlaps and overlaps
-    empty_shard = Shard().nearest(NEAREST.codes, 16)
+    empty_shard = Shard().nearest(NEAREST.codes, 16, 1000)
     read = answer_to(NEAREST, encoded(answer_message(empty_shard)))
     assert isinstance(read, NearestLandmarks) and read.nodes == () and len(read.squared) == len(NEAREST.codes)
     assert answer_to(OVERLAPS, encoded(answer_message({}))) == {}
@@ -142,7 +142,7 @@ def test_the_longest_messages_that_there_may_be_are_taken() -> None:
     change = encoded(ShardChange(STATE, ComparedNodes.of(some), Ids.of(one.id for one in some)))
     assert len(decoded(change, ShardRequest).nodes.nodes[-1].landmarks) == MOST_LANDMARKS
     votes = PlaceIndexSettings().votes
-    question = Nearest(node.landmarks.codes, votes)
+    question = Nearest(node.landmarks.codes, votes, 1 << 40)
     owners = np.arange(MAX_LANDMARKS * votes).reshape(-1, votes)
     nodes = tuple(NodeId(f"{k:032}", MAX_NUMBER, MAX_NUMBER) for k in range(owners.size))
     nearest = NearestLandmarks(np.zeros(owners.shape, np.float32), owners, nodes)

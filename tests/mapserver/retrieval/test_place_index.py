@@ -13,7 +13,9 @@ from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.retrieval import ranking
+from mapweave.mapserver.retrieval.coarse_quantizer import coarse_quantizers
 from mapweave.mapserver.retrieval.compared_landmarks import MOST_LANDMARKS
+from mapweave.mapserver.retrieval.inverted_file import InvertedFile
 from mapweave.mapserver.retrieval.landmark_index import MOST_WITHIN, LandmarkIndexSettings
 from mapweave.mapserver.retrieval.place_index import SLOT_BITS, PlaceIndex, PlaceIndexSettings
 from synthetic.world import CAMERA, World, random_vectors, room, take_map, take_view
@@ -156,8 +158,8 @@ def test_what_another_robot_adds_changes_nothing_once_it_is_hidden(
 ) -> None:
     """However many copies of a place it adds: all nearest landmarks are copies then."""
     world, nodes, tour = building
-    index = filled(nodes, PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=exact, growth=99.0)))
-    assert (index.landmarks.means is None) == (exact == 100_000)
+    index = filled(nodes, PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=exact)))
+    assert (index.landmarks.cells(len(index.landmarks)) == 0) == (exact == 100_000)
     views = [take_view(world, stop, np.random.default_rng(12))[0] for stop in tour[::4]]
     before = [index.query(view, 16) for view in views]
     copies = [replace(node, id=NodeId("liar", k, node.id.number)) for node in nodes[::4] for k in range(20)]
@@ -178,7 +180,7 @@ def test_adding_again_replaces(building: tuple[World, list[Node], list[Pose2]]) 
 def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[Node], list[Pose2]]) -> None:
     world, nodes, tour = building
     index = filled(nodes, PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=1500)))
-    assert index.landmarks.means is not None
+    assert index.landmarks.cells(len(index.landmarks)) > 0
     rng = np.random.default_rng(5)
     hits = 0
     for node, stop in zip(nodes, tour, strict=True):
@@ -219,7 +221,7 @@ def test_nothing_is_found_in_nothing(building: tuple[World, list[Node], list[Pos
 
 def everywhere() -> PlaceIndexSettings:
     """Cells, of which all are searched: then nothing may be missing."""
-    landmarks = LandmarkIndexSettings(exact=300, growth=2.0, probes=10_000)
+    landmarks = LandmarkIndexSettings(exact=300, probes=10_000)
     return PlaceIndexSettings(landmarks=landmarks)
 
 
@@ -231,7 +233,7 @@ def test_cells_of_which_all_are_searched_answer_like_no_cells(
     for index in (plain, cells):
         index.remove(nodes[4].id)
         index.add(nodes[7])
-    assert cells.landmarks.means is not None and len(cells.landmarks) == len(plain.landmarks)
+    assert cells.landmarks.cells(len(cells.landmarks)) > 0 and len(cells.landmarks) == len(plain.landmarks)
     for stop in tour[::5]:
         view, _ = take_view(world, stop, np.random.default_rng(7))
         one, two = plain.query(view, 6), cells.query(view, 6)
@@ -247,41 +249,106 @@ def test_many_at_once_equal_one_by_one(building: tuple[World, list[Node], list[P
     assert one.query(view, 9) == many.query(view, 9) and len(many.landmarks) == len(one.landmarks)
 
 
-def test_cells_are_trained_in_the_background(building: tuple[World, list[Node], list[Pose2]]) -> None:
-    """What comes and goes while new cells are learned is in them."""
-    world, nodes, tour = building
-    landmarks = LandmarkIndexSettings(exact=300, growth=2.0, patience=500, probes=10_000)
-    index = PlaceIndex(PlaceIndexSettings(landmarks=landmarks))
-    index.extend(nodes[:8])
-    index.add(nodes[8])
-    index.remove(nodes[0].id)
-    index.extend(nodes[9:])
-    for stop, node in zip(tour[9:12], nodes[9:12], strict=True):
-        view, _ = take_view(world, stop, np.random.default_rng(9))
-        assert node.id in dict(index.query(view, 3)), "searchable at once"
-    index.settle()
-    plain = filled(nodes[1:])
-    assert len(index.landmarks) == len(plain.landmarks)
-    view, _ = take_view(world, tour[5], np.random.default_rng(10))
-    own, theirs = dict(index.query(view, 5)), dict(plain.query(view, 5))
-    assert set(own) == set(theirs)
+def small_cells(**how: int) -> PlaceIndexSettings:
+    """Cells of all sizes for a few thousand landmarks: 256 up to 500, then 1024, and so on."""
+    return PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=300, fill=2, **how))
 
 
-def test_an_index_that_cannot_be_trained_reports_it_and_goes_on(
-    building: tuple[World, list[Node], list[Pose2]],
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
+def altered(nodes: list[Node], count: int) -> list[Node]:
+    """Nodes of a fourth robot, which sees the same things a little differently."""
+    rng, made = np.random.default_rng(13), []
+    for number in range(count):
+        marks = nodes[number % len(nodes)].landmarks
+        codes = quantise(decode(marks.codes) + rng.normal(0, 0.05, marks.codes.shape))
+        marks = replace(marks, codes=codes)
+        made.append(replace(nodes[number % len(nodes)], id=NodeId("liar", 1, number + 1), landmarks=marks))
+    return made
+
+
+@pytest.mark.parametrize(
+    "settings",
+    [PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=3000)), small_cells()],
+    ids=["all are compared, but for what is hidden", "smaller cells are searched, but for what is hidden"],
+)
+def test_what_is_hidden_does_not_decide_which_cells_are_searched(
+    building: tuple[World, list[Node], list[Pose2]], settings: PlaceIndexSettings
 ) -> None:
     world, nodes, tour = building
-    monkeypatch.setattr("mapweave.mapserver.retrieval.landmark_index.InvertedFile", None)
-    index = PlaceIndex(
-        PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=300, growth=2.0, patience=300))
-    )
-    index.extend(nodes)
-    index.settle()
-    view, _ = take_view(world, tour[1], np.random.default_rng(11))
-    assert index.query(view, 1)[0][0] == nodes[1].id
-    assert "could not be made faster" in caplog.text
+    index = filled(nodes, settings)
+    own = len(index.landmarks)
+    liar = altered(nodes, 4 * len(nodes))
+    views = [take_view(world, stop, np.random.default_rng(12))[0] for stop in tour[::3]]
+    before = [index.query(view, 16) for view in views]
+    index.extend(liar)
+    assert index.landmarks.cells(own) != index.landmarks.cells(len(index.landmarks))
+    hidden = [node.id for node in liar]
+    assert [index.query(view, 16, hidden) for view in views] == before
+    # Questions that hide nothing meanwhile, and more that comes, make no difference.
+    index.query(views[0], 16)
+    index.add(nodes[0])
+    assert [index.query(view, 16, hidden) for view in views] == before
+
+
+def test_the_order_of_growth_and_questions_make_no_difference(
+    building: tuple[World, list[Node], list[Pose2]],
+) -> None:
+    world, nodes, tour = building
+    at_once, grown = PlaceIndex(small_cells()), PlaceIndex(small_cells())
+    at_once.extend(nodes)
+    view = take_view(world, tour[0], np.random.default_rng(12))[0]
+    sizes = []
+    for node in reversed([*nodes, *altered(nodes, 20)]):
+        grown.add(node)
+        grown.query(view, 3)
+        sizes.append(grown.landmarks.cells(len(grown.landmarks)))
+    assert len(set(sizes)) > 2
+    for node in altered(nodes, 20):
+        grown.remove(node.id, node.landmarks.codes)
+        assert node.id not in dict(grown.query(view, 99))
+    for stop in tour[::4]:
+        view = take_view(world, stop, np.random.default_rng(14))[0]
+        assert dict(grown.query(view, 6)) == pytest.approx(dict(at_once.query(view, 6)), rel=1e-3)
+
+
+def test_all_landmarks_are_in_cells_of_another_size(building: tuple[World, list[Node], list[Pose2]]) -> None:
+    """What comes and goes is in cells of all sizes that are kept; those that nobody searches are dropped."""
+    world, nodes, tour = building
+    index = filled(nodes, small_cells(probes=20_000))
+    liar = altered(nodes, 4 * len(nodes))
+    hidden = [node.id for node in liar]
+    index.extend(liar)
+    view = take_view(world, tour[5], np.random.default_rng(15))[0]
+    index.query(view, 3, hidden)
+    index.remove(nodes[5].id, nodes[5].landmarks.codes)
+    assert nodes[5].id not in dict(index.query(view, 99, hidden))
+    index.add(nodes[5])
+    plain = filled(nodes)
+    assert dict(index.query(view, 5, hidden)) == pytest.approx(dict(plain.query(view, 5)), rel=1e-3)
+    assert len(index.landmarks._kept) == 2
+    index.extend(altered(nodes, 8 * len(nodes))[4 * len(nodes) :])
+    assert len(index.landmarks._kept) == 1
+
+
+def test_a_question_waits_while_cells_are_filled_for_another_one_and_finds_the_same(
+    building: tuple[World, list[Node], list[Pose2]],
+) -> None:
+    world, nodes, tour = building
+    index = filled(nodes, small_cells())
+    liar = altered(nodes, 4 * len(nodes))
+    hidden = [node.id for node in liar]
+    view = take_view(world, tour[5], np.random.default_rng(15))[0]
+    before = index.query(view, 9)
+    index.extend(liar)
+    with ThreadPoolExecutor(4) as pool:
+        found = list(pool.map(lambda _: index.query(view, 9, hidden), range(8)))
+    assert found == [before] * 8
+
+
+def test_fewer_cells_are_searched_when_the_smallest_are_full() -> None:
+    index = PlaceIndex().landmarks
+    smallest = InvertedFile(coarse_quantizers()[-1])
+    assert [index.cells(n) for n in (30_000, 30_001, 102_401, 10**6, 10**7)] == [0, 256, 1024, 4096, 16384]
+    assert [index._probes(n, smallest) for n in (10**6, 6_553_600, 13_107_200, 10**8)] == [10, 10, 5, 2]
 
 
 def test_who_announces_a_node_does_not_wait_for_a_search(
