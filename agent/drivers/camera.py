@@ -28,7 +28,7 @@ RETRY = 1.0
 SETTLING = 1.0
 """s of automatic exposure before it is locked."""
 STREAM_PATIENCE = 5.0
-"""s in which a stream may come back: rpicam-vid ends with the program that it served, and is started anew."""
+"""s in which a stream may come back: rpicam-vid ends with the program that it served, and starts again."""
 FFMPEG_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 """The environment's variable that OpenCV reads when it opens a source."""
 RAW_STREAM = "fflags;nobuffer|analyzeduration;500000"
