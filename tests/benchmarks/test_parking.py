@@ -50,6 +50,10 @@ def test_parking_is_judged_by_the_truth(scene):
     assert first.success == (exact and min(first.record.seen) >= LEAST_VISIBLE and not first.collisions)
     # The servo gets the truth: better than a robot that only counts the turns of its wheels.
     assert first.believed_m == pytest.approx(first.error_m, abs=0.02)
+    assert 1e-4 < first.sigma_m < 0.01
+    off = first.record.believed[-1] - first.record.true[-1]
+    assert math.hypot(off[0], off[1]) < 4.0 * first.sigma_m
+    assert first.nees < 16.3, "99.9 % of right covariances"
 
 
 @pytest.mark.slow
@@ -60,6 +64,6 @@ def test_the_command_prints_figures_and_draws(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr("sys.argv", [*arguments, str(out)])
     parking.main()
     figures = json.loads(capsys.readouterr().out.splitlines()[-1])
-    assert {"success", "error_m_median", "error_deg_median", "fov_violations"} <= set(figures)
+    assert {"success", "error_m_median", "error_deg_median", "nees_mean", "fov_violations"} <= set(figures)
     assert figures["starts"] == 1
     assert sorted(path.name for path in out.iterdir()) == ["fig12.png", "fig13.png", "fig14.png"]

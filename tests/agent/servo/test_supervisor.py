@@ -102,7 +102,7 @@ def test_starts_parked(robot: RobotDescription, simulate: Callable[..., Any]) ->
 def test_it_comes_nearer_to_the_goal_at_which_it_has_arrived(
     robot: RobotDescription, integrate: Callable[..., list[Pose2]], aside: float
 ) -> None:
-    """It has arrived by an estimate that was off, is told where it is, and drives the rest."""
+    """It has arrived by an estimate that was off, hears where it is, and drives the rest."""
     servo, tracked, pose = Servo(robot), np.ones(len(WALL_OF_POINTS), dtype=bool), Pose2(0.0, aside, 0.0)
     servo.start(Pose2(), WALL_OF_POINTS)
     while servo.command(Pose2(), WALL_OF_POINTS, tracked, NOTHING).state != "arrived":
