@@ -2,6 +2,7 @@
 
     python -m benchmarks.liar [--seed N] [--ways NAME ...] [--without RULE] [--json]
     python -m benchmarks.liar --rules [--seed N] [--ways NAME ...] [--jobs N] [--json]
+    python -m benchmarks.liar --margins [--seed N] [--json]
 
 Nothing is rendered (see `synthetic.wrong_geometry`); server, ingest, merge and relocalization are the real
 ones, and all that robots send and ask goes over a bus. Three robots map a house. A fourth one then sends its
@@ -12,7 +13,8 @@ is contained if links and answers are the same and no node has moved by more tha
 moves them by 2 to 3 cm. It is named if the history that the page shows holds it against the robot. Some ways
 cannot be found out (`UNDECIDABLE`): they are measured, and not counted.
 
-With `--rules` all ways that can be found out are tried with all rules, and without each.
+With `--rules` all ways that can be found out are tried with all rules, and without each. With `--margins` the
+ways of `margins.py` are, each without the one rule that contains it.
 """
 
 from __future__ import annotations
@@ -32,6 +34,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from benchmarks.command_line import command_line
+from benchmarks.liar.margins import MARGINS
 from benchmarks.rules.switches import ALL, Switch, switched_off
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver import active_nodes, answers
@@ -120,6 +123,16 @@ def tried(
             yield name, trial.outcome(EVERY[name])
 
 
+def margins(seed: int, queries: int) -> Iterator[tuple[str, dict[str, ContainmentOutcome]]]:
+    """What becomes of each way that one rule contains, with all rules, and without that one."""
+    with tempfile.TemporaryDirectory() as folder:
+        trial = drawn_trial(seed, queries, Path(folder))
+        for name, (rule, lie) in MARGINS.items():
+            outcomes = {ALL: trial.outcome(lie)}
+            with switched_off(RULES[rule]):
+                yield name, {**outcomes, rule: trial.outcome(lie)}
+
+
 def _without(seed: int, queries: int, ways: Sequence[str], rule: str) -> dict[str, Any]:
     logging.disable(logging.WARNING)
     return totals(dict(tried(seed, queries, ways, rule)))
@@ -132,22 +145,32 @@ def main() -> None:
     parser.add_argument("--ways", nargs="+", default=list(EVERY), choices=list(EVERY), metavar="NAME")
     parser.add_argument("--without", choices=list(RULES), metavar="RULE", help="switch a rule off: see RULES")
     parser.add_argument("--rules", action="store_true", help="all rules, and without each of them")
+    parser.add_argument("--margins", action="store_true", help="the ways that one rule alone contains")
     parser.add_argument("--jobs", type=int, default=1, help="processes, with --rules (default 1)")
     arguments = parser.parse_args()
     if min(arguments.queries, arguments.jobs) < 1:
         parser.error("--queries and --jobs must be at least 1")
     if arguments.rules and arguments.without:
         parser.error("--rules switches each rule off: leave out --without")
+    if arguments.margins and (arguments.rules or arguments.without):
+        parser.error("--margins has its own ways and rules: leave out --rules and --without")
     logging.disable(logging.WARNING)
     console = Console(stderr=arguments.json)
     with Progress(console=console) as progress:
         if arguments.rules:
             found = _by_rule(arguments, progress)
+        elif arguments.margins:
+            found = {}
+            each = margins(arguments.seed, arguments.queries)
+            for name, by_rule in progress.track(each, len(MARGINS), description="ways"):
+                found[name] = {rule: asdict(one) for rule, one in by_rule.items()}
+                for rule, one in by_rule.items():
+                    console.print(f"without {rule}: " if rule != ALL else "", row(name, one), sep="")
         else:
             outcomes: dict[str, ContainmentOutcome] = {}
             rule = arguments.without or ALL
-            each = tried(arguments.seed, arguments.queries, arguments.ways, rule)
-            for name, one in progress.track(each, len(arguments.ways) + 1, description="ways"):
+            ways = tried(arguments.seed, arguments.queries, arguments.ways, rule)
+            for name, one in progress.track(ways, len(arguments.ways) + 1, description="ways"):
                 outcomes[name] = one
                 console.print(row(name, one))
             peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024

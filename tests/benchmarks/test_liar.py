@@ -4,14 +4,30 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from benchmarks.liar.benchmark import drawn_trial
-from mapweave.scenarios.liar.lies import WAYS
+from benchmarks.liar.benchmark import RULES, draw, drawn_trial
+from benchmarks.liar.margins import MARGINS
+from mapweave.mapserver.log.entry import ReceivedChange
+from mapweave.scenarios.liar.lies import WAYS, LieInputs
+from synthetic.wrong_geometry import ODD
 
-pytestmark = pytest.mark.slow
+
+@pytest.mark.parametrize("name", list(MARGINS))
+def test_what_one_rule_contains_is_of_legal_messages(name: str) -> None:
+    """No change of it is refused, so that no other rule names it for that."""
+    rule, lie = MARGINS[name]
+    maps = draw(3)[1]
+    others = {map_id: content for map_id, content in maps.items() if map_id != ODD}
+    sent = lie(LieInputs(ODD, maps[ODD], others, np.random.default_rng(3)))
+    assert rule in RULES and {map_id.agent for map_id in sent.logs} == {ODD.agent}
+    for map_id, log in sent.logs.items():
+        for k, message in enumerate(log, start=1):
+            assert not isinstance(ReceivedChange.read(map_id, k, message).change, str)
 
 
+@pytest.mark.slow
 def test_lies_are_contained_and_named(tmp_path: Path) -> None:
     trial = drawn_trial(3, 6, tmp_path)
     beside = trial.beside

@@ -146,6 +146,10 @@ class Served:
         entries = decode(replies[0].payload, FleetStatus).robots if replies else ()
         return any(entry.robot == agent and entry.accusation for entry in entries)
 
+    def links_joining(self, agent: str) -> int:
+        """How many links there are between a robot's maps and those of others."""
+        return sum((link.a.agent == agent) != (link.b.agent == agent) for link in self._server.merged().links)
+
     def seen(
         self, maps: Collection[MapId], lost: Sequence[tuple[View, Pose2]], truth: Mapping[NodeId, Pose2]
     ) -> FleetResult:

@@ -37,6 +37,7 @@ class ContainmentOutcome:
         links_changed: among their maps, gone or come.
         alive: whether the server took all and answers.
         seconds: until all was merged.
+        links_joining: between maps of the robot that lies and theirs, at least.
     """
 
     contained: bool
@@ -47,6 +48,7 @@ class ContainmentOutcome:
     links_changed: int
     alive: bool
     seconds: float
+    links_joining: int = 0
 
     @property
     def accused(self) -> bool:
@@ -125,18 +127,21 @@ class LiarTrial:
             seconds = time.monotonic() - began
             alive = taken and served.alive()
             in_status = served.in_status(self._liar.agent)
+            joining = served.links_joining(self._liar.agent)
             first = compared(self.before, served.seen(self._others, self._queries, self._truth))
         with Served(folder / "s0.sqlite") as served:
             alive = served.settle() and alive
             again = compared(self.before, served.seen(self._others, self._queries, self._truth))
             named = served.named(self._liar.agent)
+            joining = min(joining, served.links_joining(self._liar.agent))
         shutil.rmtree(folder)
         moved, links = max(first[0], again[0]), max(first[2], again[2])
         changed = (first[1] | again[1]) & ~self._left_out
         contained = alive and moved <= MOVED_M and not changed.any() and not links
         outcome = ContainmentOutcome(
-            contained, named, in_status, round(moved, 4), int(changed.sum()), links, alive, round(seconds, 2)
-        )
+            contained, named, in_status, round(moved, 4), int(changed.sum()), links, alive, round(seconds, 2),
+            joining,
+        )  # fmt: skip
         return outcome, changed
 
 
