@@ -9,6 +9,7 @@ parameter with a Gaussian prior, if a setting says how much it may be.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Array, Pose2
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.registration.gauss_newton import GAUSS_NEWTON_STEPS, PlanarFix, improve, refine, stack_sightings
 from mapweave.registration.minimal_poses import hypotheses
 from mapweave.registration.planar_ambiguity import mirrored
@@ -176,11 +177,32 @@ def _weighed(
     states = np.append(mean.vector, pitch), mirror[0]
     score, mirror_score = (_score(parts, state, s.pitch_sigma) for state in states)
     if mirror_score <= score:
-        return replace(fix, rival=max(mirror_score, 0.0) / score if score > 0.0 else 1.0)
+        share = max(mirror_score, 0.0) / score if score > 0.0 else 1.0
+        return _or_mirrored(fix, mirror[0], score - mirror_score, share)
     better = refine(stack, mirror[0], s.scale_sigma)
     if better is None or int(better.inliers.sum()) < s.least_inliers:
-        return replace(fix, rival=1.0)
-    return replace(better, rival=max(score, 0.0) / mirror_score)
+        return _or_mirrored(fix, mirror[0], 0.0, 1.0)
+    return _or_mirrored(better, states[0], mirror_score - score, max(score, 0.0) / mirror_score)
+
+
+def _or_mirrored(fix: PlanarFix, other: Array, lead: float, rival: float) -> PlanarFix:
+    """A pose, as uncertain as it is if another one may be the true one.
+
+    That is so with the probability that their log likelihood ratios leave it; the covariance is the second
+    moment of both about the better one.
+
+    Args:
+        fix: the better pose.
+        other: (4,) the other pose and its pitch.
+        lead: by how many nats the first is likelier.
+        rival: see PlanarFix.
+    """
+    pose = fix.node_from_robot
+    off = (pose.mean.inverse() @ Pose2.from_vector(other[:3])).vector
+    spread = np.outer(off, off) / (1.0 + math.exp(min(lead, 500.0)))
+    pose = PoseGaussian(pose.mean, pose.covariance + spread)
+    distance = math.hypot(off[0], off[1])
+    return replace(fix, node_from_robot=pose, rival=rival, rival_distance=distance, spread=spread)
 
 
 def _score(parts: Sequence[Sightings], state: Array, pitch_sigma: float) -> float:

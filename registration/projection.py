@@ -319,12 +319,10 @@ def determined(information: Matrix) -> bool:
 
 @for_each
 def _move_point(n: Index, stack: Stack, linear: Linear, step: Vector, out: Matrix) -> None:
-    """Put point n where it fits best after a step of the pose, within its uncertainty; outliers back.
+    """Put point n where it fits best after a step of the pose, within its uncertainty.
 
-    A sighting may then be an inlier where its point was given and none where that fits best, in turns:
-    seven of 425 drawn problems are 0.14 to 0.63 sigmas from the optimum. Where outliers' points move as well,
-    none is more than 0.03, but of 400 pairs of nodes by poor cameras 45 links are wrong instead of 36, and no
-    more are right (`python -m benchmarks.rules --pairs 400 --seed 871`).
+    An outlier's too: whether it is one depends on where it is linearised. Put back, it would be an inlier
+    where it was given and none where it fits best, in turns.
     """
     white, factor, p = linear.white, linear.factor, stack.covariances
     # The residual that is left, times the inverse of its covariance.
@@ -341,14 +339,19 @@ def _move_point(n: Index, stack: Stack, linear: Linear, step: Vector, out: Matri
     left, z = linear.by_point[n, 1] * u, linear.by_point[n, 3] * v
     x = linear.axes[n, 0] * forward - linear.axes[n, 1] * left
     y = linear.axes[n, 1] * forward + linear.axes[n, 0] * left
-    inlier = linear.inliers[n]
     for k in range(3):
-        out[n, k] = stack.points[n, k] + inlier * (p[n, k, 0] * x + p[n, k, 1] * y + p[n, k, 2] * z)
+        out[n, k] = stack.points[n, k] + p[n, k, 0] * x + p[n, k, 1] * y + p[n, k, 2] * z
 
 
 @compiled
 def improve(stack: Stack, start: Vector, rounds: int) -> tuple[bool, Vector, Matrix]:
-    """Bring a pose to its best near a first one by Gauss-Newton.
+    """Bring a pose to its best near a first one by Gauss-Newton, with iteratively reweighted rows.
+
+    What becomes least is pitch^2 / 2 - sum of ln(1 + exp(ratio)) over the sightings inside their gates: each
+    is a right match, Gaussian, or a wrong one, anywhere (a mixture as in MLESAC: Torr and Zisserman, CVIU 78,
+    2000), with its point where it fits best (variable projection: Golub and Pereyra, SIAM J. Numer. Anal. 10,
+    1973). The rows' weights are that cost's; that the residuals' covariance depends on the pose is left out
+    of each step.
 
     Args:
         stack: the sightings.

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.node import Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.registration.evidence import GRID, depth_agreement, gather
 from mapweave.registration.matching import MatchSettings, match
@@ -44,7 +44,8 @@ class RecognitionSettings:
         most_position_share: largest standard deviation of the position as a share of the median depth of
             the inliers.
         most_rival: what the pose mirrored in what is seen may explain, as a share of what the best does:
-            a flat thing from afar looks almost the same from two sides.
+            a flat thing from afar looks almost the same from two sides. One that is nearer than the
+            position may be uncertain is part of that uncertainty.
     """
 
     matching: MatchSettings = field(default_factory=MatchSettings)
@@ -68,6 +69,7 @@ class Recognition:
         usable: matches with a depth on either side, which could have been inliers.
         evidence: the numbers that support it, for an edge's `evidence`.
         pitch: by which the view's camera looks further up than the node's, rad.
+        spread: (3, 3) part of the pose's covariance, see PlanarFix.
     """
 
     node_from_robot: PoseGaussian
@@ -76,6 +78,7 @@ class Recognition:
     usable: int
     evidence: dict[str, float]
     pitch: float = 0.0
+    spread: Array = field(default_factory=lambda: np.zeros((3, 3)))
 
     @property
     def inliers(self) -> int:
@@ -217,13 +220,14 @@ def _examine(
     inliers = usable[fix.inliers]
     evidence = gather(a, camera_a, b, camera_b, inliers, len(pairs), len(usable), fix)
     evidence["depths"] = depth_agreement(sightings[0], fix)
-    evidence["rival"] = fix.rival
+    within = fix.rival_distance <= s.most_position_share * evidence["depth"]
+    evidence["rival"] = 0.0 if within else fix.rival
     reason = _objection(evidence, s)
     if reason:
         return RecognitionFailure(reason, len(pairs), inliers, fix.node_from_robot, evidence)
     unknown = min(a.scale_share, b.scale_share) if measured else a.scale_share
     pose = of_unknown_scale(fix.node_from_robot, unknown, camera_a, camera_b)
-    return Recognition(pose, inliers, len(pairs), len(usable), evidence, fix.pitch)
+    return Recognition(pose, inliers, len(pairs), len(usable), evidence, fix.pitch, fix.spread)
 
 
 def of_unknown_scale(pose: PoseGaussian, share: float, of_node: Camera, of_view: Camera) -> PoseGaussian:

@@ -54,6 +54,20 @@ def test_the_noise_of_blurred_pixels_is_estimated() -> None:
     assert np.mean(squared) < 4.5
 
 
+def test_that_another_pose_may_be_the_true_one_stays_in_the_covariance() -> None:
+    rng, a = np.random.default_rng(3), Pose2(2.5, 2.0, 0.3)
+    node = take_node(WORLD, NodeId("r0", 1, 1), a, HERE, rng, Sensing(pixel_sigma=0.1))
+    view, _ = take_view(WORLD, a @ Pose2(0.03, 0.02, 0.01), rng, Sensing(pixel_sigma=0.12))
+    one = recognise(node, view, SETTINGS, rng)
+    assert one is not None and not one.spread.any()
+    spread = np.diag([0.04, 0.01, 0.0001])
+    pose = PoseGaussian(one.node_from_robot.mean, one.node_from_robot.covariance + spread)
+    of_two = replace(one, node_from_robot=pose, spread=spread)
+    alone, both = (refine_pose(node, view, each, SETTINGS.pose) for each in (one, of_two))
+    assert alone.covariance.trace() < one.node_from_robot.covariance.trace()
+    assert np.allclose(both.covariance, alone.covariance + spread, rtol=1e-6, atol=1e-12)
+
+
 def test_a_refinement_that_leaves_most_landmarks_out_is_not_taken() -> None:
     """Landmarks up to 100 m away, of which every third pixel is off by more than the others."""
     street, rng = room(0, 0, 100, 80, 3000, np.random.default_rng(1)), np.random.default_rng(7)

@@ -1,6 +1,7 @@
 """Recognising places in a synthetic world with known truth."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -187,6 +188,29 @@ def test_each_rule_refuses_with_its_own_reason(
     view, _ = take_view(world(), near(a, rng), rng)
     verdict = examine_view(node_at(a, rng), view, settings, rng)
     assert isinstance(verdict, RecognitionFailure) and word in verdict.reason
+
+
+@pytest.mark.parametrize(("distance", "linked"), [(0.05, True), (0.5, False)])
+def test_a_rival_pose_nearer_than_the_position_may_be_uncertain_refuses_nothing(
+    distance: float, linked: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The landmarks are about 2 m away, and 6 % of that is allowed."""
+    solve = recognition.solve_sightings
+
+    def two_poses(*args: Any, **names: Any) -> Any:
+        fix = solve(*args, **names)
+        assert fix is not None
+        return replace(fix, rival=0.95, rival_distance=distance)
+
+    monkeypatch.setattr(recognition, "solve_sightings", two_poses)
+    rng = np.random.default_rng(8)
+    a = Pose2(2.5, 2.0, 0.3)
+    view, _ = take_view(world(), near(a, rng), rng)
+    verdict = examine_view(node_at(a, rng), view, None, rng)
+    if linked:
+        assert isinstance(verdict, Recognition) and verdict.evidence["rival"] == 0.0
+    else:
+        assert isinstance(verdict, RecognitionFailure) and "on the other side" in verdict.reason
 
 
 def test_a_patch_in_a_corner_does_not_make_a_place() -> None:
