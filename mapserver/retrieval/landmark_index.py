@@ -185,7 +185,7 @@ class LandmarkIndex:
         return landmarks
 
     def _drop_unused(self, needed: int) -> None:
-        """Drop what nobody searches, but not what has the size that is needed for all landmarks."""
+        """Drop what was not searched recently, but not what has the size needed for all landmarks."""
         recent = self._changed - len(self) // UNUSED
         for size in [size for size in self._kept if size != needed and needed in self._kept]:
             if self._searched.get(size, -1) < recent:

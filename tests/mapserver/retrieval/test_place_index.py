@@ -311,7 +311,7 @@ def test_the_order_of_growth_and_questions_make_no_difference(
 
 
 def test_all_landmarks_are_in_cells_of_another_size(building: tuple[World, list[Node], list[Pose2]]) -> None:
-    """What comes and goes is in cells of all sizes that are kept; those that nobody searches are dropped."""
+    """What comes and goes is in cells of all sizes that are kept; unused ones are dropped."""
     world, nodes, tour = building
     index = filled(nodes, small_cells(probes=20_000))
     liar = altered(nodes, 4 * len(nodes))
