@@ -33,6 +33,7 @@ MEASUREMENTS: dict[str, str] = {
     "rules_lies": "python -m benchmarks.liar --rules --jobs 2 --seed 757 --ways 'node at 1e9 m' "
     "'edges of 1e5 m' 'covariance of zero' 'greatest covariance' 'contradicting clocks' 'many epochs' "
     "'shuffled maps' 'copied places' 'half copied landmarks' --json",
+    "lies_margins": "python -m benchmarks.liar --margins --seed 759 --json",
     "wrong_geometry": "python -m benchmarks.wrong_geometry --runs 1 --kinds slip carried --scenes room "
     "--seed 723 --json",
     "agent": "python -m benchmarks.agent --seed 724 --json",

@@ -70,13 +70,19 @@ def _rules(rules: Sequence[Rule], results: Mapping[str, StoredResult]) -> str:
     ]  # fmt: skip
     before = ""
     for rule in rules:
-        reasons = "; ".join(filled(words, _of(results, source).figures) for words, source in rule.fails)
-        commands = ", ".join(dict.fromkeys(_command(_of(results, source)) for _, source in rule.fails))
+        reasons = "; ".join(_reason(results, *one) for one in rule.fails)
+        named = dict.fromkeys(_command(_of(results, source)) for _, source in rule.fails if source)
+        commands = ", ".join(named) or "none is stored"
         lines.append(
             f"| {rule.name} | `{rule.file}` | {reasons} | {'same' if commands == before else commands} |"
         )
         before = commands
     return "\n".join(lines)
+
+
+def _reason(results: Mapping[str, StoredResult], words: str, source: str) -> str:
+    """What fails without a rule, with the figures of the named result; without a name it has none."""
+    return filled(words, _of(results, source).figures) if source else words
 
 
 def _measured(results: Mapping[str, StoredResult]) -> str:

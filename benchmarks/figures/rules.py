@@ -12,7 +12,7 @@ class Rule:
     Attributes:
         name: of the rule.
         file: where it stands.
-        fails: templates of what fails without it, each with the name of the result.
+        fails: templates of what fails without it, each with the name of the result; without a name, words.
     """
 
     name: str
@@ -69,6 +69,16 @@ def _lies(rule: str) -> tuple[str, str]:
         f"{{all rules/not_contained}}; not named: {{{rule}/not_named}} instead of {{all rules/not_named}}"
     )
     return words, "rules_lies"
+
+
+def _margins(rule: str, *ways: str) -> tuple[tuple[str, str], ...]:
+    """What becomes of ways to lie that one rule contains, without it and with all."""
+    figures = "{WAY/RULE/answers_changed} of 12 answers and {WAY/RULE/links_changed} links of the others"
+    rows = []
+    for way in ways:
+        without, whole = (figures.replace("WAY", way).replace("RULE", one) for one in (rule, "all rules"))
+        rows.append((f"{way}: changes {without} instead of {whole}", "lies_margins"))
+    return tuple(rows)
 
 
 def _loops(rule: str, way: str, figure: str, of: str = "") -> tuple[str, str]:
@@ -132,6 +142,66 @@ OF_RECOGNITION = {
     "certain position": ("picture",),
 }
 """What shows each rule of recognition."""
+SHOWN_BY: dict[str, tuple[tuple[str, str], ...]] = {
+    "maps that contradict themselves": (
+        *_margins("maps that contradict themselves", "landmarks that occur twice", "a dozen small maps"),
+        (
+            "nine maps of four nodes make answers ambiguous: `tests/mapserver/test_lies.py"
+            "::test_many_maps_of_one_robot_that_contradict_each_other_make_no_answer_ambiguous`",
+            "",
+        ),
+    ),
+    "fragments": _margins("fragments", "small maps left behind"),
+    "bent maps": _margins("bent maps", "steps a tenth too long"),
+    "shuffled maps": _margins("shuffled maps", "one shuffled map"),
+    "two sources of aliasing": (
+        *_margins("two sources of aliasing", "false edges of its own"),
+        (
+            "one robot takes the weight of landmarks from links between two others: "
+            "`tests/merge/outlier_rejection/test_distinctness.py"
+            "::test_one_robot_alone_takes_no_landmarks_from_links_of_others`",
+            "",
+        ),
+    ),
+    "clocks that run backwards": (
+        (
+            "links that join the true map of a robot with such a clock: "
+            "{a clock that runs backwards/clocks that run backwards/links_joining} instead of "
+            "{a clock that runs backwards/all rules/links_joining}",
+            "lies_margins",
+        ),
+    ),
+    "refused changes": (
+        (
+            "none by itself; without it and two sources of aliasing, edges to nowhere part the others' maps "
+            "(one room, seed 1)",
+            "",
+        ),
+    ),
+    "optimisation in two stages": (
+        (
+            "an implausible map joins two others that nothing else joins: "
+            "`tests/mapserver/test_lies.py::test_an_implausible_map_does_not_join_what_nothing_else_joins`",
+            "",
+        ),
+    ),
+    "torn maps": (
+        (
+            "altered copies behind a true drive are not found, where they are not known as copies: "
+            "`tests/merge/test_torn_maps.py"
+            "::test_altered_copies_behind_a_true_drive_are_found_out_by_their_arrangement`",
+            "",
+        ),
+    ),
+    "false places of one robot": (
+        (
+            "a robot with twelve wrong maps parts two others that three links join: "
+            "`tests/merge/outlier_rejection/test_fleet_chance.py::test_wrong_maps_of_one_robot_part_no_others`",
+            "",
+        ),
+    ),
+}
+"""What shows rules that no way of the run with all rules shows."""
 AGAINST_LIES = {
     "copies": "mapserver/merging/copies.py",
     "refused changes": "mapserver/merging/implausible_maps.py",
@@ -253,7 +323,7 @@ RULES = (
             _lies("wrong geometry"),
         ),
     ),
-    *(Rule(name, file, (_lies(name),)) for name, file in AGAINST_LIES.items()),
+    *(Rule(name, file, SHOWN_BY.get(name) or (_lies(name),)) for name, file in AGAINST_LIES.items()),
     Rule(
         "own loop closures agree with the way",
         "merge/outlier_rejection/pairwise_consistency.py",

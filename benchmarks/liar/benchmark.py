@@ -50,7 +50,8 @@ from mapweave.scenarios.liar.lies import EVERY, WAYS, Map
 from mapweave.scenarios.liar.trial import ContainmentOutcome, LiarTrial, row, totals
 from synthetic.wrong_geometry import ODD, SCENES, FaultyFleet, OdometryFault, draw_fleet, lost_views
 
-SCENE = "house"
+SCENE = "house", 3
+"""Which, and how often robots stop in it."""
 CLOCK, RADIUS, APART_S = "utc", 0.16, 10_000
 """All robots have one clock; the honest ones drive one after the other."""
 HONEST = "(an honest fourth robot)"
@@ -91,9 +92,10 @@ RULES: dict[str, tuple[Switch, ...]] = {
 """What contains lies, each with what takes its place when it is switched off."""
 
 
-def draw(seed: int) -> tuple[FaultyFleet, dict[MapId, Map]]:
+def draw(seed: int, scene: tuple[str, int] = SCENE) -> tuple[FaultyFleet, dict[MapId, Map]]:
     """A fleet whose robots have clocks and footprints."""
-    fleet = draw_fleet(seed, SCENES[SCENE], OdometryFault.NONE, stops=3)
+    name, stops = scene
+    fleet = draw_fleet(seed, SCENES[name], OdometryFault.NONE, stops=stops)
     maps: dict[MapId, Map] = {}
     for number, (map_id, (nodes, edges)) in enumerate(fleet.maps.items()):
         later = number * APART_S * 1_000_000_000
@@ -104,11 +106,11 @@ def draw(seed: int) -> tuple[FaultyFleet, dict[MapId, Map]]:
     return fleet, maps
 
 
-def drawn_trial(seed: int, queries: int, folder: Path) -> LiarTrial:
-    """Three robots map the house, and a fourth one is to lie."""
-    fleet, maps = draw(seed)
+def drawn_trial(seed: int, queries: int, folder: Path, scene: tuple[str, int] = SCENE) -> LiarTrial:
+    """Three robots map the house, or another scene, and a fourth one is to lie."""
+    fleet, maps = draw(seed, scene)
     honest_truth = {node: pose for node, pose in fleet.truth.items() if node.map != ODD}
-    views = lost_views(replace(fleet, truth=honest_truth), SCENES[SCENE], queries, seed)
+    views = lost_views(replace(fleet, truth=honest_truth), SCENES[scene[0]], queries, seed)
     return LiarTrial(ODD, maps, views, honest_truth, seed, folder)
 
 
@@ -126,8 +128,12 @@ def tried(
 def margins(seed: int, queries: int) -> Iterator[tuple[str, dict[str, ContainmentOutcome]]]:
     """What becomes of each way that one rule contains, with all rules, and without that one."""
     with tempfile.TemporaryDirectory() as folder:
-        trial = drawn_trial(seed, queries, Path(folder))
-        for name, (rule, lie) in MARGINS.items():
+        trials = {
+            scene: drawn_trial(seed, queries, Path(folder, scene[0]), scene)
+            for scene in {scene: None for _, _, scene in MARGINS.values()}
+        }
+        for name, (rule, lie, scene) in MARGINS.items():
+            trial = trials[scene]
             outcomes = {ALL: trial.outcome(lie)}
             with switched_off(RULES[rule]):
                 yield name, {**outcomes, rule: trial.outcome(lie)}

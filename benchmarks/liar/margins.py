@@ -123,13 +123,15 @@ def _false_edge(
     return Edge(edge_id, a, b, pose, kind, evidence={"inliers": 200.0}, shared=shared)
 
 
-MARGINS: Mapping[str, tuple[str, Callable[[LieInputs], LyingMessages]]] = {
-    "steps a tenth too long": ("bent maps", steps_too_long),
-    "one shuffled map": ("shuffled maps", one_shuffled),
-    "a dozen small maps": ("maps that contradict themselves", a_dozen),
-    "landmarks that occur twice": ("maps that contradict themselves", all_twice),
-    "small maps left behind": ("fragments", left_behind),
-    "false edges of its own": ("two sources of aliasing", false_edges),
-    "a clock that runs backwards": ("clocks that run backwards", clock_backwards),
+FEW, MANY = ("house", 1), ("room", 2)
+"""Scenes with few shared places and with many, and how often robots stop there."""
+MARGINS: Mapping[str, tuple[str, Callable[[LieInputs], LyingMessages], tuple[str, int]]] = {
+    "steps a tenth too long": ("bent maps", steps_too_long, FEW),
+    "one shuffled map": ("shuffled maps", one_shuffled, FEW),
+    "a dozen small maps": ("maps that contradict themselves", a_dozen, FEW),
+    "landmarks that occur twice": ("maps that contradict themselves", all_twice, FEW),
+    "small maps left behind": ("fragments", left_behind, FEW),
+    "false edges of its own": ("two sources of aliasing", false_edges, MANY),
+    "a clock that runs backwards": ("clocks that run backwards", clock_backwards, FEW),
 }
-"""The rule that alone contains a way, by the way; of the last one, that alone has its map joined."""
+"""The rule that alone contains a way, by the way, and where; the last rule alone has the map joined."""

@@ -17,8 +17,8 @@ from synthetic.wrong_geometry import ODD
 @pytest.mark.parametrize("name", list(MARGINS))
 def test_what_one_rule_contains_is_of_legal_messages(name: str) -> None:
     """No change of it is refused, so that no other rule names it for that."""
-    rule, lie = MARGINS[name]
-    maps = draw(3)[1]
+    rule, lie, scene = MARGINS[name]
+    maps = draw(3, scene)[1]
     others = {map_id: content for map_id, content in maps.items() if map_id != ODD}
     sent = lie(LieInputs(ODD, maps[ODD], others, np.random.default_rng(3)))
     assert rule in RULES and {map_id.agent for map_id in sent.logs} == {ODD.agent}
