@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import replace
 from functools import cache
 
+import numpy as np
 import pytest
 
 from mapweave.hybridmap.change import NodePut
@@ -109,6 +110,22 @@ def test_copies_of_a_place_take_no_votes_once_they_are_hidden() -> None:
             ranked = cluster.index.query(view_of(node), 16, [copy.id for copy in copies])
             assert not ranked.missing
             assert_alike(ranked, one_index(nodes).query(view_of(node), 16))
+
+
+def test_landmarks_that_are_wanted_are_counted_as_nodes_come_and_go() -> None:
+    """They decide which cells a shard searches: what is hidden, gone or put twice does not count."""
+    nodes = fleet()
+    shorter = replace(nodes[0], landmarks=nodes[0].landmarks.take(np.arange(5)))
+    hidden = [node.id for node in nodes[10:20]]
+    with shards(nodes) as cluster:
+        cluster.index.extend([nodes[1], shorter, shorter])
+        cluster.index.remove(nodes[2].id)
+        cluster.index.remove(nodes[2].id)
+        left = [shorter, nodes[1], *nodes[3:10], *nodes[20:]]
+        assert sum(link.wanted(hidden) for link in cluster.links) == sum(len(one.landmarks) for one in left)
+        assert sum(link.wanted(()) for link in cluster.links) == sum(
+            len(one.landmarks) for one in [*left, *nodes[10:20]]
+        )
 
 
 def test_a_map_stays_whole_in_one_shard() -> None:
