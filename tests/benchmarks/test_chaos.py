@@ -8,6 +8,8 @@ import shutil
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
@@ -53,11 +55,13 @@ def written(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture
-def fleet(written: Path, tmp_path: Path) -> tuple[list[Change], Journal, SqliteStore]:
+def fleet(written: Path, tmp_path: Path) -> Iterator[tuple[list[Change], Journal, SqliteStore]]:
     """A copy of it, open: what was sent, the journal and the store."""
     shutil.copytree(written, tmp_path, dirs_exist_ok=True)
     sent = sent_changes(tmp_path, 0, 5)
-    return sent, Journal(tmp_path / "r0.sqlite", "r0"), SqliteStore(tmp_path / "s0.sqlite")
+    journal, store = Journal(tmp_path / "r0.sqlite", "r0"), SqliteStore(tmp_path / "s0.sqlite")
+    with closing(journal), closing(store):
+        yield sent, journal, store
 
 
 def changed(store: SqliteStore, path: Path, sql: str) -> SqliteStore:
@@ -80,8 +84,10 @@ def test_what_a_store_lacks_is_lost(fleet: tuple[list[Change], Journal, SqliteSt
     sent, journal, store = fleet
     newest = {element_of(one.body): one.sequence for one in sent}
     final = max(newest.values())
-    lacking = changed(store, tmp_path / "s0.sqlite", f"DELETE FROM change WHERE sequence = {final}")
-    found = account(sent, journal, [lacking])
+    with closing(
+        changed(store, tmp_path / "s0.sqlite", f"DELETE FROM change WHERE sequence = {final}")
+    ) as lacking:
+        found = account(sent, journal, [lacking])
     assert (found.lost, found.stored, found.maps_equal) == (1, len(sent) - 1, False)
 
 
@@ -94,8 +100,10 @@ def test_what_a_robot_has_dropped_since_it_was_undone_is_not_lost(
     assert dropped > 0
     kept = {one.sequence for one in journal.changes(sent[0].map, 1, len(sent))}
     gone = ", ".join(str(one.sequence) for one in sent if one.sequence not in kept)
-    lacking = changed(store, tmp_path / "s0.sqlite", f"DELETE FROM change WHERE sequence IN ({gone})")
-    found = account(sent, journal, [lacking])
+    with closing(
+        changed(store, tmp_path / "s0.sqlite", f"DELETE FROM change WHERE sequence IN ({gone})")
+    ) as lacking:
+        found = account(sent, journal, [lacking])
     assert (found.lost, found.undone, found.maps_equal) == (0, dropped, True)
 
 
@@ -136,7 +144,8 @@ def test_a_journal_that_forgot_a_committed_change_has_lost_it(
     disk.execute(f"DELETE FROM change WHERE sequence = {len(sent)}")
     disk.commit()
     disk.close()
-    assert account(sent, Journal(tmp_path / "r0.sqlite"), [store]).lost == 1
+    with closing(Journal(tmp_path / "r0.sqlite")) as shorter:
+        assert account(sent, shorter, [store]).lost == 1
 
 
 def test_a_log_that_contradicts_itself_is_no_measure(
