@@ -22,7 +22,7 @@ from mapweave.hybridmap.landmark_tables import DIMENSIONS, SYMBOLS, VERSION
 FILE = "cells.npz"
 FAMILIES = (16, 32, 64, 128)
 """Of each size of cells. A family has as many cells as there are families."""
-SEARCHED = 8
+SEARCHED = 12
 """Families among whose centres a question finds the nearest, at least."""
 BLOCK = 1 << 17
 """Codes that are widened to floats at once."""

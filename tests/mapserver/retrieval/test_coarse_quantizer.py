@@ -1,50 +1,62 @@
-"""Means of means against brute force."""
+"""Cells in families against brute force."""
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.descriptor import quantise
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.mapserver.retrieval import coarse_quantizer as module
-from mapweave.mapserver.retrieval.coarse_quantizer import CoarseQuantizer
+from mapweave.mapserver.retrieval.coarse_quantizer import CoarseQuantizer, coarse_quantizers
 from synthetic.world import random_vectors
 
+Codes = NDArray[np.uint8]
 
-def codes_of(count: int, seed: int) -> NDArray[np.uint8]:
+
+def codes_of(count: int, seed: int) -> Codes:
     rng = np.random.default_rng(seed)
     seen = random_vectors(300, rng)[rng.integers(0, 300, count)]
     return quantise(seen + rng.normal(0, 0.08, seen.shape))
 
 
-def squared(vectors: NDArray[np.float32], means: NDArray[np.float32]) -> NDArray[np.float32]:
-    out: NDArray[np.float32] = ((vectors[:, None] - means[None]) ** 2).sum(axis=2)
+def squared(vectors: NDArray[np.float32], centres: Codes) -> NDArray[np.float32]:
+    """(N, M) between all."""
+    wide = centres.astype(np.float32)
+    products = vectors @ wide.T
+    out: NDArray[np.float32] = (vectors**2).sum(axis=1)[:, None] - 2 * products + (wide**2).sum(axis=1)
     return out
 
 
-def test_a_landmark_belongs_to_the_nearest_of_the_nearest_family() -> None:
-    means = CoarseQuantizer.learn(codes_of(4000, 1), 64)
+@pytest.mark.parametrize("number", [0, 1, 2])
+def test_a_landmark_belongs_to_the_nearest_of_the_nearest_family(number: int) -> None:
+    quantizer = coarse_quantizers()[number]
     vectors = codes_of(3000, 2).astype(np.float32)
-    family = squared(vectors, means.heads).argmin(axis=1)
-    own = squared(vectors, means.means)
-    whose = np.repeat(np.arange(len(means.heads)), np.diff(means.starts))
+    family = squared(vectors, quantizer.heads).argmin(axis=1)
+    own = squared(vectors, quantizer.centres)
+    whose = np.repeat(np.arange(len(quantizer.heads)), len(quantizer.heads))
     own[whose[None] != family[:, None]] = np.inf
     expected = own.argmin(axis=1)
-    for some in (means.nearest(vectors), means.nearest(vectors[: module.FEW - 1])):
-        # Equally near means are interchangeable.
+    for some in (quantizer.nearest(vectors), quantizer.nearest(vectors[: module.FEW - 1])):
+        # Equally near centres are interchangeable.
         rows = np.arange(len(some))
         assert np.allclose(own[rows, some], own[rows, expected[: len(some)]], rtol=1e-4)
         assert (some == expected[: len(some)]).mean() > 0.99
 
 
-def test_a_question_finds_nearly_all_of_the_nearest_means() -> None:
-    means = CoarseQuantizer.learn(codes_of(8000, 3), 256)
+@pytest.mark.parametrize("number", [0, 1, 2, 3])
+def test_a_question_finds_nearly_all_of_the_nearest_centres(number: int) -> None:
+    quantizer = coarse_quantizers()[number]
     vectors = codes_of(200, 4).astype(np.float32)
-    nearest = np.argsort(squared(vectors, means.means), axis=1)[:, :8]
-    result = means.searched.search(vectors, 8)[1]
-    assert len(means.heads) == 16
-    assert np.mean([len(set(a) & set(b)) / 8 for a, b in zip(nearest, result, strict=True)]) > 0.9
+    nearest = np.argsort(squared(vectors, quantizer.centres), axis=1)[:, :8]
+    result = quantizer.searched.search(vectors, 8, params=quantizer.probing(8))[1]
+    found = np.mean([len(set(a) & set(b)) / 8 for a, b in zip(nearest, result, strict=True)])
+    assert found > 0.9, found
 
 
-def test_few_landmarks_make_as_many_means_at_most() -> None:
-    means = CoarseQuantizer.learn(codes_of(5, 5), 64)
-    assert 1 <= len(means) <= 64 and means.starts[-1] == len(means)
-    assert means.nearest(np.zeros((0, 32), np.float32)).shape == (0,)
+def test_what_are_no_cells_of_codes_is_refused() -> None:
+    heads, centres = codes_of(4, 5), codes_of(16, 6)
+    assert len(CoarseQuantizer(heads, centres)) == 16
+    for wrong in ((heads[:0], centres[:0]), (heads, centres[:15]), (heads, centres.astype(np.float32))):
+        with pytest.raises(InvalidFile, match="cells"):
+            CoarseQuantizer(*wrong)
+    assert CoarseQuantizer(heads, centres).nearest(np.zeros((0, 32), np.float32)).shape == (0,)
