@@ -48,7 +48,7 @@ def test_a_question_finds_nearly_all_of_the_nearest_centres(number: int) -> None
     quantizer = coarse_quantizers()[number]
     vectors = codes_of(200, 4).astype(np.float32)
     nearest = np.argsort(squared(vectors, quantizer.centres), axis=1)[:, :8]
-    result = quantizer.searched.search(vectors, 8, params=quantizer.probing(8))[1]
+    result = quantizer.searched.search(vectors, 8)[1]
     found = np.mean([len(set(a) & set(b)) / 8 for a, b in zip(nearest, result, strict=True)])
     assert found > 0.9, found
 
