@@ -182,7 +182,7 @@ class CameraOccupancyGrid(OccupancyGrid):
         return float(_first(np.logical_not(known)[None], along, reach)[0])
 
     def room(self) -> Array:
-        """For each cell the distance to the nearest thing seen or touched, m."""
+        """The distance from each cell to the nearest thing seen or touched, m."""
         return self._distance(self._occupied)
 
     def drivable(self, unknown: bool = False) -> NDArray[np.bool_]:
@@ -218,7 +218,7 @@ class CameraOccupancyGrid(OccupancyGrid):
         return np.asarray((self._odds < -DECIDED) & ~self._touched)
 
     def _distance(self, cells: NDArray[np.bool_]) -> Array:
-        """For each cell the distance to the nearest of some cells, m."""
+        """The distance from each cell to the nearest of some cells, m."""
         return np.asarray(
             cv2.distanceTransform((~cells).astype(np.uint8), cv2.DIST_L2, 5) * self._settings.cell
         )

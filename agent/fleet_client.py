@@ -164,7 +164,7 @@ class FleetClient(BusClient):
         self._asker.join(self._timeout + 1.0)
 
     def status(self) -> AgentStatus:
-        """As others receive it; from any thread."""
+        """The status as others receive it; from any thread."""
         traffic = self._bus.traffic if isinstance(self._bus, TrafficMeter) else 0
         # What fails now comes before a question that once had no answer.
         failure = one_line(self._failure())

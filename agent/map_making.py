@@ -71,12 +71,12 @@ class MapMaking:
 
     @property
     def description(self) -> RobotDescription:
-        """Of the robot, as it is calibrated."""
+        """The robot's description, as it is calibrated."""
         return self._description
 
     @property
     def lens(self) -> Lens:
-        """Of its camera, as it is calibrated."""
+        """The lens of its camera, as it is calibrated."""
         return self._lens
 
     @property
@@ -95,7 +95,7 @@ class MapMaking:
         return self._resumption is not None and self._resumption.lost
 
     def explore(self) -> None:
-        """From now on the robot decides itself what to map, if it may; what was interrupted goes on."""
+        """Let the robot decide from now on itself what to map, if it may; what was interrupted goes on."""
         if self._explorer is None and (not self._by_camera or self._settings.exploration.without_rangers):
             self._explorer = self._new_explorer()
 
@@ -213,7 +213,7 @@ class MapMaking:
         return self._explorer is not None and self._explorer.idle and self.located
 
     def account(self, exploring: bool) -> tuple[str, str, bool]:
-        """For people.
+        """What it has made, for people.
 
         Args:
             exploring: whether the mission is to explore, and no person drives.

@@ -102,7 +102,7 @@ class MissionControl:
 
     @property
     def report(self) -> MissionReport | None:
-        """On the mission that holds."""
+        """Report on the mission that holds."""
         with self._lock:
             return None if self._current is None else self._reports[self._current]
 

@@ -64,7 +64,7 @@ class MotionPrimitives:
         return self._questions
 
     def number(self) -> int:
-        """For the next question."""
+        """The number for the next question."""
         self.next_number += 1
         return self.next_number - 1
 

@@ -123,7 +123,7 @@ class OccupancyGrid:
         return np.asarray(cells[:, 0] * self._odds.shape[1] + cells[:, 1], np.int64)
 
     def room(self) -> Array:
-        """For each cell the distance to the nearest thing seen, m."""
+        """The distance from each cell to the nearest thing seen, m."""
         occupied = (self._odds > DECIDED).astype(np.uint8)
         return np.asarray(cv2.distanceTransform(1 - occupied, cv2.DIST_L2, 5) * self._settings.cell)
 

@@ -162,7 +162,7 @@ class Pipeline:
 
     @property
     def lens(self) -> Lens:
-        """Of that image."""
+        """The lens of that image."""
         return self._map_making.lens
 
     @property
@@ -172,12 +172,12 @@ class Pipeline:
 
     @property
     def calibration(self) -> OnlineCalibration:
-        """Of the drive, while it maps."""
+        """The calibration of the drive, while it maps."""
         return self._map_making.calibration
 
     @property
     def fix(self) -> Fix | None:
-        """By which node the robot drives to a goal, or stands after it was stopped; None without one."""
+        """The node by which the robot drives to a goal, or stands after it was stopped; None without one."""
         navigator = self._navigator if isinstance(self._mission, GoTo | Idle) else None
         return None if navigator is None else navigator.fix
 
@@ -383,7 +383,7 @@ class Pipeline:
         self._map_making.lose_pose()
 
     def _seek_goal_again(self) -> None:
-        """On its way to a goal it knows no more where it is. A goal that was given up stays so."""
+        """Find the way to the goal again after the robot got lost. A goal that was given up stays so."""
         if self._navigator is not None and self._navigator.given_up:
             self._forget_fix()
         else:

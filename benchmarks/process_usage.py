@@ -78,5 +78,5 @@ def held_bytes() -> int:
 
 
 def total(pids: Iterable[int]) -> float:
-    """Of all threads of all processes, s."""
+    """Processor time of all threads of all processes, s."""
     return sum(map(used_by, pids))

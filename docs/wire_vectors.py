@@ -128,7 +128,7 @@ def shown(value: Any) -> Any:
 
 
 def landmarks(camera: Camera, count: int, by_rows: bool = True) -> Landmarks:
-    """As a robot makes them, with and without depth; by rows, or in another order."""
+    """Landmarks as a robot makes them, with and without depth; by rows, or in another order."""
     random = np.random.default_rng(count)
     depths = random.uniform(0.3, 8.0, count).astype(np.float32)
     depths[::3] = np.nan
@@ -214,7 +214,7 @@ def plan(record: tuple[annotation.Annotation, ...]) -> floor_plan.PlacedPlan:
 
 
 def status() -> AgentStatus:
-    """Of a robot that drives to a goal."""
+    """The status of a robot that drives to a goal."""
     pipeline = Status(
         "driving to the goal", "3 nodes to go", 17, 40, HERE.mean, False, "goto", NODE, Pose2(0.1, 0.0, 0.25),
         5, progress=0.25, tally=DriveStatistics(4, 1, 1, 0), covariance=(0.25, 0.0, 0.25, 0.0625),

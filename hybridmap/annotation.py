@@ -63,7 +63,7 @@ class Place:
 
     @property
     def words(self) -> str:
-        """For people."""
+        """The annotation in words."""
         return f"node {self.node}" if self.area is None else _area_words(self.area)
 
 
@@ -102,7 +102,7 @@ class Closure:
 
     @property
     def words(self) -> str:
-        """For people."""
+        """The annotation in words."""
         begin = "" if self.begin_ns is None else f" from {utc_words(self.begin_ns)}"
         end = "" if self.end_ns is None else f" until {utc_words(self.end_ns)}"
         return f"{_edge_or_area(self.edge, self.area)}, closed{begin}{end}"
@@ -168,7 +168,7 @@ class Floor:
 
     @property
     def words(self) -> str:
-        """For people."""
+        """The annotation in words."""
         return f"on floor {self.label}"
 
 
@@ -216,7 +216,7 @@ class Annotation:
 
     @property
     def kind(self) -> str:
-        """Of the body: place, closure and so on."""
+        """The kind of the body: place, closure and so on."""
         return self.body.TAG
 
     @property

@@ -64,7 +64,7 @@ class Apart:
         return frozenset(MapId(*end[:2]) for end in self.ends)
 
     def __str__(self) -> str:
-        """For example `r0.1.17 and r1.1.5`."""
+        """In words: `r0.1.17 and r1.1.5`."""
         return f"{self.ends[0]} and {self.ends[1]}"
 
 
@@ -116,7 +116,7 @@ class Linked:
         shared: NDArray[np.int64] | None = None,
         evidence: Mapping[str, float] | None = None,
     ) -> Linked:
-        """With the pose, and what supports it."""
+        """The subject with the pose, and what supports it."""
         pairs = () if shared is None else tuple((int(one), int(other)) for one, other in shared)
         numbers = tuple((name, float(value)) for name, value in sorted((evidence or {}).items()))
         return Linked(a, b, a_from_b.mean, _upper(a_from_b.covariance), pairs, numbers)
@@ -144,7 +144,7 @@ class Linked:
         return frozenset((self.a.map, self.b.map))
 
     def __str__(self) -> str:
-        """For example `r0.1.17 and r1.1.5`."""
+        """In words: `r0.1.17 and r1.1.5`."""
         return f"{self.a} and {self.b}"
 
 
@@ -170,7 +170,7 @@ class RetiredMap:
         return frozenset((self.map,))
 
     def __str__(self) -> str:
-        """For example `map r0.1`."""
+        """In words: `map r0.1`."""
         return f"map {self.map}"
 
 
@@ -202,7 +202,7 @@ class RetiredNodes:
         return frozenset(node.map for node in self.nodes)
 
     def __str__(self) -> str:
-        """For example `node r0.1.17` or `nodes r0.1.3 and r0.1.5`."""
+        """In words: `node r0.1.17` or `nodes r0.1.3 and r0.1.5`."""
         return nodes_in_words(self.nodes)
 
 
@@ -228,7 +228,7 @@ class RetiredArea:
         return frozenset((self.area.anchor.map,))
 
     def __str__(self) -> str:
-        """For example `the area of 4 corners at r0.1.17`."""
+        """In words: `the area of 4 corners at r0.1.17`."""
         return f"the area of {len(self.area.corners)} corners at {self.area.anchor}"
 
 
@@ -274,7 +274,7 @@ class RetiredWindow:
         return node.id.map == self.map and self.begin_ns <= node.stamp_ns <= self.end_ns
 
     def __str__(self) -> str:
-        """For example `map r0.1 from 2026-03-01 12:00:00 UTC until 2026-03-01 12:05:00 UTC`."""
+        """In words: `map r0.1 from 2026-03-01 12:00:00 UTC until 2026-03-01 12:05:00 UTC`."""
         return f"map {self.map} {period_in_words(self.begin_ns, self.end_ns)}".rstrip()
 
 
@@ -366,7 +366,7 @@ def read_window(
 
 
 def nodes_in_words(nodes: Iterable[NodeId]) -> str:
-    """For example `nodes r0.1.3 and r0.1.5`; of many some, and their number."""
+    """Nodes in words, for example `nodes r0.1.3 and r0.1.5`; of many some, and their number."""
     names = [str(node) for node in nodes]
     if len(names) == 1:
         return f"node {names[0]}"
@@ -380,7 +380,7 @@ def _upper(covariance: Array) -> tuple[float, ...]:
 
 
 def period_in_words(begin_ns: int, end_ns: int) -> str:
-    """For example `from 2026-03-01 12:00:00 UTC until 2026-03-01 12:05:00 UTC`; empty for all times."""
+    """A period: `from 2026-03-01 12:00:00 UTC until 2026-03-01 12:05:00 UTC`; empty for all times."""
     begin = f"from {_time(begin_ns)}" if begin_ns else ""
     end = f"until {_time(end_ns)}" if end_ns < MAX_STAMP_NS else ""
     return " ".join(part for part in (begin, end) if part)

@@ -4,5 +4,5 @@ from __future__ import annotations
 
 
 def counted(count: int, noun: str) -> str:
-    """For example `1 node`, `2 nodes`; the noun is given in the singular."""
+    """A number with its noun, for example `1 node`, `2 nodes`; the noun is given in the singular."""
     return f"{count} {noun}" if count == 1 else f"{count} {noun}s"

@@ -133,7 +133,7 @@ class FloorPlan:
 
     @property
     def words(self) -> str:
-        """For people."""
+        """The plan in words."""
         scale = "" if self.metres_per_pixel is None else f", {self.metres_per_pixel:g} m/px"
         return f"{self.image.file or 'an image'}, {len(self.pairs)} pairs{scale}"
 

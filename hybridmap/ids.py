@@ -34,7 +34,7 @@ class MapId(NamedTuple):
     epoch: Number
 
     def __str__(self) -> str:
-        """For example `r0.1`."""
+        """The id in text, for example `r0.1`."""
         return f"{self.agent}.{self.epoch}"
 
 
@@ -51,7 +51,7 @@ class NodeId(NamedTuple):
         return MapId(self.agent, self.epoch)
 
     def __str__(self) -> str:
-        """For example `r0.1.17`."""
+        """The id in text, for example `r0.1.17`."""
         return f"{self.agent}.{self.epoch}.{self.number}"
 
     @staticmethod

@@ -139,7 +139,7 @@ class Kernel(Generic[P, R]):
         return numba.njit(cache=True, **_OPTIONS)(self._linked())
 
     def _looping(self, numba: Any) -> Any:
-        """To be compiled as part of the kernels that call it, for the types that they have."""
+        """Mark a function to be compiled into the kernels that call it, for their types."""
         # If the call names each argument, numba makes one loop of both: three times as fast.
         count = len(signature(self._function).parameters) - str(self._loop).count("range")
         arguments = ", ".join(f"argument{k}" for k in range(count))

@@ -211,13 +211,13 @@ class ManualConstraints:
 
 
 def decided(constraint: ManualConstraint) -> str:
-    """For example `by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
+    """Who decided it, when and why, for example `by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
     why = f': "{constraint.because}"' if constraint.because else ""
     return f"by {constraint.who or 'a person'} on {utc_words(constraint.stamp_ns)}{why}"
 
 
 def reason_of(constraint: ManualConstraint) -> str:
-    """For example `undone by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
+    """Who undid it, when and why, for example `undone by anna on 2026-03-01 12:00 UTC: "two kitchens"`."""
     about, how = constraint.about, decided(constraint)
     match about:
         case Apart((first, second)):
@@ -285,5 +285,5 @@ def retired_words(constraint: ManualConstraint) -> str:
 
 
 def verb_of(about: Subject) -> str:
-    """Of a sentence on what is retired: `is`, or `are`."""
+    """The verb of a sentence on what is retired: `is`, or `are`."""
     return "are" if isinstance(about, RetiredNodes) and len(about.nodes) > 1 else "is"

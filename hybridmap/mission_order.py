@@ -68,7 +68,7 @@ OPEN = (MissionState.SENT, MissionState.RUNNING)
 
 
 def new_id() -> str:
-    """For a new mission, drawn by chance."""
+    """An id for a new mission, drawn by chance."""
     return secrets.token_hex(6)
 
 
@@ -156,7 +156,7 @@ class MissionOrder:
 
     @property
     def rank(self) -> tuple[int, str]:
-        """Of two missions of one robot the one of higher rank holds; see `replaces`."""
+        """The order of missions: of two of one robot the higher one holds; see `replaces`."""
         return self.stamp_ns, self.id
 
     def replaces(self, holding: MissionOrder) -> bool:
@@ -170,7 +170,7 @@ class MissionOrder:
 
     @property
     def words(self) -> str:
-        """For people."""
+        """The mission in words."""
         if self.node is None:
             return str(self.kind)
         return (
@@ -218,7 +218,7 @@ class Missions:
 
     @staticmethod
     def newest(reports: list[MissionReport]) -> Missions:
-        """As many as are kept: the newest of each robot first, so that none displaces those of others."""
+        """The missions to keep: the newest of each robot first, so that none displaces those of others."""
         turns, ranked = Counter[str](), []
         for report in sorted(reports, key=lambda report: report.order.rank, reverse=True):
             robot = report.order.robot

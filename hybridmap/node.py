@@ -79,7 +79,7 @@ class Landmarks:
 
     @property
     def tilt_sigma(self) -> float:
-        """By which the camera may have been off level, rad."""
+        """How far the camera may have been off level, rad."""
         return HELD_TILT if self.scale_share else 0.0
 
     def points_in_robot(self, camera: Camera) -> Array:

@@ -41,6 +41,6 @@ class Pin:
 
     @property
     def words(self) -> str:
-        """For people."""
+        """The pin in words."""
         pose = self.merged_from_node
         return f"at {pose.x:.3f},{pose.y:.3f} m, {math.degrees(pose.heading):.1f} deg"

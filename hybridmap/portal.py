@@ -58,7 +58,7 @@ class Portal:
 
     @property
     def words(self) -> str:
-        """For people."""
+        """The portal in words."""
         return f"a {self.means} between {self.a} and {self.b}" + (f" ({self.note})" if self.note else "")
 
 
@@ -84,7 +84,7 @@ class PortalStop:
 
     @property
     def title(self) -> str:
-        """For example `lift 'east lift'`."""
+        """Its kind and name, for example `lift 'east lift'`."""
         return f"{self.means} '{self.name}'"
 
     @property

@@ -71,7 +71,7 @@ class PrunedNodes:
         return node, successor_from_node
 
     def words(self, node: NodeId, present: Container[NodeId]) -> str:
-        """For example `r0.1.5 left the map on 2026-03-01 14:00 UTC: r0.9.3 replaces it`."""
+        """In words: `r0.1.5 left the map on 2026-03-01 14:00 UTC: r0.9.3 replaces it`."""
         stands = self.successor(node, present)
         now = "nothing is left of its place" if stands is None else f"{stands[0]} replaces it"
         return f"{node} left the map on {utc_words(self.nodes[node].stamp_ns)}: {now}"

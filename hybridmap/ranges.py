@@ -49,7 +49,7 @@ class Ranges:
 
     @staticmethod
     def around(proximity: NDArray[Any], bearings: tuple[float, ...], reach: float, radius: float) -> Ranges:
-        """From what a robot senses: free distances from its edge.
+        """Make them of what a robot senses: free distances from its edge.
 
         Args:
             proximity: (K,) m, or empty.

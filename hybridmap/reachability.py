@@ -119,7 +119,7 @@ def left(
 
 
 def _above(number: float) -> float:
-    """With one decimal, rounded up, so that what is above its limit is not said to be as much."""
+    """The value with one decimal, rounded up, so that what is above its limit is not said to be as much."""
     return math.ceil(10.0 * number) / 10.0
 
 

@@ -26,7 +26,7 @@ class Superseded:
     turn: Angle
 
     def __str__(self) -> str:
-        """For example `r1.1.5 replaces it, 0.31 m off and turned by 12 degrees, with 34 landmarks`."""
+        """In words: `r1.1.5 replaces it, 0.31 m off and turned by 12 degrees, with 34 landmarks`."""
         turned = f"turned by {math.degrees(self.turn):.0f} degrees"
         where = f"{self.distance:.2f} m off and {turned}"
         return f"{self.by} replaces it, {where}, with {self.found} landmarks"

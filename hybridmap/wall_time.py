@@ -21,7 +21,7 @@ HOURS = {"min": 1.0 / 60.0, "h": 1.0, "d": 24.0}
 
 
 def utc_words(stamp_ns: int) -> str:
-    """For example `2026-03-01 14:00 UTC`."""
+    """A time in words, for example `2026-03-01 14:00 UTC`."""
     return datetime.fromtimestamp(stamp_ns // NANOSECONDS, UTC).strftime("%Y-%m-%d %H:%M UTC")
 
 

@@ -168,7 +168,7 @@ class AdmissionControl:
         return soon * self._seconds / self._settings.threads
 
     def _next_appointment(self, wait: float, ticket: int | None, again: bool) -> float:
-        """In how many seconds to retry: when the queue is half empty, after all others.
+        """Seconds after which to retry: when the queue is half empty, after all others.
 
         A ticket that was refused at its appointment need not go to the end again.
         """

@@ -60,7 +60,7 @@ class BaseMap:
         )
 
     def __str__(self) -> str:
-        """For example `office.mapweave: 120 nodes of 3 maps`."""
+        """The map in one line, for example `office.mapweave: 120 nodes of 3 maps`."""
         nodes = sum(len(hybrid.nodes) for hybrid in self.maps.values())
         return f"{self.name}: {counted(nodes, 'node')} of {counted(len(self.maps), 'map')}"
 

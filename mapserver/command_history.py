@@ -56,7 +56,7 @@ class CommandHistory:
 
     @property
     def events(self) -> tuple[MapEvent, ...]:
-        """In order; for any thread."""
+        """All events in order; for any thread."""
         with self._lock:
             return self._events
 

@@ -182,7 +182,7 @@ def _doubts(
 
 
 def _image_matrix(plan: FloorPlan, fit: SimilarityFit) -> tuple[float, float, float, float, float, float]:
-    """Of pixels as images have them, y down."""
+    """The matrix of pixels as images have them, y down."""
     origin, right, down = fit.a_from_b.apply(
         np.array([[0.0, plan.image.height], [1.0, plan.image.height], [0.0, plan.image.height - 1.0]])
     )
@@ -191,7 +191,7 @@ def _image_matrix(plan: FloorPlan, fit: SimilarityFit) -> tuple[float, float, fl
 
 
 def _sigma(fit: SimilarityFit, pixel: Array) -> float:
-    """Of where a pixel is in the map, m: the mean over the directions."""
+    """The sigma of where a pixel is in the map, m: the mean over the directions."""
     arm = Pose2(0.0, 0.0, fit.a_from_b.heading).apply(fit.a_from_b.scale * pixel)
     jacobian = np.array([[1.0, 0.0, -arm[1], arm[0]], [0.0, 1.0, arm[0], arm[1]]])
     return math.sqrt(0.5 * float(np.trace(jacobian @ fit.covariance @ jacobian.T)))

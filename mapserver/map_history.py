@@ -67,7 +67,7 @@ class MapHistory:
 
     @property
     def events(self) -> tuple[MapEvent, ...]:
-        """In order; for any thread."""
+        """All events in order; for any thread."""
         with self._lock:
             return self._kept.events
 
@@ -231,7 +231,7 @@ def _frame_words(change: FrameChange) -> str:
 
 
 def _briefly(kind: MapEventKind, events: Sequence[str]) -> list[tuple[MapEventKind, str]]:
-    """Of very much at once the number."""
+    """What happened in few words; of very much at once the number."""
     more = [f"and {len(events) - MOST_AT_ONCE} more at once"] if len(events) > MOST_AT_ONCE else []
     return [(kind, words) for words in (*events[:MOST_AT_ONCE], *more)]
 

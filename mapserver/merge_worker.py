@@ -92,7 +92,7 @@ class MergeWorker:
 
     @property
     def answers(self) -> Answers:
-        """From the newest merged map."""
+        """Answers from the newest merged map."""
         return self._answers
 
     @property

@@ -190,7 +190,7 @@ class _Reader(Collector):
         yield from self._robots()
 
     def _refusals(self, ingest: IngestCounters, admission: Mapping[str, int | float]) -> Metric:
-        """By a reason of which there are few."""
+        """Refusals, by a reason of which there are few."""
         held_back = self._sources.held_back()
         quotas = {f"quota_{what}": held_back.get(what, 0) for what in QUOTAS}
         reasons = {"invalid_change": ingest.refused, "damaged_message": ingest.damaged, **quotas}

@@ -210,7 +210,7 @@ class PlaceResolver:
 
 
 def others_of(word: str, names: Sequence[str]) -> str:
-    """For a name that is none of these: those that it may be, else the first ones; empty if there is none."""
+    """Names that may be meant by one that is none of these: else the first ones; empty if there is none."""
     if close := _alike(word, names):
         return close
     more = f" and {len(names) - MOST_NAMES} more" if len(names) > MOST_NAMES else ""

@@ -48,7 +48,7 @@ class _Hindrances:
     within: frozenset[Annotation]
 
     def words(self, pair: frozenset[NodeId]) -> str:
-        """Of a pair; empty if it is none."""
+        """A pair in words; empty if it is none."""
         if pair in self.blocked:
             return "reported as blocked"
         for closure in self.rules.closed.get(pair, ()):
@@ -254,7 +254,7 @@ def _hop(
 
 
 def _apart(merged: MergedMap, start: NodeId, goal: NodeId, missing: str) -> RouteExplanation:
-    """Of two nodes that nothing joins, or of which one takes no part."""
+    """The explanation of two nodes that nothing joins, or of which one takes no part."""
     first, second = merged.component_of(start), merged.component_of(goal)
     if first is None or second is None:
         return RouteExplanation(start, goal, False, missing)

@@ -365,7 +365,7 @@ class Router:
         return sorted(entries, key=lambda entry: entry[1])[:ENTRIES]
 
     def _saved(self, pose: Pose2, node: NodeId, distance: float, barred: set[frozenset[NodeId]]) -> float:
-        """By how much it is cheaper to get to a node for a robot that is on an edge to it, m."""
+        """How much cheaper it is to get to a node for a robot that is on an edge to it, m."""
         roads = self.roads
         target = roads.poses[node]
         goal = np.array([target.x, target.y])

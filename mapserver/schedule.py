@@ -113,11 +113,11 @@ class LiveSchedule:
         self._periodic: list[threading.Thread] = []
 
     def monotonic(self) -> float:
-        """Of the machine."""
+        """The machine's monotonic clock."""
         return time.monotonic()
 
     def time_ns(self) -> int:
-        """Of the machine."""
+        """The machine's time."""
         return time.time_ns()
 
     def observe(self, stamp_ns: int) -> None:

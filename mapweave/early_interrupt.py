@@ -23,7 +23,7 @@ _came = False
 
 
 def remember() -> None:
-    """From now on it is remembered that Ctrl-C came; KeyboardInterrupt is raised as before."""
+    """Remember from now on that Ctrl-C came; KeyboardInterrupt is raised as before."""
     global _came
     _came = False
     if threading.current_thread() is not threading.main_thread():

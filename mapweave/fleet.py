@@ -363,7 +363,7 @@ class Fleet(FleetMap, FleetConstraints):
         via: tuple[str, ...] = (),
         because: str = "",
     ) -> MissionReport:
-        """By way of the map server; without one directly."""
+        """Give a mission by way of the map server; without one directly."""
         check_name(robot)
         self._check_role()
         report, after_ns = None, 0

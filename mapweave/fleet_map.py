@@ -41,7 +41,7 @@ class FleetMap(FleetQuestions, Map):
         self._closed = False
 
     def __repr__(self) -> str:
-        """For example `<Fleet demo>`; asks nothing."""
+        """A short name, for example `<Fleet demo>`; asks nothing."""
         return f"<{type(self).__name__} {self._keys.fleet}>"
 
     def map_bytes(self) -> bytes:

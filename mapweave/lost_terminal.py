@@ -27,7 +27,7 @@ class _Terminal(io.FileIO):
 
 
 def outlast_terminal() -> None:
-    """From now on, output of this process and its log to a terminal that is gone are dropped."""
+    """Drop output of this process and its log from now on if their terminal is gone."""
     for name in ("stdout", "stderr"):
         stream = getattr(sys, name)
         if stream is None or not stream.isatty():

@@ -100,7 +100,7 @@ class Map(ABC):
         """Floor plans, and where they lie under the merged map."""
 
     def __repr__(self) -> str:
-        """For example `<FileMap: 17 nodes, 3 maps, ...>`."""
+        """A short description, for example `<FileMap: 17 nodes, 3 maps, ...>`."""
         return f"<{type(self).__name__}: {self.content.title}>"
 
     @property
@@ -418,7 +418,7 @@ class FileMap(Map, ConstraintMethods):
             return PlaceResolver(router, router.annotations).answer(asked)
 
     def _router(self) -> Router:
-        """Of the ways that are open now."""
+        """The router over the ways that are open now."""
         return self._read.router.at(self.annotations(), time.time_ns())
 
 

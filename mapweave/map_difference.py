@@ -73,7 +73,7 @@ class MapDifference:
     events: tuple[str, ...]
 
     def values(self) -> dict[str, Any]:
-        """For `json.dumps`."""
+        """The difference for `json.dumps`."""
 
         def nodes(some: Iterable[NodeId]) -> list[str]:
             return [str(node) for node in some]

@@ -54,7 +54,7 @@ class MapSource(StrEnum):
 
     @property
     def words(self) -> str:
-        """With its article."""
+        """The kind of map with its article."""
         return f"{'an' if self is MapSource.JOURNAL else 'a'} {self.value}"
 
 
@@ -83,7 +83,7 @@ class OpenedMap:
 
     @property
     def name(self) -> str:
-        """For people: that of the file, without its folder."""
+        """The name for people: that of the file, without its folder."""
         return self.path.name if isinstance(self.path, Path) else self.path
 
     def merged(

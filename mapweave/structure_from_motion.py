@@ -267,7 +267,7 @@ def _rays(views: Sequence[View], structure: Structure) -> Array:
 
 
 def _triangulated(views: Sequence[View], structure: Structure) -> Structure:
-    """With points where the rays meet best; NaN for those without parallax, or behind a camera."""
+    """The scene with points where the rays meet best; NaN for those without parallax, or behind a camera."""
     rays = _rays(views, structure)
     visible = np.isfinite(rays[..., 0])
     filled = np.nan_to_num(rays)

@@ -100,7 +100,7 @@ class FloorParting(NamedTuple):
 
     @property
     def words(self) -> str:
-        """For people, in one phrase; empty if no link falls."""
+        """The floor in one phrase; empty if no link falls."""
         if not self.links:
             return ""
         fall = f"{counted(self.links, 'link')} {'falls' if self.links == 1 else 'fall'}"

@@ -54,7 +54,7 @@ class StandingDecisions:
 
     @staticmethod
     def union(parts: Iterable[StandingDecisions]) -> StandingDecisions:
-        """Of maps that nothing tied together before."""
+        """The union of decisions on maps that nothing tied together before."""
         some = list(parts)
         return StandingDecisions(
             {pair: link for decisions in some for pair, link in decisions.given.items()},

@@ -99,7 +99,7 @@ class Sightings:
         return np.isfinite(self.depths) & np.isfinite(self.depth_sigmas)
 
     def levelled(self, pitch: float) -> Sightings:
-        """As a level camera would have seen them, see projection.py.
+        """The sightings as a level camera would have seen them, see projection.py.
 
         Args:
             pitch: by which the camera looks up against the points' frame, rad; where inverted, the robot's.

@@ -80,7 +80,7 @@ class SimilarityFit:
 
     @property
     def rms(self) -> float:
-        """Of the residuals' lengths, in units of a."""
+        """Root mean square of the residuals' lengths, in units of a."""
         return math.sqrt(float((self.residuals**2).sum(axis=1).mean()))
 
     @property

@@ -46,7 +46,7 @@ class Figure:
 
     @property
     def radius(self) -> float:
-        """Of the way that it needs, also where it turns, m."""
+        """The radius of the way that it needs, also where it turns, m."""
         return math.hypot(self.length, self.width) / 2
 
 

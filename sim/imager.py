@@ -61,7 +61,7 @@ class Imager:
 
     @property
     def gain(self) -> float:
-        """Of the automatic exposure, 1 at the beginning."""
+        """The gain of the automatic exposure, 1 at the beginning."""
         return math.exp(self._log_gain)
 
     def drops(self) -> bool:

@@ -81,7 +81,7 @@ def _packed(
     look_along: bool,
     rng: np.random.Generator,
 ) -> tuple[Pose2, ...]:
-    """As many as fit when the floor is filled row by row, robot i in room i as long as it lasts."""
+    """As many places as fit when the floor is filled row by row, robot i in room i as long as it lasts."""
     places: list[list[Array]] = []
     taken: list[Array] = []
     for points in free:

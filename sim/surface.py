@@ -232,7 +232,7 @@ def _seamless(grain: Field, down: bool = False) -> Field:
 
 
 def _skirted(rng: np.random.Generator, canvas: Image) -> Image:
-    """With a skirting board, the same along every wall, scuffed."""
+    """The surface with a skirting board, the same along every wall, scuffed."""
     board = int(0.06 * TEXELS_PER_METRE)
     if len(canvas) > 4 * board:
         scuffs = noise(rng, canvas.shape[1], board, 3.0)

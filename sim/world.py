@@ -67,7 +67,7 @@ class PanelSet:
 
     @staticmethod
     def of(panels: Sequence[Panel]) -> PanelSet:
-        """From single panels."""
+        """Make it of single panels."""
         columns = [
             np.array([getattr(p, name) for p in panels], dtype=np.float64).reshape(-1, 3)
             for name in ("corner", "along", "down")

@@ -82,7 +82,7 @@ class Database:
             raise
 
     def _inode_now(self) -> tuple[int, int] | None:
-        """By which the file of this name is known; None if there is none."""
+        """The inode by which the file of this name is known; None if there is none."""
         try:
             status = self._file.stat()
         except OSError:

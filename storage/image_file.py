@@ -143,7 +143,7 @@ def image_size(data: bytes) -> tuple[int, int]:
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
-    """Of the first frame that a JPEG begins; the segments before it are skipped."""
+    """The size of the first frame that a JPEG begins; the segments before it are skipped."""
     at = 2
     for _ in range(MAX_SEGMENTS):
         if at + 9 > len(data) or data[at] != 0xFF:

@@ -115,7 +115,7 @@ class PostgresAddress:
         return PostgresAddress(parameters, f"{SCHEME}{','.join(places)}/{parameters.get('dbname', '')}")
 
     def conninfo(self, name: str, writes: bool) -> str:
-        """For libpq.
+        """The address for libpq.
 
         Args:
             name: of the session, as PostgreSQL's lists show it.
@@ -175,7 +175,7 @@ class PostgresSession:
 
     @property
     def machine(self) -> str:
-        """For libpq: the one of the address's hosts that it is connected to; empty if it is to none.
+        """The one of the address's hosts, for libpq, that it is connected to; empty if it is to none.
 
         From any thread.
         """

@@ -110,7 +110,7 @@ class PostgresServer:
             os.kill(process, signal.SIGCONT)
 
     def kill(self) -> None:
-        """As a loss of power ends it: with every session."""
+        """End it as a loss of power does: with every session."""
         self.process.send_signal(signal.SIGSTOP)
         sessions = [os.pidfd_open(child) for child in self._children()]
         self.process.kill()
@@ -129,7 +129,7 @@ class PostgresServer:
             self.process.wait(60)
 
     def address(self, database: str = "postgres") -> str:
-        """Of a database."""
+        """The address of a database."""
         return f"postgresql://{ROLE}@/{database}?host={self.folder}"
 
     def database(self) -> str:

@@ -110,7 +110,7 @@ def _robot(keys: Keys, name: str) -> list[_Rule]:
 
 
 def _writes(patterns: list[str]) -> list[_Rule]:
-    """To publish, be alive and answer under these keys, and to be asked there."""
+    """Rules to publish, be alive and answer under these keys, and to be asked there."""
     return [
         ("ingress", ("put", "liveliness_token", "declare_queryable", "reply"), patterns),
         ("egress", ("query", "declare_subscriber", *WATCHES), patterns),
@@ -118,7 +118,7 @@ def _writes(patterns: list[str]) -> list[_Rule]:
 
 
 def _reads(patterns: list[str]) -> list[_Rule]:
-    """To hear what is published and who is alive under these keys."""
+    """Rules to hear what is published and who is alive under these keys."""
     return [
         ("ingress", ("declare_subscriber", *WATCHES), patterns),
         ("egress", ("put", "liveliness_token"), patterns),
@@ -126,5 +126,5 @@ def _reads(patterns: list[str]) -> list[_Rule]:
 
 
 def _asks(patterns: list[str]) -> list[_Rule]:
-    """To ask, and to get the answers."""
+    """Rules to ask, and to get the answers."""
     return [("ingress", ("query",), patterns), ("egress", ("reply", "declare_queryable"), patterns)]

@@ -286,7 +286,7 @@ def questions_to_robot(key: str) -> str:
 
 
 def robot_of(key: str) -> str:
-    """In whose name a message or a question comes: a robot's, or a person's with a key; else empty."""
+    """The name in which a message or a question comes: a robot's, or a person's with a key; else empty."""
     return _robot_in(key) if len(key) <= MAX_KEY else _robot_in.__wrapped__(key)
 
 

@@ -102,7 +102,7 @@ def _depth_columns() -> tuple[Column, Column]:
 
 @cache
 def _written_columns() -> tuple[Frequencies, Frequencies, Frequencies]:
-    """Of codes, shares and cells."""
+    """The columns of codes, shares and cells."""
     shares, cells = _depth_columns()
     return Frequencies.of(_code_columns()), Frequencies.of([shares]), Frequencies.of([cells])
 

@@ -73,7 +73,7 @@ class Numbers(NamedTuple):
 
     @staticmethod
     def zeros(count: int) -> Numbers:
-        """Of so many landmarks."""
+        """Zeros for so many landmarks."""
         x, y, share, depth = np.zeros((4, count), np.int64)
         return Numbers(x, y, share, depth, np.zeros((count, CODE_BYTES), np.uint8))
 
@@ -116,7 +116,7 @@ def alphabets() -> Alphabets:
 
 @cache
 def _columns() -> tuple[Columns, Columns, Columns]:
-    """Of codes, shares and cells."""
+    """The columns of codes, shares and cells."""
     tables = landmark_tables()
     codes, shares, cells = tables.codes, tables.shares[None], tables.cells[None]
     return tuple(Columns.of([Column(of) for of in part]) for part in (codes, shares, cells))  # type: ignore[return-value]

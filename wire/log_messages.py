@@ -79,7 +79,7 @@ class LogMessage(msgspec.Struct, frozen=True, omit_defaults=True):
     limit: ClassVar[Limit] = Limit("message", MAX_SMALL_BYTES)
 
     def encode(self) -> bytes:
-        """As bytes."""
+        """The message as bytes."""
         return pack(msgspec.to_builtins(self, builtin_types=(bytes,)))
 
     @classmethod
@@ -135,7 +135,7 @@ class Ack(LogMessage, frozen=True):
     status_period: Annotated[float, Meta(ge=0.0, le=LONGEST_STATUS_PERIOD)] = field(name="p", default=0.0)
 
     def encode(self) -> bytes:
-        """With the newest refusals and the beginning of their reasons."""
+        """The message as bytes, with the newest refusals and the beginning of their reasons."""
         newest = self.refusals[-MAX_REFUSALS:]
         brief = tuple(Refusal(refusal.sequence, refusal.reason[:MAX_REASON]) for refusal in newest)
         return LogMessage.encode(msgspec.structs.replace(self, refusals=brief))

@@ -59,13 +59,13 @@ class MemoryHub:
     def disturb(
         self, faults: MessageFaults, random: np.random.Generator, bus: MemoryBus | None = None
     ) -> None:
-        """From now on disturb messages, with the given random numbers: of one bus, or of all."""
+        """Disturb messages from now on, with the given random numbers: of one bus, or of all."""
         with self._lock:
             self._faults[bus] = faults
             self._random = random
 
     def calm(self, bus: MemoryBus | None = None) -> None:
-        """From now on deliver messages of one bus, or of all; those held back arrive, oldest last."""
+        """Deliver messages of one bus, or of all, from now on; those held back arrive, oldest last."""
         with self._lock:
             if bus is None:
                 self._faults.clear()

@@ -89,7 +89,7 @@ class Refusals:
                 del self._since[reason]
 
     def wait(self) -> float | None:
-        """For how long there is nothing to flush, s; None: until the next is refused."""
+        """How long there is nothing to flush, s; None: until the next is refused."""
         if not self._since:
             return None
         return max(0.0, min(since for since, _ in self._since.values()) + EVERY - self._clock())

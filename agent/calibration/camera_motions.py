@@ -62,7 +62,7 @@ class WheelTrack:
 
     @cached_property
     def _integrals(self) -> tuple[Array, Array, Array]:
-        """Of ways and turns: what was counted, and its integral, (2, K) each; its rate, (2, K - 1)."""
+        """Counted ways and turns, and their integrals, (2, K) each; its rate, (2, K - 1)."""
         counted, steps = np.stack([self.way, self.turn]), self._steps
         areas = np.zeros_like(counted)
         np.cumsum(0.5 * (counted[:, 1:] + counted[:, :-1]) * steps, axis=1, out=areas[:, 1:])

@@ -28,7 +28,7 @@ class CountedWheels:
 
     @property
     def stamp(self) -> float:
-        """Of the last reading, s; minus infinity without one."""
+        """Time of the last reading, s; minus infinity without one."""
         return float(self._columns[0, self._count - 1]) if self._count else -math.inf
 
     @property

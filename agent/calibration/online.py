@@ -147,7 +147,7 @@ class OnlineCalibration:
 
     @property
     def geometry(self) -> DriveGeometry:
-        """In use."""
+        """The geometry in use."""
         return self._geometry
 
     @property

@@ -82,7 +82,7 @@ class ImagePair:
 
     @cached_property
     def floor_rows(self) -> tuple[Array, Array]:
-        """Of tracks and then of the floor: (3, N + K) rays, (2, N + K) coordinates in the second image."""
+        """Tracks, then the floor: (3, N + K) rays, (2, N + K) coordinates in the second image."""
         before = np.concatenate([self.before, self.floor.before])
         return _rays(before), np.concatenate([self.after, self.floor.after]).T.copy()
 

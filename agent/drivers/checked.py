@@ -76,7 +76,7 @@ class CheckedRobot:
 
     @property
     def waiting(self) -> float:
-        """For how long the driver's `sense` has not returned, s; 0 outside of it."""
+        """How long the driver's `sense` has not returned, s; 0 outside of it."""
         since = self._waiting_since
         return 0.0 if since is None else time.monotonic() - since
 
@@ -146,7 +146,7 @@ class CheckedRobot:
                 raise
 
     def _check_unit(self, stamp_ns: int) -> None:
-        """Of the first stamp alone: a clock since the start comes by such numbers later."""
+        """Check the unit of the first stamp alone: a clock since the start comes by such numbers later."""
         now = self._clock()
         for unit, in_a_second in UNITS.items():
             if abs(stamp_ns / in_a_second - now) < SKEW:
@@ -173,7 +173,7 @@ class CheckedRobot:
             )
 
     def _check_motion(self, odometry: Odometry, seconds: float) -> None:
-        """Of the first observations in which the robot has moved."""
+        """Check the first observations in which the robot has moved."""
         if self._moved >= FIRST or not (odometry.forward or odometry.turn):
             return
         self._moved += 1
@@ -192,7 +192,7 @@ class CheckedRobot:
 
 
 def _reduced(given: RobotDescription) -> RobotDescription:
-    """With the camera of reduced images; itself if these are not larger than agents work on."""
+    """The description for reduced images; itself if its images are not too large for agents."""
     camera = given.camera
     size = reduced_size(camera.width, camera.height)
     if size == (camera.width, camera.height):

@@ -56,5 +56,5 @@ class AdaptiveOdometryNoise:
         return np.diag(SLIP)
 
     def increase(self) -> None:
-        """From now on, for a while."""
+        """Use more noise from now on, for a while."""
         self._steps_left = DISTRUST

@@ -120,7 +120,7 @@ def examine(
 def turn_by_image(
     rays: Array, slots: NDArray[np.intp], slopes: Array, wheel_root: Array, most: float
 ) -> float:
-    """By how much the robot has turned further than its wheels measured, rad, by the landmarks in the image.
+    """How much the robot has turned further than its wheels measured, rad, by the landmarks in the image.
 
     The image shows a turn as da = (1 + a^2) du2, the same for near and far landmarks. The estimate is the
     mean of the middle half, so that a quarter may be wrong on either side, and its error follows from the

@@ -34,7 +34,7 @@ class LandmarkEstimates(NamedTuple):
 
     @staticmethod
     def of_rays(ids: Ids, rays: Array, covariances: Array, camera: Camera) -> LandmarkEstimates:
-        """Of rays (N, 3) [a, b, w 1/m] in the camera and their covariances (N, 3, 3)."""
+        """Make them of rays (N, 3) [a, b, w 1/m] in the camera and their covariances (N, 3, 3)."""
         w = rays[:, 2]
         finite = w > 0.0
         depths = np.where(finite, 1.0 / np.where(finite, w, 1.0), np.inf)

@@ -38,7 +38,7 @@ class MappingState:
 
     @staticmethod
     def at_anchor() -> MappingState:
-        """At the anchor with certainty (the paper's P_0^r = 0), without landmarks."""
+        """The state at the anchor with certainty (the paper's P_0^r = 0), without landmarks."""
         return MappingState(np.zeros(3), np.zeros((0, 3)), np.zeros((3, 3)))
 
     @cached_property

@@ -32,7 +32,7 @@ class Pinhole:
     """
 
     def __init__(self, camera: Camera) -> None:
-        """Of its intrinsics."""
+        """Make the model of a camera by its intrinsics."""
         self.focal = np.array([camera.fx, camera.fy])
         self.centre = np.array([camera.cx, camera.cy])
 

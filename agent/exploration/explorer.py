@@ -89,7 +89,7 @@ class Explorer:
 
     @property
     def questions(self) -> list[Question]:
-        """For the fleet's map, of this tick."""
+        """Questions of this tick for the fleet's map."""
         return self._questions
 
     @property

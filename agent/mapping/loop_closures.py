@@ -36,7 +36,7 @@ class LoopClosures:
         self._rng = np.random.default_rng(0)
 
     def edges(self, node: Node) -> list[Edge]:
-        """From each earlier place that a node shows."""
+        """The edges from each earlier place that a node shows."""
         found = [self.edge(earlier, node) for earlier in self.nearby(node, None)]
         return [edge for edge in found if edge is not None]
 
@@ -57,7 +57,7 @@ class LoopClosures:
         return [candidate for _, candidate in sorted(nearby, key=lambda pair: pair[0])[:LOOP_TRIES]]
 
     def edge(self, earlier: Node, node: Node) -> Edge | None:
-        """From an earlier place to a node that shows it; None if it does not."""
+        """The edge from an earlier place to a node that shows it; None if it does not."""
         recognition = register(earlier, node, None, self._rng)
         if recognition is None or recognition.evidence["sigma_xy"] >= LOOP_SIGMA:
             return None

@@ -40,7 +40,7 @@ Released = Callable[[NodeId, NodeId], bool]
 
 
 def alone(node: NodeId, successor: NodeId) -> bool:
-    """Of a robot that shares its map with no fleet."""
+    """The retirement of a robot that shares its map with no fleet."""
     return True
 
 

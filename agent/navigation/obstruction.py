@@ -75,6 +75,6 @@ def obstruction(
 
 
 def _obstacle(fix: Fix, x: float, y: float, reach: float, robot: str = "") -> Obstacle:
-    """At a position in the robot's frame."""
+    """The obstacle at a position in the robot's frame."""
     at = fix.node_from_robot.mean @ Pose2(x, y)
     return Obstacle(fix.node, at.x, at.y, reach, robot)

@@ -255,7 +255,9 @@ class RouteFollower:
         return self._servo_barred == 0.0
 
     def _confirm(self, state: State, observation: Observation) -> None:
-        """At the goal detect it again: tracks have drifted a little on the way, all in the same direction.
+        """Detect the goal again on arrival.
+
+        Tracks have drifted a little on the way, all in the same direction.
 
         A view from the node's own pose shows its features at their own scale, so in most places this is the
         most precise measurement of the pose. Several are averaged, and joined with what the tracks say: where

@@ -227,7 +227,7 @@ def files_of(path: Path) -> list[Path]:
 
 
 def _numbered(path: Path) -> tuple[int, str]:
-    """For sorting: walk_10 comes after walk_9."""
+    """A key for sorting: walk_10 comes after walk_9."""
     return len(path.name), path.name
 
 

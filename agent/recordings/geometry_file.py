@@ -91,5 +91,5 @@ def write_geometry(path: Path, geometry: DriveGeometry, notes: Mapping[str, str]
 
 
 def _scale(key: str) -> float:
-    """Of a value in the file, to SI."""
+    """The scale of a value in the file, to SI."""
     return math.radians(1.0) if "deg" in key else 1.0

@@ -272,7 +272,7 @@ class _Part:
 
 
 class _KeptOpen:
-    """In place of the storage of a bag that stays open."""
+    """Stands in for the storage of a bag that stays open."""
 
     def __init__(self, path: Path) -> None:
         self.path = path

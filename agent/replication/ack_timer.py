@@ -29,7 +29,7 @@ class AckTimer:
 
     @property
     def timeout(self) -> float:
-        """From sending to when the acknowledgement is overdue."""
+        """Time from sending to when the acknowledgement is overdue."""
         if self._mean is None:
             return self._least
         return min(max(self._mean + DEVIATIONS * self._deviation, self._least), self._most)

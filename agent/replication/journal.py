@@ -79,7 +79,7 @@ class Draft:
 
 
 def checksum(key: Sequence[object], encoded: bytes) -> int:
-    """Of a row of `change`: of its body in the lower 32 bits, of what precedes that in the 31 above."""
+    """Checksum of a row of `change`: its body in the lower 32 bits, what precedes it in the 31 above."""
     return _of_key(key) << 32 | zlib.crc32(encoded)
 
 

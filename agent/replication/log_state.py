@@ -36,7 +36,7 @@ class LogState:
 
     @staticmethod
     def of(journal: Journal, map_id: MapId) -> LogState:
-        """As the journal has it; raises InvalidValue if the map was never opened."""
+        """The state as the journal has it; raises InvalidValue if the map was never opened."""
         return LogState(map_id, journal.log_id(map_id), journal.head(map_id), journal.acknowledged(map_id))
 
     def settled(self, servers: Sequence[str]) -> int:

@@ -79,7 +79,7 @@ first: the beacons of a fleet that a server cannot keep up with must not hold it
 
 @dataclass(frozen=True, slots=True)
 class _Retirement:
-    """Of nodes of a map that was left."""
+    """The retirement of nodes of a map that was left."""
 
     map: MapId
     drafts: Sequence[Draft]

@@ -104,7 +104,7 @@ class _Ballot:
 
     @property
     def share(self) -> float:
-        """Of the pairs that agree with it; 0 if none was."""
+        """The share of the pairs that agree with it; 0 if none was."""
         return len(self._votes[self.found]) / self.count if self.found is not None else 0.0
 
     @property
@@ -210,7 +210,7 @@ class OdometryConvention:
             self._agreement.add(self._stamp_ns, self._turn, motion.turn, sideways)
 
     def _depth_to_floor(self, before: NDArray[np.uint8], now: NDArray[np.uint8]) -> float:
-        """Of what is seen below the horizon, by the odometry; 0 if it is not seen."""
+        """Depth of what is seen below the horizon, by the odometry; 0 if it is not seen."""
         camera, scale = self._camera, before.shape[1] / self._camera.width
         lowest = (camera.height - camera.cy) / camera.fy
         row = math.ceil((camera.cy + SLOPE * camera.fy) * scale)

@@ -112,7 +112,7 @@ class TurnAgreement:
 
 
 def correlation(reported: Array, seen: Array) -> float:
-    """Of (N,) turns by odometry and by image, rad, NaN where one is unknown; 0 if one says too little."""
+    """Correlation of (N,) turns by odometry and image, rad, NaN where unknown; 0 if one says too little."""
     known = np.isfinite(reported) & np.isfinite(seen)
     reported, seen = reported[known], seen[known]
     turned = [np.abs(turns) >= TURNED for turns in (reported, seen)]

@@ -105,7 +105,7 @@ class FieldOfView:
         return np.stack([self.slack(np.stack([x, y, np.full_like(x, h)], axis=-1)) for h in headings])
 
     def spread(self, most: int) -> FieldOfView:
-        """At most `most` of the landmarks, evenly over the bearings at the goal: a stricter, faster field."""
+        """A stricter, faster field: at most `most` landmarks, evenly over the bearings at the goal."""
         if self.count <= most:
             return self
         order = np.argsort(np.arctan2(self.points[:, 1], self.points[:, 0]), kind="stable")

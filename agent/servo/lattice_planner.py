@@ -216,7 +216,7 @@ def _descend(
 
 
 def _thin(points: Array) -> Array:
-    """At most so many of a way's points: first its corners, then points between, evenly."""
+    """Keep at most so many of a way's points: first its corners, then points between, evenly."""
     moved = np.append(True, np.abs(np.diff(points, axis=0)).sum(axis=1) > 0)
     points = points[moved]
     if len(points) <= _MOST_POINTS:

@@ -59,7 +59,7 @@ def ranger_points(proximity: NDArray[Any], description: RobotDescription) -> Arr
 def _directions(
     bearings: tuple[float, ...], readings: int
 ) -> tuple[Array, NDArray[np.int64], NDArray[np.int64]]:
-    """Of as many rangers as there are readings: (K, 2) unit vectors, (K,) around the robot, (K,) the next."""
+    """Directions of K rangers: (K, 2) unit vectors, (K,) their order around the robot, (K,) the next."""
     angles = np.asarray(bearings[:readings], dtype=np.float64)
     order = np.argsort(angles, kind="stable")
     return np.stack([np.cos(angles), np.sin(angles)], axis=-1), order, np.roll(order, -1)

@@ -50,7 +50,7 @@ class TrackQuality:
         )
 
     def __str__(self) -> str:
-        """In one line."""
+        """The quality in one line."""
         text = f"{self.alive} tracks over {100 * self.coverage:.0f} % of the image"
         if self.alive:
             text += f", {self.age_median:.0f} images old in the median"

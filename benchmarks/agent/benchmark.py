@@ -148,7 +148,7 @@ def main() -> None:
 
 
 def rounded(figures: dict[str, float | Figures]) -> dict[str, float | Figures]:
-    """With four digits."""
+    """The value with four digits."""
     return {
         name: {key: float(f"{one:.4g}") for key, one in value.items()}
         if isinstance(value, dict)

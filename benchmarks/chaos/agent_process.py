@@ -98,7 +98,7 @@ class NotedJournal(Journal):
 
 
 def digest(bodies: Sequence[ChangeBody]) -> str:
-    """Of the changes of a step."""
+    """The digest of the changes of a step."""
     return hashlib.sha256(b"".join(map(encode_body, bodies))).hexdigest()[:16]
 
 

@@ -80,7 +80,7 @@ class FleetProcesses:
 
     @property
     def endpoints(self) -> tuple[str, ...]:
-        """Of the routers themselves."""
+        """The endpoints of the routers themselves."""
         return tuple(self._endpoint(name) for name in ROUTERS)
 
     def store_of(self, server: str) -> str:
@@ -176,7 +176,7 @@ class FleetProcesses:
             (link.cut if cut else link.restore)()
 
     def end_disturbance(self, kind: Kind, target: str) -> None:
-        """As it was before."""
+        """Restore what was before."""
         match kind:
             case Kind.KILL | Kind.LOSE_STORE:
                 self.start(target)

@@ -57,7 +57,7 @@ class RobotTimes:
 def recoveries(
     robots: Sequence[RobotTimes], servers: Sequence[str], done: Sequence[tuple[float, Kind, str]]
 ) -> list[float]:
-    """From the end of each disturbance until every server has all that every robot had committed by then, s.
+    """Times, s, from the end of each disturbance until every server has all that was committed by then.
 
     What else happens meanwhile counts: a second server that is killed before the first has caught up makes
     both recoveries longer.

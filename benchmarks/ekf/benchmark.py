@@ -144,7 +144,7 @@ def main() -> None:
 
 
 def _rounded(value: float | list[float]) -> float | list[float] | None:
-    """For JSON, which has no NaN: a figure of no starts is null."""
+    """The value for JSON, which has no NaN: a figure of no starts is null."""
     if isinstance(value, list):
         return [float(f"{part:.5g}") for part in value]
     return None if math.isnan(value) else float(f"{value:.5g}")

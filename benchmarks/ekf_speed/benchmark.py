@@ -66,7 +66,7 @@ class Racer(Protocol):
     """A filter at the pace of the race."""
 
     def rules(self) -> contextlib.AbstractContextManager[None]:
-        """By which it steps."""
+        """The rules by which it steps."""
 
     def step(self, odometry: Odometry, pixels: Array) -> None:
         """Predict and update."""

@@ -177,7 +177,7 @@ def figures(done: dict[str, dict[int, Exploration]], minutes: float, seed: int) 
 
 
 def table(result: dict[str, Any]) -> Table:
-    """For people."""
+    """A table for people."""
     shown = Table(
         title=f"office of {result['floor_m2']:.0f} m2, {result['minutes']:g} minutes, seed {result['seed']}"
     )

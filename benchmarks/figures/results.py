@@ -77,7 +77,7 @@ def run(command: str, data: Path | None) -> StoredResult:
 
 
 def _processor_s() -> float:
-    """Of all processes that this one has started and waited for."""
+    """Processor time of all processes that this one has started and waited for."""
     usage = resource.getrusage(resource.RUSAGE_CHILDREN)
     return usage.ru_utime + usage.ru_stime
 

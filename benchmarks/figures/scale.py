@@ -69,7 +69,7 @@ class Costs:
 
     @staticmethod
     def of(results: Mapping[str, StoredResult]) -> Costs:
-        """Of stored results."""
+        """The costs by stored results."""
         merge, answers = results["merge_scale"].figures["scale"], results["relocalize"].figures
         explored = results["explore"].figures
         floor = explored["area_per_minute_ours"]["1"] * explored["minutes"]
@@ -128,7 +128,7 @@ class ScalePlan:
 
     @staticmethod
     def of(costs: Costs) -> ScalePlan:
-        """By the costs."""
+        """The plan by the costs."""
         robots = ROBOTS / SITES
         rate, first = robots * MAPPING / NODE_EVERY, robots / NODE_EVERY
         nodes = AREA * costs.nodes_per_m2 * costs.growth

@@ -84,7 +84,7 @@ def fit(seen: Seen) -> Array:
 
 
 def reliability(seen: Seen, weights: Array) -> list[dict[str, float]]:
-    """In each bin of predicted probability: count, mean prediction, share that is right."""
+    """For each bin of predicted probability: count, mean prediction, share that is right."""
     predicted = np.array([p for supports, _ in seen for p in probabilities(supports, weights.tolist())])
     true = np.array([there for _, right in seen for there in right], dtype=np.float64)
     rows = []

@@ -141,7 +141,7 @@ class AgentLink:
         return len(self.journal.noted) < len(self.submitted)
 
     def latencies(self, begin: float, end: float) -> list[float]:
-        """From handing over to the noted acknowledgement, s, of what was handed over then; inf without."""
+        """Times, s, from handing over to the noted acknowledgement; inf without one."""
         noted = [*self.journal.noted, *[float("inf")] * len(self.submitted)]
         return [b - a for a, b in zip(self.submitted, noted, strict=False) if begin <= a < end]
 

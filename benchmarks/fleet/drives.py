@@ -48,5 +48,5 @@ def drive(robot: int, stops: int, seed: int) -> RobotTour:
 
 
 def name_of(robot: int) -> str:
-    """Of the agent."""
+    """The name of an agent."""
     return f"r{robot}"

@@ -72,7 +72,7 @@ def _nodes(request: ShardRequest) -> list[Node]:
 
 @cache
 def cluster_messages() -> ClusterMessages:
-    """Of a room that was mapped twice."""
+    """Messages about a room that was mapped twice."""
     # Not before it is needed: it makes more than this.
     from benchmarks.fuzz.samples import Samples
 

@@ -168,7 +168,7 @@ def _matched(tallies: dict[str, KeptMatches], source: str) -> bool:
 
 
 def show(result: dict[str, Any], console: Console) -> None:
-    """For people."""
+    """Show the figures to people."""
     ways = Table("kept as", "bytes a view", "right matches", "pairs matched", "precision")
     for name, one in result["ways"].items():
         ways.add_row(

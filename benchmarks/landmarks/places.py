@@ -61,7 +61,7 @@ class SimulatedPlace:
 
     @property
     def description(self) -> RobotDescription:
-        """Of a robot with this camera, whose features come without distortion."""
+        """The description of a robot with this camera, whose features come without distortion."""
         return RobotDescription(self.camera)
 
     def nearby(self, rng: np.random.Generator) -> Pose2:

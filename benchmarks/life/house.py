@@ -37,7 +37,7 @@ class TwoRooms(World):
 
     @staticmethod
     def built(rng: np.random.Generator) -> TwoRooms:
-        """With furniture where it is at first."""
+        """The house with furniture where it is at first."""
         both = [room(*place, LANDMARKS, rng) for place in ROOMS]
         whole = both[0] + both[1]
         return TwoRooms(whole.points, whole.normals, whole.vectors, np.repeat([0, 1], LANDMARKS))

@@ -167,7 +167,7 @@ def _landmark_figures(run: MappingDrive) -> dict[str, float]:
 
 
 def _track_figures(run: MappingDrive, away: Array) -> dict[str, float]:
-    """Of all tracks: how long they lived, and how far they were from where they should be."""
+    """Figures of all tracks: how long they lived, and how far they were from where they should be."""
     alive = np.concatenate([m.ids for m in run.moments])
     lengths = np.unique(alive, return_counts=True)[1]
     off = [np.linalg.norm(reprojection_errors(run, m), axis=1) for m in run.moments]

@@ -41,7 +41,7 @@ Figures = dict[str, float]
 
 
 def scale(sizes: Sequence[int], seed: int, progress: Progress) -> dict[str, dict[str, float]]:
-    """By figure, then by the number of nodes. See `at_size`.
+    """Figures by name, then by the number of nodes. See `at_size`.
 
     Raises:
         InvalidValue: a size that cannot be drawn.

@@ -205,7 +205,7 @@ def measure(
 
 
 def table(found: dict[str, Any]) -> Table:
-    """For people."""
+    """A table for people."""
     names = list(found["runs"])
     shown = Table("", *names, title=f"merging in the simulator, seed {found['seed']}")
     for figure in ("runs", *figures([])):

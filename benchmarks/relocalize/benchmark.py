@@ -118,7 +118,7 @@ def measured(bench: Bench, size: int, peer: bool, ceilings: list[str]) -> dict[s
 
 
 def table(sizes: dict[str, dict[str, Any]]) -> Table:
-    """For people."""
+    """A table for people."""
     out, first = Table("figure", *sizes, title="nodes"), next(iter(sizes.values()))
     for name, value in first.items():
         if not isinstance(value, dict):

@@ -113,7 +113,7 @@ def gather(count: int, places: Sequence[TruePlace], seed: int, progress: Progres
 
 
 def differences(places: Sequence[TruePlace], seed: int, pairs: int = 200) -> Differences:
-    """Of landmarks that two nodes share, by matches that the geometry confirms."""
+    """Differences of landmarks that two nodes share, by matches that the geometry confirms."""
     rng = np.random.default_rng([seed, 0xD1F])
     found, whole = list[NDArray[np.float32]](), list[NDArray[np.int16]]()
     for k in rng.permutation(len(places))[: 4 * pairs].tolist():

@@ -49,7 +49,7 @@ class Exhaustive:
         self._settings = RecognitionSettings()
 
     def answers(self, queries: Sequence[Query], progress: Callable[[], None]) -> list[RelocalizeAnswer]:
-        """As a relocalizer answers; progress is called once a node, then once a query."""
+        """Answers as a relocalizer gives them; progress is called once a node, then once a query."""
         roots = [root_sift(query.picture.sift) for query in queries]
         counts = self.may_match(roots, progress)
         answers = []

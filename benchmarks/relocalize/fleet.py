@@ -52,7 +52,7 @@ class Bench:
 
     @cached_property
     def vocabulary(self) -> Vocabulary:
-        """Of the bag of words, learned from the real places."""
+        """The vocabulary of the bag of words, learned from the real places."""
         return Vocabulary(np.concatenate([decode(p.node.landmarks.codes) for p in self.places]), self.seed)
 
     @contextmanager

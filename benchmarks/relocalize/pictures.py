@@ -68,7 +68,7 @@ class RenderedPicture:
 
     @cached_property
     def view(self) -> View:
-        """As a robot would ask."""
+        """The view with which a robot would ask."""
         return View(self.pixels, encode(self.sift), self.camera)
 
 

@@ -58,7 +58,7 @@ class Site:
 
     @property
     def name(self) -> str:
-        """For example `office-7`."""
+        """The place's name, for example `office-7`."""
         return f"{self.kind}-{self.seed}"
 
     @cached_property

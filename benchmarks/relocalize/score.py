@@ -111,7 +111,7 @@ def errors(query: Query, place: TruePlace | None, node_from_robot: PoseGaussian)
 
 
 def share(replies: Sequence[ScoredAnswer], what: Callable[[ScoredAnswer], bool]) -> float:
-    """Of replies, NaN of none."""
+    """The share of replies, NaN of none."""
     return round(sum(map(what, replies)) / len(replies), 4) if replies else math.nan
 
 

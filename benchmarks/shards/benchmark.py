@@ -229,7 +229,7 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
 
 
 def table(rows: dict[str, dict[str, Any]]) -> Table:
-    """For people."""
+    """A table for people."""
     out = Table("figure", *rows)
     for name in dict.fromkeys(name for row in rows.values() for name in row):
         out.add_row(name, *(str(row.get(name, "")) for row in rows.values()))

@@ -112,7 +112,7 @@ class RayNodes:
 
 
 def descendants(pid: int) -> Iterator[int]:
-    """Of a process, by /proc."""
+    """The descendants of a process, by /proc."""
     children: dict[int, list[int]] = {}
     for entry in Path("/proc").iterdir():
         if entry.name.isdigit():

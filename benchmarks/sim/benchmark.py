@@ -179,7 +179,7 @@ def measure(robots: list[int], seconds: float, seed: int, quiet: bool) -> dict[s
 
 
 def table(result: dict[str, Any]) -> Table:
-    """For people."""
+    """A table for people."""
     shown = Table(title=f"a fleet in an office, seed {result['seed']}")
     for title in ("robots", "x real time", "in one process", *(f"{part} %" for part in (*PARTS, "rest"))):
         shown.add_column(title, justify="right")

@@ -34,7 +34,7 @@ class Cluster:
 
     @property
     def status(self) -> str:
-        """For people, for example `4 of 4 shards`; empty without a cluster."""
+        """The state for people, for example `4 of 4 shards`; empty without a cluster."""
         return "" if self.index is None else self.index.status
 
     def start(self) -> None:

@@ -32,12 +32,12 @@ class GatewayRequest(NamedTuple):
     message: bytes
 
     def packed(self) -> bytes:
-        """As bytes."""
+        """The frame as bytes."""
         return REQUEST.pack(self.number, self.target) + self.message
 
     @staticmethod
     def read(data: bytes) -> GatewayRequest:
-        """Of bytes.
+        """Read a frame of bytes.
 
         Raises:
             InvalidMessage: they are too few.
@@ -60,13 +60,13 @@ class GatewayReply(NamedTuple):
     words: str = ""
 
     def packed(self) -> bytes:
-        """As bytes; of long words the first ones."""
+        """The frame as bytes; of long words the first ones."""
         tail = self.words[:MOST_WORDS].encode(errors="replace") if self.words else self.message
         return REPLY.pack(self.number, bool(self.words)) + tail
 
     @staticmethod
     def read(data: bytes) -> GatewayReply:
-        """Of bytes.
+        """Read a frame of bytes.
 
         Raises:
             InvalidMessage: they are too few.

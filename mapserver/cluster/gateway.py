@@ -100,7 +100,7 @@ class Gateway:
         return answer
 
     def _keep(self) -> None:
-        """In a thread of its own: run the child, and again when it has ended."""
+        """Keep the child, in a thread of its own: run the child, and again when it has ended."""
         pause = FIRST_PAUSE
         while not self._closing.is_set():
             began = time.monotonic()
@@ -193,7 +193,7 @@ def _received(connection: Connection) -> GatewayReply:
 
 
 def _write(child: _Child) -> None:
-    """In a thread of its own, so that no thread of the server waits for a child that does not read."""
+    """Write in a thread of its own: no thread of the server waits for a child that does not read."""
     try:
         while (item := child.outbox.get()) is not None:
             child.connection.send_bytes(item.packed())

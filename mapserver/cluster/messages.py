@@ -74,7 +74,7 @@ class Ids:
 
     @staticmethod
     def of(nodes: Iterable[NodeId]) -> Ids:
-        """Of nodes."""
+        """Make it of nodes."""
         maps: dict[tuple[str, int], int] = {}
         rows = [(maps.setdefault(node[:2], len(maps)), node[2]) for node in nodes]
         return Ids(tuple(MapId(*map_id) for map_id in maps), np.array(rows, np.int64).reshape(-1, 2))
@@ -117,7 +117,7 @@ class ComparedNodes:
 
     @staticmethod
     def of(nodes: Sequence[Node]) -> ComparedNodes:
-        """Of nodes."""
+        """Make it of nodes."""
         cameras = {camera: k for k, camera in enumerate(dict.fromkeys(node.camera for node in nodes))}
         parts = [Landmarks.empty(), *(bounded(node).landmarks for node in nodes)]
         return ComparedNodes(
@@ -273,7 +273,7 @@ class Comparison:
 
     @staticmethod
     def of(pairs: Pairs) -> Comparison:
-        """Of pairs of nodes."""
+        """Make it of pairs of nodes."""
         nodes = {node.id: node for pair in pairs for node in pair}
         row = {node_id: k for k, node_id in enumerate(nodes)}
         rows = np.array([[row[a.id], row[b.id]] for a, b in pairs], np.int64).reshape(-1, 2)
@@ -320,7 +320,7 @@ class ComparisonAnswer:
 
     @staticmethod
     def of(verdicts: Iterable[Verdict]) -> ComparisonAnswer:
-        """Of what `mapweave.mapserver.merging.node_comparisons.compare` gives."""
+        """Make it of what `mapweave.mapserver.merging.node_comparisons.compare` gives."""
         return ComparisonAnswer(tuple(map(_sent, verdicts)))
 
     def verdicts_on(self, pairs: Pairs) -> list[Verdict]:

@@ -219,7 +219,7 @@ class ShardLink:
         log.warning("shard %s is lost (%s): answers are partial until it is back", self.name, _words(error))
 
     def _keep(self) -> None:
-        """In a thread of its own: have the shard back whenever it is lost."""
+        """Keep the shard, in a thread of its own: have the shard back whenever it is lost."""
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: not self._current or self._closing)

@@ -61,7 +61,7 @@ class ShardedIndex:
 
     @property
     def status(self) -> str:
-        """For people, for example `4 of 4 shards`."""
+        """The state for people, for example `4 of 4 shards`."""
         current = sum(link.current for link in self._links)
         words = f"{current} of {len(self._links)} shards"
         helped = sum(link.answers and not link.current for link in self._links)

@@ -61,7 +61,7 @@ def _pose(pose: PoseGaussian) -> dict[str, Any]:
 
 
 def _node(node: Node) -> dict[str, Any]:
-    """With what is needed to draw it: the size of its image and where in it the landmarks are, px."""
+    """A node with what is needed to draw it: the size of its image and where in it the landmarks are, px."""
     pixels = np.round(node.landmarks.pixels.astype(float), 1)
     return {
         "id": str(node.id),

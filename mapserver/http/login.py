@@ -231,7 +231,7 @@ def _unauthorized(words: str) -> HTTPException:
 
 
 def address_of(connection: HTTPConnection) -> str:
-    """Of the client, or, behind a proxy on this machine, of the one for which that asks."""
+    """The address of the client, or, behind a proxy on this machine, of the one for which that asks."""
     return "" if connection.client is None else connection.client.host[:64]
 
 

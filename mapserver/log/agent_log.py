@@ -84,7 +84,7 @@ class AgentLog:
             self._announced = deque([*((later, began) for (_, began), (later, _) in pairs), last])
 
     def lag(self, now: float) -> float:
-        """For how long a change is known of that is not settled, s; 0 if all are.
+        """How long a change is known of that is not settled, s; 0 if all are.
 
         Never less than it is, and at most a few percent more.
         """

@@ -97,5 +97,5 @@ class Traffic:
 
     @property
     def payload_bytes(self) -> int:
-        """In all of these."""
+        """Bytes of payload in all of these."""
         return self.node_bytes + self.edge_bytes

@@ -68,7 +68,7 @@ class Gap(NamedTuple):
 
 
 def checksum(values: Sequence[object]) -> int:
-    """Of the columns of a row."""
+    """The checksum of the columns of a row."""
     *head, last = values
     crc = zlib.crc32("\0".join(map(str, head)).encode("utf-8", "replace"))
     return zlib.crc32(last if isinstance(last, bytes) else str(last).encode("utf-8", "replace"), crc)

@@ -26,7 +26,7 @@ MOST_FOUND = 100_000
 
 @dataclass
 class _Kept:
-    """Of one map.
+    """What is kept of one map.
 
     Attributes:
         bytes: that are kept; changes that were refused count with all of their message until it is compacted.

@@ -67,6 +67,6 @@ class Puller:
         self._threads.shutdown(cancel_futures=True)
 
     def _pull(self, agent_log: AgentLog, asked: LogRequest) -> None:
-        """In a thread of its own, because an agent may be slow."""
+        """Pull changes, in a thread of its own, because an agent may be slow."""
         replies = self._bus.ask(self._keys.log(agent_log.map), asked.encode(), self._timeout)
         self._answered(Pulled(agent_log, asked, replies))

@@ -530,5 +530,5 @@ def _numbers(elements: Iterable[NodeId]) -> list[tuple[MapId, Sequence[int]]]:
 
 
 def fresh_id() -> int:
-    """For a store that is made now."""
+    """An id for a store that is made now."""
     return secrets.randbits(62) + 1

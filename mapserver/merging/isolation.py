@@ -15,7 +15,7 @@ T = TypeVar("T")
 
 @dataclass
 class _Failure:
-    """Of one map.
+    """The failure of one map.
 
     Attributes:
         reason: in words.

@@ -87,7 +87,7 @@ class CachedVerifications:
         return entry[1]
 
     def overlaps(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
-        """Of a node that it knows, with others that it knows."""
+        """Overlaps of a node that it knows, with others that it knows."""
         out = {}
         for candidate_id, value in self._overlaps.get(node.id, {}).items():
             candidate = node_of(candidate_id)
@@ -101,7 +101,7 @@ class CachedVerifications:
         return [(node_id, other) for other in others]
 
     def verdicts(self, node_of: Callable[[NodeId], Node | None]) -> Iterable[tuple[Pair, Verdict]]:
-        """On pairs of nodes that it knows."""
+        """Verdicts on pairs of nodes that it knows."""
         for pair, verdict in self._findings.verdicts.items():
             a, b = node_of(pair[0]), node_of(pair[1])
             if a is not None and b is not None and self.knows(a) and self.knows(b):

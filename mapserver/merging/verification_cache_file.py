@@ -112,7 +112,7 @@ def _read(parts: Iterator[NDArray[Any]]) -> VerificationCache:
 
 
 def _with_rows(results: Iterable[tuple[Pair, Any]], row: dict[NodeId, int]) -> list[tuple[Pair, Any]]:
-    """Of pairs of which both nodes are among those that are kept, in the order of ids."""
+    """The rows of pairs of which both nodes are among those that are kept, in the order of ids."""
     return sorted(((p, v) for p, v in results if p[0] in row and p[1] in row), key=lambda item: item[0])
 
 

@@ -252,5 +252,5 @@ class PlaceIndex:
 
 
 def _fingerprint(codes: NDArray[np.uint8]) -> Print:
-    """Of a node's (N, 32) codes."""
+    """The fingerprint of a node's (N, 32) codes."""
     return Print(hash(codes.tobytes()), len(codes))

@@ -49,7 +49,7 @@ class NearestLandmarks:
 
     @staticmethod
     def none(features: int, k: int) -> NearestLandmarks:
-        """Of so many features, where there are no landmarks."""
+        """The ranking of so many features, where there are no landmarks."""
         nowhere = np.full((features, k), -1)
         return NearestLandmarks(np.full((features, k), np.inf, np.float32), nowhere, ())
 

@@ -40,7 +40,7 @@ class HttpAccess:
 
     @property
     def url(self) -> str:
-        """For people: where all addresses are served, by a name that the certificate has."""
+        """The address for people: where all addresses are served, by a name that the certificate has."""
         host, port = self.address
         if self.logins is not None and host in ALL_ADDRESSES:
             host = _name_of(self.logins.hosts)

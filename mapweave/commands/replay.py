@@ -243,7 +243,7 @@ def _bus(network: NetworkSettings, name: str, offline: bool) -> tuple[ZenohBus |
 
 
 def name_of(arguments: argparse.Namespace) -> str:
-    """Of the robot in the fleet: as given, else that of its splits.toml, else the file's or folder's."""
+    """The robot's name in the fleet: as given, else that of its splits.toml, else the file's or folder's."""
     import re
 
     from mapweave.hybridmap.ids import check_name

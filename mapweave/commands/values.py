@@ -84,7 +84,7 @@ def remark(text: str) -> str:
 
 
 def note(text: str) -> str:
-    """For who takes a robot through a portal; likewise."""
+    """A note for who takes a robot through a portal; likewise."""
     if not text:
         return text
     from mapweave.hybridmap.portal import MOST_NOTE

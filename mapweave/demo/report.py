@@ -76,7 +76,7 @@ class Report:
 
     @staticmethod
     def of(trial: TrialResult) -> Report:
-        """Of a trial of the scenario `demo`."""
+        """The report on a trial of the scenario `demo`."""
         recording, figures = trial.recording, trial.figures
         report = Report(
             seed=recording.seed,
@@ -115,7 +115,7 @@ class Report:
         return report
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The report for JSON."""
         return asdict(self)
 
     def lines(self) -> list[tuple[str, str]]:

@@ -62,7 +62,7 @@ def first_wrong(findings: Sequence[Finding]) -> Finding | None:
 
 
 def report(findings: Sequence[Finding]) -> dict[str, Any]:
-    """For JSON."""
+    """The finding for JSON."""
     first = first_wrong(findings)
     return {
         "findings": [asdict(finding) for finding in findings],

@@ -30,7 +30,7 @@ class FoundPort:
 
     @property
     def line(self) -> str:
-        """For people."""
+        """The port in one line."""
         parts = [self.path, self.description, f"always at {self.stable}" if self.stable else ""]
         if not self.usable:
             parts.append("may not be opened: add your user to the group dialout and log in again")

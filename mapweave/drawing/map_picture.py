@@ -264,7 +264,7 @@ def _marks(picture: MapPicture) -> Array:
 
 
 def _height(picture: MapPicture) -> float:
-    """Of the figure, inches: as the map needs it, within reason."""
+    """The height of the figure, inches: as the map needs it, within reason."""
     left, right, bottom, top = bounds_of(picture)
     width, height = right - left, top - bottom
     legend = 0.25 * math.ceil((len(picture.starts) + 6) / 6)

@@ -152,7 +152,7 @@ class DriveMap:
         return error_m <= most_m and error_deg <= (most_deg if place.distance_known else math.degrees(TURN))
 
     def _error(self, place: Whereabouts, true: Pose2 | None) -> tuple[float, float]:
-        """Of the position, m, and of the heading, degrees; NaN without truth."""
+        """The error of the position, m, and of the heading, degrees; NaN without truth."""
         node = self._nodes.get(place.node)
         at_node = None if node is None else self._truth.robot_at(node.stamp_ns, node.camera)
         if true is None or at_node is None:

@@ -47,7 +47,7 @@ class RelocalizationEvaluation:
     trials: list[LostDrive]
 
     def report(self) -> dict[str, Any]:
-        """For `json.dumps`: figures of the first way at the top, those of the others under their names."""
+        """Figures of the first way at the top, those of the others under their names, for `json.dumps`."""
         names = list(self.verdicts)
         by_selection = {name: figures(self.verdicts[name]) for name in names[1:]}
         first = {**figures(self.verdicts[names[0]]), **trial_figures(self.trials)}

@@ -39,7 +39,7 @@ class MapPart:
 
     @cached_property
     def nodes(self) -> tuple[NodeId, ...]:
-        """In the order of ids."""
+        """The nodes in the order of ids."""
         return tuple(sorted(self.merged.components[self.component]))
 
     @cached_property
@@ -65,7 +65,7 @@ class MapPart:
 
     @cached_property
     def probabilities(self) -> dict[tuple[NodeId, NodeId], float]:
-        """Of the links."""
+        """The probabilities of the links."""
         return link_probabilities(self.merged)
 
     @property

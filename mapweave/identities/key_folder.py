@@ -90,7 +90,7 @@ class Identity:
 
     @property
     def state(self) -> str:
-        """In a word or two."""
+        """The state in a word or two."""
         if self.revoked:
             return f"revoked {self.revoked}"
         over = self.expires and time_of(self.expires) <= datetime.now(UTC)
@@ -420,7 +420,10 @@ class KeyFolder:
         self.catalogue = catalogue
 
     def _password_lines(self) -> list[str]:
-        """As the router reads them; from key files, which may have been moved, only if these are gone."""
+        """The router's lines of passwords.
+
+        From key files, which may have been moved, only if these are gone.
+        """
         if (self.path / PASSWORDS).exists():
             return self._read(PASSWORDS).splitlines()
         known = {one.name: self.path / f"{one.name}{SUFFIX}" for one in self.catalogue.identities}

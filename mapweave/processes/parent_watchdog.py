@@ -15,7 +15,7 @@ NAME = "MAPWEAVE_LIFELINE"
 
 
 def environment() -> Mapping[str, str]:
-    """Of a child that is started with a pipe as its stdin."""
+    """The environment of a child that is started with a pipe as its stdin."""
     return {**os.environ, NAME: "1"}
 
 

@@ -178,7 +178,7 @@ def _raised(pose: Pose2) -> Array:
 
 
 def _ellipsoids(points: Array, covariances: Array) -> rr.Ellipsoids3D:
-    """Of landmarks that are known well enough to be drawn."""
+    """Ellipsoids of landmarks that are known well enough to be drawn."""
     centres, half_sizes, axes = ellipsoids(points, covariances)
     turns = np.array([cv2.Rodrigues(matrix)[0].ravel() for matrix in axes]).reshape(-1, 3)
     angles = np.linalg.norm(turns, axis=1, keepdims=True)

@@ -38,7 +38,7 @@ class Expectation:
         return (self.least is None or value >= self.least) and (self.most is None or value <= self.most)
 
     def __str__(self) -> str:
-        """In words."""
+        """The expectation in words."""
         if self.equal is not None:
             return as_text(self.equal)
         if self.least is not None and self.most is not None:

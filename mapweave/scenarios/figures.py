@@ -147,7 +147,7 @@ class Figures:
     robots: Mapping[str, RobotFigures] = field(default_factory=dict)
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The figures for JSON."""
         table = asdict(self)
         # The key is an agent's name: to be found again by eye, whatever order the robots came in.
         table["robots"] = {name: table["robots"][name] for name in sorted(table["robots"])}

@@ -272,12 +272,12 @@ class FilmFrame:
 
 
 def _width(text: str, scale: float, weight: int = 1) -> int:
-    """Of a text, px."""
+    """The width of a text, px."""
     return int(cv2.getTextSize(text, FONT, scale, weight)[0][0])
 
 
 def _shortened(text: str, room: int, scale: float) -> str:
-    """As much of a text as there is room for, px; an ellipsis marks the rest."""
+    """So much of a text as there is room for, px; an ellipsis marks the rest."""
     if _width(text, scale) <= room:
         return text
     shorter = text[: int(len(text) * room / _width(text, scale))] if room > 0 else ""

@@ -64,7 +64,7 @@ class TrialStage:
         return _next(self.out / "mcap", robot) if self.mcap_log else None
 
     def agent_seed(self, robot: str) -> int:
-        """Of a robot's random choices."""
+        """The seed of a robot's random choices."""
         return self.seed * 16 + self.robots.index(robot)
 
 
@@ -83,7 +83,7 @@ class TrialFleet(Protocol):
 
     @property
     def keys(self) -> Keys:
-        """Of the fleet."""
+        """The keys of the fleet."""
 
     @property
     def control(self) -> SimControl:

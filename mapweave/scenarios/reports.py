@@ -78,7 +78,7 @@ class Reports:
         return None
 
     def agents(self, robots: Iterable[str]) -> dict[str, AgentStatus]:
-        """Of those that can be reached."""
+        """The agents that can be reached."""
         statuses = ((robot, self.agent(robot)) for robot in robots)
         return {robot: report for robot, report in statuses if report is not None}
 

@@ -69,7 +69,7 @@ class TrialResult:
     verdicts: tuple[ExpectationResult, ...]
 
     def as_dict(self) -> dict[str, Any]:
-        """For JSON."""
+        """The run for JSON."""
         return {
             "scenario": self.recording.scenario,
             "seed": self.recording.seed,

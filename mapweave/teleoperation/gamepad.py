@@ -54,7 +54,7 @@ class Gamepad:
             ) from None
 
     def fileno(self) -> int:
-        """For `select`."""
+        """The file descriptor for `select`."""
         return self._fd
 
     def read(self) -> None:

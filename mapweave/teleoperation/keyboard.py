@@ -99,11 +99,11 @@ class RawTerminal:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """As before."""
+        """Restore the terminal as it was before."""
         termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
 
     def fileno(self) -> int:
-        """For `select`."""
+        """The file descriptor for `select`."""
         return self._fd
 
     def read(self) -> bytes:

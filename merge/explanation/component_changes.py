@@ -89,7 +89,7 @@ def joinings(before: Iterable[frozenset[MapId]], after: MergedMap) -> tuple[str,
 
 
 def _briefly(maps: frozenset[MapId]) -> str:
-    """For example `r0.1+r2.1`: with `and` the sides would be ambiguous."""
+    """A component in short, for example `r0.1+r2.1`: with `and` the sides would be ambiguous."""
     named = "+".join(str(map_id) for map_id in sorted(maps))
     return named if len(maps) <= MOST_NAMED else f"{len(maps)} maps with {min(maps)}"
 

@@ -98,7 +98,7 @@ class _Between:
 
 
 def _between(merged: MergedMap, pairs: Collection[Pair]) -> dict[Pair, _Between]:
-    """Of all pairs at once: a large fleet has many refusals."""
+    """What lies between all pairs at once: a large fleet has many refusals."""
     out = {pair: _Between() for pair in pairs}
     for link in merged.links:
         if between := out.get((min(link.a.map, link.b.map), max(link.a.map, link.b.map))):
@@ -116,7 +116,7 @@ def _explained(
     joined: bool,
     closely: bool,
 ) -> MapsExplanation:
-    """Of two maps; only a close examination compares similar pairs once more."""
+    """What is said of two maps; only a close examination compares similar pairs once more."""
     links, refused = between.links, between.refused
     if joined:
         nearest = _weakest(merged, links)

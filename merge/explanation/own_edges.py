@@ -24,7 +24,7 @@ WORDS = {
 
 
 def edge_in_words(edge: Edge) -> str:
-    """For example `r0 turned on the spot from one to the other (edge r0.1.5)`."""
+    """An edge in words, for example `r0 turned on the spot from one to the other (edge r0.1.5)`."""
     return f"{edge.id.agent} {WORDS[edge.kind]} (edge {edge.id})"
 
 

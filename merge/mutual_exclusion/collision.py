@@ -39,7 +39,7 @@ class Collision:
 
     @property
     def reason(self) -> str:
-        """In words."""
+        """The reason in words."""
         if self.where:
             return (
                 f"{self.first} would have seen {self.second} {self.nearest:.1f} m {self.where} "

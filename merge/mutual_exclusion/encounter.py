@@ -105,7 +105,7 @@ class Encounter:
         return added, total
 
     def evidence(self, clear: Array, odds: Array, weights: Array) -> tuple[float, float]:
-        """By footprints and by mutual visibility, at the maximum."""
+        """The evidence by footprints and by mutual visibility, at the maximum."""
         by_footprints = np.cumsum(self.by_footprints(clear))
         _, total = self.added(clear, odds, weights)
         most = int(np.argmax(total))

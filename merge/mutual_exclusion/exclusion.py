@@ -143,7 +143,7 @@ def _collision(
     odds: Array | None,
     evidence: float,
 ) -> Collision:
-    """In numbers: by visibility if (M,) odds against the merge are given, else by footprints."""
+    """Its numbers: by visibility if (M,) odds against the merge are given, else by footprints."""
     first, second = trajectories
     if odds is None:
         worst = meeting.close[np.argmin(meeting.distances[meeting.close])]

@@ -32,7 +32,7 @@ class RangeScans:
     def of(
         ranges: Sequence[Ranges], segments: Sequence[TrajectorySegment], owners: NDArray[np.int64]
     ) -> RangeScans:
-        """Of one robot's nodes, in their order, and then of their trajectory segments, likewise.
+        """The scans of one robot's nodes, in their order, and then of their trajectory segments, likewise.
 
         A broken sensor also reports that there is nothing. So a scan without any reading in range, and a
         sensor without any, are not used.

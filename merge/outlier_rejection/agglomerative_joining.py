@@ -152,7 +152,7 @@ def _sorted(
 
 
 def best_supported(weights: Mapping[Key, float]) -> dict[NodeId, Key]:
-    """Of each piece the two that are joined by the greatest weight: it and another one."""
+    """For each piece the two that are joined by the greatest weight: it and another one."""
     best: dict[NodeId, Key] = {}
     for key in _ranked(weights):
         for piece in key:

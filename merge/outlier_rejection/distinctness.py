@@ -122,7 +122,7 @@ class _Sides:
 
     @staticmethod
     def of(links: Sequence[Link], by_node: Mapping[NodeId, Fragment]) -> _Sides:
-        """Of links with both nodes in fragments."""
+        """The distinctness of links with both nodes in fragments."""
         graphs = {by_node[node].name: by_node[node].graph for link in links for node in link.pair}
         sizes = [len(graph.nodes) for graph in graphs.values()]
         starts = np.cumsum([0, *sizes[:-1]])

@@ -71,7 +71,7 @@ def tears(first: Sequence[NodeId], second: Sequence[NodeId], graph: PoseGraph, n
 def _shares(
     graph: PoseGraph, nodes: Sequence[Node], which: Sequence[NodeId], others: Sequence[NodeId]
 ) -> Array:
-    """Of each node that can be compared: the share of its landmarks that other nodes of its map refute.
+    """For each node that can be compared, the share of its landmarks that other nodes of its map refute.
 
     Args:
         graph: of the map.

@@ -72,7 +72,7 @@ def prior_odds(merged: MergedMap) -> float:
 
 
 def probability(log_factor: float, odds: float) -> float:
-    """Of Bayes' factor and prior odds, never so near to 0 or 1 that nothing could change it."""
+    """By Bayes' factor and prior odds; never so near to 0 or 1 that nothing could change it."""
     log_odds = float(np.clip(log_factor + math.log(odds), -12.0, 12.0))
     return 1.0 / (1.0 + math.exp(-log_odds))
 

@@ -233,7 +233,7 @@ def _in_turns(maps: Sequence[MapId]) -> list[MapId]:
 
 
 def thinned(links: Sequence[Link]) -> list[Link]:
-    """At most `MOST_LINKS` of them, in the order of ids: the order in which they were found has no effect."""
+    """Keep `MOST_LINKS` of them at most, by id: the order in which they were found has no effect."""
     ordered = sorted(links, key=lambda link: link.key)
     chosen = np.unique(np.linspace(0, len(ordered) - 1, MOST_LINKS).round().astype(np.int64))
     return [ordered[int(k)] for k in chosen]
@@ -359,7 +359,7 @@ def _seen_through_shares(
     fixed: Fragment,
     nodes: Mapping[NodeId, Node],
 ) -> Array:
-    """Of each node that can be placed: the share of its comparable landmarks that are seen through.
+    """For each node that can be placed, the share of its comparable landmarks that are seen through.
 
     Args:
         links: links from `placed` to `fixed` that place it.

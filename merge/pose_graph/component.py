@@ -106,7 +106,7 @@ class Component(PoseGraph):
         return PoseGaussians(means, covariances)
 
     def _covariances(self, i: Rows, j: Rows, means: Array, least: int) -> tuple[Array, NDArray[np.bool_]]:
-        """Of pairs of rows, by what was measured around all of them.
+        """Covariances of pairs of rows, by what was measured around all of them.
 
         Args:
             i: (K,) rows.

@@ -78,7 +78,7 @@ class Factors:
 
     @staticmethod
     def of(measurements: Sequence[RelativePose], a: Sequence[int], b: Sequence[int]) -> Factors:
-        """Of measurements between rows."""
+        """The factors of measurements between rows."""
         covariances = np.array([m.a_from_b.covariance for m in measurements]).reshape(-1, 3, 3)
         means = [(m.x, m.y, m.heading) for m in (measurement.a_from_b.mean for measurement in measurements)]
         return Factors(
@@ -90,7 +90,7 @@ class Factors:
 
     @staticmethod
     def together(parts: Sequence[Factors]) -> Factors:
-        """Of all parts, which have the same rows."""
+        """The factors of all parts, which have the same rows."""
         columns = ("a", "b", "means", "weights")
         return Factors(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 

@@ -30,7 +30,7 @@ class Fragment:
 
     @property
     def nodes(self) -> tuple[NodeId, ...]:
-        """In the order of ids."""
+        """The nodes in the order of ids."""
         return self.graph.nodes
 
     @cached_property

@@ -54,7 +54,7 @@ class NodePoses(Mapping[NodeId, Placement]):
                 self._numbers.setdefault(map_id, []).append(number)
 
     def number(self, node: NodeId) -> int | None:
-        """Of the node's component; None if it is not there."""
+        """The number of the node's component; None if it is not there."""
         for number in self._numbers.get(node[:2], ()):
             if node in self._graphs[number].rows:
                 return number
@@ -104,7 +104,7 @@ class WrongGeometry(NamedTuple):
 
     @property
     def reason(self) -> str:
-        """For example `map r3.1 contradicts r0.1 and r1.1, which agree: its geometry is wrong`."""
+        """In words: `map r3.1 contradicts r0.1 and r1.1, which agree: its geometry is wrong`."""
         *most, last = map(str, self.agreeing)
         return (
             f"map {self.which} contradicts {', '.join(most)} and {last}, which agree: its geometry is wrong"
@@ -280,7 +280,7 @@ class MergedMap:
         }
 
     def summary(self) -> str:
-        """For example `17 nodes, 3 maps, 2 components, 5 links, 1 loop, 2 refused, 4 superseded`.
+        """In one line: `17 nodes, 3 maps, 2 components, 5 links, 1 loop, 2 refused, 4 superseded`.
 
         Links are between maps, loops within one; superseded nodes and retired maps count as nodes and maps;
         retired nodes count as no nodes.

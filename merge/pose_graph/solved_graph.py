@@ -74,7 +74,7 @@ class PoseGraph:
 
     @cached_property
     def maps(self) -> frozenset[MapId]:
-        """Of which maps there are nodes."""
+        """The maps of which there are nodes."""
         return frozenset(MapId(agent, epoch) for agent, epoch in {node[:2] for node in self.nodes})
 
     @cached_property

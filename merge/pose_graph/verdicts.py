@@ -38,7 +38,7 @@ class Verdicts:
             self._partners[maps[0]].discard(maps[1])
 
     def between(self, maps: MapPair) -> Mapping[Pair, Verdict]:
-        """Of the pairs between two maps."""
+        """Verdicts on the pairs between two maps."""
         return self._between.get(maps, {})
 
     def at(self, maps: Set[MapId]) -> set[MapPair]:
@@ -56,7 +56,7 @@ class Verdicts:
                 yield maps
 
     def among(self, maps: frozenset[MapId]) -> list[Verdict]:
-        """Of all pairs with both ends in these maps."""
+        """Verdicts on all pairs with both ends in these maps."""
         return [
             verdict
             for first in sorted(maps)
@@ -65,7 +65,7 @@ class Verdicts:
         ]
 
     def across(self, island_of: Mapping[MapId, frozenset[MapId]]) -> list[Verdict]:
-        """Of all pairs of which the two maps are in different islands; maps that are in none are left out."""
+        """Verdicts on pairs of maps in different islands; maps that are in none are left out."""
         return [
             verdict
             for (first, second), verdicts in self._between.items()

@@ -197,7 +197,7 @@ class Design:
 
     @property
     def items(self) -> dict[str, Sequence[Item]]:
-        """Of each kind of list, under its name."""
+        """The items of each kind of list, under its name."""
         return {
             "rooms": self.rooms,
             "walls": self.walls,
@@ -235,7 +235,7 @@ def check_design(design: Design, where: str) -> None:
 
 
 def floor_area(room: Room) -> float:
-    """Of a room, m^2."""
+    """The floor area of a room, m^2."""
     return (room.high[0] - room.low[0]) * (room.high[1] - room.low[1])
 
 

@@ -19,7 +19,7 @@ OPEN = 0.3
 
 
 def lamps_of(design: Design, plan: BuildingPlan) -> list[tuple[Vector, ...]]:
-    """For each room the lamps that shine into it, in its frame: its own, and those of rooms it is open to."""
+    """The lamps of each room that shine into it, in its frame: its own, and those of rooms it is open to."""
     own = [_hung(room, design.height) for room in design.rooms]
     lamps = []
     for number, room in enumerate(design.rooms):

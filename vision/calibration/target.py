@@ -99,7 +99,7 @@ class CalibrationTarget:
             raise InvalidValue(f"target: {self.dictionary} has {most} markers, too few for this board")
 
     def __str__(self) -> str:
-        """For people."""
+        """The target for people."""
         text = f"{self.pattern} {self.columns}x{self.rows}, squares {1e3 * self.square:g} mm"
         if self.pattern is Pattern.CHESSBOARD:
             return text

@@ -84,7 +84,7 @@ class CommandKeys:
         return f"{self._root}/{topic.strip('/')}/{number}"
 
     def parse_robot_driver(self, key: str) -> tuple[str, int]:
-        """By which topic, and the number of who drives.
+        """The topic by which one drives, and the number of who does.
 
         Raises:
             InvalidMessage: it is no such key.

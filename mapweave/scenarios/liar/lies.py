@@ -72,7 +72,7 @@ class LieInputs:
     rng: np.random.Generator
 
     def id(self, number: int) -> NodeId:
-        """Of a node or an edge of the robot that lies."""
+        """The id of a node or an edge of the robot that lies."""
         return NodeId(*self.map, number)
 
     def theirs(self) -> list[Node]:
@@ -198,7 +198,7 @@ def same_times(s: LieInputs) -> LyingMessages:
 
 
 def many_landmarks(s: LieInputs) -> LyingMessages:
-    """As many landmarks as fifty messages hold: 100 000, a few of them true."""
+    """Nodes with as many landmarks as fifty messages hold: 100 000, a few of them true."""
     nodes = [
         replace(node, landmarks=_filled(node, s.rng)) for node in (s.own[0] * math.ceil(50 / len(s.own[0])))
     ][:50]

@@ -158,7 +158,7 @@ def row(name: str, one: ContainmentOutcome) -> str:
 
 
 def totals(outcomes: Mapping[str, ContainmentOutcome]) -> dict[str, Any]:
-    """Of the ways that can be found out, and which of them were not."""
+    """Totals over the ways that can be found out, and which of them were not."""
     listed = {name: one for name, one in outcomes.items() if name in WAYS}
     return {
         "ways": len(listed),
