@@ -71,7 +71,7 @@ def test_every_key_is_on_the_page_and_has_a_vector() -> None:
         names = [x for x in code.co_varnames[: code.co_argcount] if x not in ("self", "keys")]
         if "question" in names:  # of a robot in its own name: the key of the question, and the name
             continue
-        if names == ["name"]:  # of whom, the key's form says
+        if names == ["name"]:  # the form of the key says which
             role = method(keys, "x").removeprefix("mapweave/1/demo/").split("/")[0]
             given["name"] = {"agent": "r0", "server": "s0", "robot": "b0"}[role]
         key = method(keys, *(given[argument] for argument in names))
