@@ -92,7 +92,8 @@ def _by_images(merged: MergedMap, asked: Linked, because: str, s: ConsistencySet
     if asked.pose is None:
         raise InvalidValue(
             f"the images of {asked} do not show one place: {evidence}. If you know that they do, give by "
-            f"hand the pose of {asked.b} seen from {asked.a}, and a reason"
+            f"hand the pose of {asked.b} seen from {asked.a}, and a reason (shell: --pose X,Y,DEGREES "
+            "--because TEXT)"
         )
     if not because:
         raise InvalidValue(f"a pose by hand, without the images ({evidence}), needs a reason")

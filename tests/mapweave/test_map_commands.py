@@ -257,7 +257,8 @@ def test_linking_in_a_file_and_taking_it_back(
     path.write_bytes(files[3].read_bytes())
     wrong = ["map", "link", "r0.1.1", "r2.1.3", "--map", str(path)]
     assert main(wrong) == NO
-    assert "do not show one place: " in capfd.readouterr().err
+    error = capfd.readouterr().err
+    assert "do not show one place: " in error and "--pose X,Y,DEGREES --because TEXT" in error
     by_hand = [*wrong, "--pose=-1,0.5,90", "--because", "the same door", "--by", "anna"]
     only_checked = "only checked, nothing is changed: r0.1.1 and r2.1.3: linked by hand by anna"
     assert said(*by_hand, "--check").startswith(only_checked)
