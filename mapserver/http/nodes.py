@@ -12,6 +12,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.named_nodes import ids_of
 from mapweave.mapserver.http.answering import Answering
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.node_details import node_details
@@ -23,10 +24,12 @@ Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
 def node_answers(server: Answering) -> list[tuple[str, str, str, Answer]]:
     """Method, path, question and answer of what is asked about a node."""
 
-    async def node(request: Request) -> Mapping[str, Any]:
-        asked = NodeId.parse(request.path_params["node"])
+    def named(request: Request) -> NodeId:
+        return NodeId.parse(*ids_of([request.path_params["node"]], server.resolve))
 
+    async def node(request: Request) -> Mapping[str, Any]:
         def details() -> Mapping[str, Any]:
+            asked = named(request)
             known = node_details(server.merged(), asked, server.annotations().floors)
             missing = server.why_no_view(asked)
             return {**json_values(known), "view": not missing, "no_view": missing}
@@ -34,9 +37,8 @@ def node_answers(server: Answering) -> list[tuple[str, str, str, Answer]]:
         return await run_in_threadpool(details)
 
     async def view(request: Request) -> Response:
-        asked = NodeId.parse(request.path_params["node"])
         try:
-            jpeg = await run_in_threadpool(server.view, asked)
+            jpeg = await run_in_threadpool(lambda: server.view(named(request)))
         except NoView as error:
             raise HTTPException(HTTPStatus.NOT_FOUND, str(error)) from None
         return Response(jpeg, media_type="image/jpeg")

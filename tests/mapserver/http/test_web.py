@@ -15,6 +15,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mapweave.hybridmap.annotation import Annotation, Annotations, Place
 from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.http.web import Web
@@ -48,6 +49,22 @@ def test_the_view_of_a_node_is_an_image_and_nothing_else(served: Web, services: 
     assert headers["Content-Type"] == "image/jpeg" and headers["X-Content-Type-Options"] == "nosniff"
     assert json.loads(ask(served, "GET", f"/nodes/{node}")[2])["view"] is True
     assert ask(served, "GET", "/nodes/r0/view")[0] == 400
+
+
+def test_a_node_is_asked_for_by_the_name_of_a_place_and_by_a_position(
+    served: Web, services: StubServices
+) -> None:
+    merged = two_maps()
+    node = next(iter(merged.maps[MapId("r0", 1)].nodes))
+    services.said = Annotations((Annotation("the kitchen", Place(node), False, "anna", 1),))
+    services.images[node] = picture(kind=".jpg")
+    at = merged.pose(node)
+    for words in ("the%20kitchen", f"{at.x:.3f},{at.y:.3f}"):
+        status, _, content = ask(served, "GET", f"/nodes/{words}")
+        assert status == 200 and json.loads(content)["node"]["id"] == str(node)
+        assert ask(served, "GET", f"/nodes/{words}/view")[2] == services.images[node]
+    status, _, content = ask(served, "GET", "/nodes/nowhere")
+    assert status == 400 and "'nowhere' is no place of this map" in json.loads(content)["error"]
 
 
 def test_the_camera_as_it_is_given(served: Web, services: StubServices) -> None:
