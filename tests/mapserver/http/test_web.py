@@ -55,7 +55,7 @@ def test_a_node_is_asked_for_by_the_name_of_a_place_and_by_a_position(
     served: Web, services: StubServices
 ) -> None:
     merged = two_maps()
-    node = next(iter(merged.maps[MapId("r0", 1)].nodes))
+    node = next(node for node in merged.poses if node not in merged.superseded)
     services.said = Annotations((Annotation("the kitchen", Place(node), False, "anna", 1),))
     services.images[node] = picture(kind=".jpg")
     at = merged.pose(node)
