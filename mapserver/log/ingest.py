@@ -267,7 +267,7 @@ class Ingest:
         intake = self._intakes.of(map_id.agent)
         if mark.sequence <= agent_log.watermark or mark.sequence in agent_log.ahead:
             self._counters.add(doubled=1)
-            return agent_log
+            return agent_log if intake.repeat() else None
         if not intake.change(len(sample.payload), self._unmerged(map_id.agent)):
             return agent_log
         fits = len(sample.payload) <= MAX_CHANGE_BYTES

@@ -48,6 +48,7 @@ class Intake:
         self._changes = TokenBucket(rate, now)
         self._bytes = TokenBucket(rate * CHANGE_BYTES, now)
         self._beacons = TokenBucket(rate, now)
+        self._repeats = TokenBucket(rate, now)
         self._current: AgentLog | None = None
         self._nodes = self._landmarks = 0
         self._edges_left = DRIVEN
@@ -57,12 +58,22 @@ class Intake:
 
     def beacon(self) -> bool:
         """Whether a beacon is looked at; the next one says the same."""
+        return self._allowed(self._beacons, "beacons")
+
+    def repeat(self) -> bool:
+        """Whether a published change that is already here is looked at.
+
+        It counts for itself: what was published and pulled as well takes nothing from what may be sent.
+        """
+        return self._allowed(self._repeats, "changes")
+
+    def _allowed(self, bucket: TokenBucket, what: str) -> bool:
         now = self._quotas.clock()
-        allowed = self._beacons.wait(1.0, now) <= 0.0
+        allowed = bucket.wait(1.0, now) <= 0.0
         if allowed:
-            self._beacons.spend(1.0, now)
+            bucket.spend(1.0, now)
         else:
-            self._quotas.hold_back(self._agent, "beacons")
+            self._quotas.hold_back(self._agent, what)
         return allowed
 
     def change(self, size: int, unmerged: int) -> bool:

@@ -122,6 +122,31 @@ def test_what_is_held_back_is_fetched_later_in_order(
     assert quotas.over() == {}, "it has kept to its quota for a while"
 
 
+def test_a_change_that_is_sent_again_and_again_is_shown_and_takes_nothing_from_new_ones(
+    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack
+) -> None:
+    clock = Clock()
+    quotas = Quotas(QuotaSettings(changes=10.0), clock)
+    server = Server(hub, tmp_path / "s0.sqlite", quotas=quotas)
+    cleanup.callback(server.end)
+    agent = other_agent(hub, cleanup, MAP)
+    at_once = round(10 * BURST)
+    agent.publish(1)
+    eventually(lambda: server.store.watermark(MAP) == 1)
+    for _ in range(at_once):
+        agent.publish(1)
+    eventually(lambda: server.ingest.counters().doubled == at_once)
+    assert quotas.over() == {}, "as many as there may be new ones"
+    for _ in range(150):
+        agent.publish(1)
+    eventually(lambda: server.ingest.counters().doubled == at_once + 150)
+    assert quotas.over() == {"r0": "over its quota: 150 changes"}
+    for sequence in range(2, at_once + 1):
+        agent.publish(sequence)
+    eventually(lambda: server.store.watermark(MAP) == at_once)
+    assert quotas.totals() == {"changes": 150}
+
+
 def test_one_map_too_many_is_refused_with_the_reason_until_there_is_room(
     hub: MemoryHub, tmp_path: Path, cleanup: ExitStack
 ) -> None:
