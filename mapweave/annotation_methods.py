@@ -31,6 +31,18 @@ class AnnotationMethods(ABC):
         """Say something of any kind."""
 
     @abstractmethod
+    def withdraw(self, kind: str, name: str, because: str = "", *, check: bool = False) -> str:
+        """Withdraw what was said; the record keeps both."""
+
+    @abstractmethod
+    def put_plan_image(self, png: bytes) -> PlanImage:
+        """Keep the image of a plan, a PNG file, before the annotation that names it."""
+
+    @abstractmethod
+    def plan_image(self, sha256: str) -> bytes:
+        """The PNG file of a plan, by the name of its image."""
+
+    @abstractmethod
     def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
         """Nodes for words."""
 

@@ -13,14 +13,16 @@ import os
 import time
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, overload
+from typing import TYPE_CHECKING, Any, overload
 
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.annotation_methods import AnnotationMethods
 from mapweave.constraint_methods import ConstraintMethods
 from mapweave.extras import need
 from mapweave.hybridmap.annotation import Annotations
@@ -35,11 +37,12 @@ from mapweave.hybridmap.explanation import (
     RouteExplanation,
     route_over,
 )
-from mapweave.hybridmap.floor_plan import PlacedPlans
+from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.named_nodes import asked_of, ids_of
 from mapweave.hybridmap.node import Node
+from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.login import login
@@ -339,11 +342,12 @@ class Map(ABC):
         write_map_file(Path(path), self.content)
 
 
-class FileMap(Map, ConstraintMethods):
+class FileMap(Map, ConstraintMethods, AnnotationMethods):
     """A map from a file; it asks no server.
 
     Corrections (`link`, `unlink`, `retire`, `undo`) merge the map again, in memory: its nodes, components and
-    ways are then those with the correction. A file has it once the map is saved.
+    ways are then those with the correction. What is said about it (`place`, `close_way`, `prefer`, `floor`,
+    `portal`, `plan`, `pin`, `withdraw`) is kept in memory, too. A file has both once the map is saved.
     """
 
     def __init__(self, content: MapFile, settings: MergeSettings | None = None, by: str = "") -> None:
@@ -356,6 +360,7 @@ class FileMap(Map, ConstraintMethods):
         """
         self._read = MapReading(content, settings)
         self._by = by or login()
+        self._images = dict(content.images)
 
     @property
     def _reading(self) -> MapReading:
@@ -399,11 +404,46 @@ class FileMap(Map, ConstraintMethods):
         return words
 
     def annotations(self) -> Annotations:
-        """What people say about the map, as the file has it."""
+        """What people say about the map: what the file has, and what was said since it was opened."""
         return Annotations(self.content.annotations)
 
+    def annotate(self, kind: str, name: str, because: str = "", *, check: bool = False, **fields: Any) -> str:
+        """Say something of any kind; see Fleet.annotate. Only a pin moves the map.
+
+        Raises:
+            Refused: it says nothing new, or is about something that is not there.
+            MissingExtra: that needs the extra "server".
+        """
+        return self._annotate(name, {"kind": kind, **fields}, False, because, check)
+
+    def withdraw(self, kind: str, name: str, because: str = "", *, check: bool = False) -> str:
+        """Withdraw what was said about the map; see `annotate`."""
+        return self._annotate(name, {"kind": kind}, True, because, check)
+
+    def plan_image(self, sha256: str) -> bytes:
+        """The PNG file of a plan, by the name of its image.
+
+        Raises:
+            Refused: the map does not have it.
+        """
+        if sha256 not in self._images:
+            raise Refused(f"the map does not have the image {sha256[:12]} of a plan: put it first")
+        return self._images[sha256]
+
+    def put_plan_image(self, png: bytes) -> PlanImage:
+        """Keep the image of a plan, a PNG file, for the annotation that names it.
+
+        Raises:
+            InvalidValue: it is no PNG file, or too large.
+        """
+        from mapweave.storage.plan_image import check_plan_png
+
+        image = check_plan_png(png)
+        self._images[image.sha256] = png
+        return image
+
     def plans(self) -> PlacedPlans:
-        """Floor plans under the map, as the file has it."""
+        """Floor plans under the map."""
         from mapweave.mapserver.floor_plans import placed_plans
 
         return placed_plans(self.annotations(), self._router().merged)
@@ -416,6 +456,31 @@ class FileMap(Map, ConstraintMethods):
 
         with refusals():
             return PlaceResolver(router, router.annotations).answer(asked)
+
+    def _annotate(
+        self, name: str, fields: Mapping[str, Any], removed: bool, because: str, check: bool
+    ) -> str:
+        router = self._read.router
+        from mapweave.mapserver.annotation_words import annotation_of_words
+        from mapweave.mapserver.annotator import CHECKED
+        from mapweave.offline_annotations import checked_annotation, with_annotation
+
+        with refusals():
+            annotation = annotation_of_words(
+                name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
+            )
+        words = checked_annotation(self.content, router, annotation, self.plan_image)
+        if check:
+            return CHECKED + words
+        content = with_annotation(self.content, annotation, self._images)
+        if not isinstance(annotation.body, Pin):
+            self._read = self._read.with_content(content)
+            return words
+        moved = MapReading(content, self._read.settings)
+        if content.poses:
+            moved = moved.with_content(replace(content, poses=dict(moved.merged.poses)))
+        self._read = moved
+        return words
 
     def _router(self) -> Router:
         """The router over the ways that are open now."""

@@ -36,6 +36,17 @@ class MapReading:
         self.content = content
         self.settings = settings or MergeSettings()
 
+    def with_content(self, content: MapFile) -> MapReading:
+        """Another content with the same measurements and pins: what follows from those is kept.
+
+        Args:
+            content: of which no more differs than annotations without pins, images and poses.
+        """
+        other = MapReading(content, self.settings)
+        same = ("graph", "merged", "router", "relocalizer")
+        vars(other).update({name: value for name, value in vars(self).items() if name in same})
+        return other
+
     @cached_property
     def graph(self) -> HybridMap:
         """Nodes and edges; links of a merged map are edges among them."""

@@ -1,16 +1,20 @@
-"""Annotations of a map file or store, without a server; the same methods as of mapweave.fleet.Fleet."""
+"""Annotations of a map without a server: by the shell (`--map`) and from Python the same.
+
+`OfflineAnnotations` has the methods of mapweave.fleet.Fleet, and writes files. `mapweave.map.FileMap` changes
+its map in memory by the same two functions.
+"""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 from mapweave.annotation_methods import AnnotationMethods
-from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage
 from mapweave.hybridmap.manual_constraint import ManualConstraints
@@ -28,7 +32,45 @@ from mapweave.merge.settings import MergeSettings
 from mapweave.opened_map import MapSource, open_map
 from mapweave.refusals import refusals
 from mapweave.storage.atomic_file import check_place
+from mapweave.storage.map_file import MapFile
 from mapweave.storage.plan_image import check_plan_png
+
+
+def checked_annotation(
+    content: MapFile, router: Router, annotation: Annotation, plan_image: Callable[[str], bytes]
+) -> str:
+    """What an annotation says and does, in words.
+
+    Args:
+        content: of the map.
+        router: of the map, without the annotation.
+        annotation: new.
+        plan_image: returns the PNG file of a floor plan by its name; raises if there is none.
+
+    Raises:
+        Refused: it says nothing new, or is about something that is not there.
+    """
+    said = Annotations(content.annotations)
+    with refusals():
+        check_annotation(router.merged, said, annotation, ManualConstraints(content.constraints))
+        check_edge(router, said, annotation)
+    if isinstance(annotation.body, FloorPlan) and not annotation.removed:
+        plan_image(annotation.body.image.sha256)
+    return "; ".join((annotation.words, *effects_of(annotation, PlaceResolver(router, said))))
+
+
+def with_annotation(content: MapFile, annotation: Annotation, images: Mapping[str, bytes]) -> MapFile:
+    """The content with an annotation, and with those images that a plan names; its poses as they were.
+
+    Args:
+        content: of the map. It is not changed.
+        annotation: as `checked_annotation` has passed it.
+        images: PNG files of floor plans, by their names, also those that no plan names yet.
+    """
+    said = Annotations((*content.annotations, annotation))
+    used = {plan.image.sha256 for _, plan in said.in_force(FloorPlan)}
+    kept = {name: png for name, png in images.items() if name in used}
+    return replace(content, annotations=said.made, images=kept)
 
 
 class OfflineAnnotations(AnnotationMethods):
@@ -55,7 +97,6 @@ class OfflineAnnotations(AnnotationMethods):
         self._by, self._settings = by, settings
         self._opened = open_map(path)
         self._out = Path(path) if out is None and self._opened.source is MapSource.FILE else out
-        self._made = Annotations(self._opened.content.annotations)
         self._images = dict(self._opened.content.images)
 
     def annotate(self, kind: str, name: str, because: str = "", *, check: bool = False, **fields: Any) -> str:
@@ -73,7 +114,7 @@ class OfflineAnnotations(AnnotationMethods):
 
     def annotations(self) -> Annotations:
         """What people say about the map."""
-        return self._made
+        return Annotations(self._opened.content.annotations)
 
     def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
         """Nodes for words.
@@ -129,26 +170,16 @@ class OfflineAnnotations(AnnotationMethods):
             annotation = annotation_of_words(
                 name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
             )
-            constraints = ManualConstraints(self._opened.content.constraints)
-            check_annotation(self._router.merged, self.annotations(), annotation, constraints)
-            check_edge(self._router, self.annotations(), annotation)
-        words = "; ".join(
-            (annotation.words, *effects_of(annotation, PlaceResolver(self._router, self.annotations())))
-        )
-        body = annotation.body
-        if isinstance(body, FloorPlan) and not annotation.removed:
-            self.plan_image(body.image.sha256)
+        words = checked_annotation(self._opened.content, self._router, annotation, self.plan_image)
         if check or out is None:
             return CHECKED + words
-        self._made = Annotations((*self._made.made, annotation))
-        used = {plan.image.sha256 for _, plan in self._made.in_force(FloorPlan)}
-        images = {name: png for name, png in self._images.items() if name in used}
-        content = replace(self._opened.content, annotations=self._made.made, images=images)
+        content = with_annotation(self._opened.content, annotation, self._images)
         self._opened = replace(self._opened, content=content)
-        if isinstance(body, Pin):
+        moved = isinstance(annotation.body, Pin)
+        if moved:
             del self._router
         content = self._opened.file(self.merged)
-        if isinstance(body, Pin) and content.poses:
+        if moved and content.poses:
             content = replace(content, poses=dict(self.merged.poses))
         self._opened = self._opened.written(out, content)
         return words

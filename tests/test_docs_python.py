@@ -63,5 +63,6 @@ def test_every_block_runs(
     printed = capsys.readouterr().out
     assert printed.startswith("<FileMap: 8 nodes, 2 maps, 1 component, ")
     assert "unknown" in printed and "r0.1 r1.1 True" in printed
-    for made in ("office.png", "both.mapweave", "both.g2o", "trajectories/r0.1.tum", "now.mapweave"):
+    saved = "annotated.mapweave", "both.mapweave", "now.mapweave"
+    for made in ("office.png", *saved, "both.g2o", "trajectories/r0.1.tum"):
         assert Path(made).stat().st_size > 0, made
