@@ -142,6 +142,10 @@ class FleetProcesses:
         """Whether all agents have ended, since all that they have is acknowledged."""
         return all(self._running[name].poll() == 0 for name in self.agents)
 
+    def mapping(self) -> list[str]:
+        """The agents that have not ended."""
+        return [name for name in self.agents if self._running[name].poll() is None]
+
     def stop_mapping(self) -> None:
         """Tell the agents to end when all is acknowledged."""
         (self.folder / ENOUGH).touch()

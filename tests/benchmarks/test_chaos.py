@@ -18,7 +18,8 @@ import pytest
 
 from benchmarks.chaos.account import Account, BrokenLog, account, sent_changes
 from benchmarks.chaos.agent_process import STAMP, digest
-from benchmarks.chaos.benchmark import good, together
+from benchmarks.chaos.benchmark import comes_true, good, percentile, together
+from benchmarks.chaos.fleet_processes import FleetProcesses
 from benchmarks.chaos.recovery import NEVER, RobotTimes, recoveries
 from benchmarks.chaos.schedule import KILLS, LEAST_KILLS, Kind, draw_schedule
 from benchmarks.chaos.scripted_robot import ScriptedRobot
@@ -188,18 +189,46 @@ def test_a_schedule_is_that_of_its_seed_and_kills_often_enough() -> None:
             assert mine and all(a.at + a.lasts <= b.at for a, b in pairwise(mine))
 
 
+ON_SQLITE = {
+    "store": "sqlite", "sent": 3, "stored": 3, "undone": 0, "lost": 0, "duplicated": 0, "out_of_order": 0,
+    "unacknowledged": 0, "maps_equal": True, "recovery_s_p50": 1.0, "recovery_s_p95": 2.0,
+    "relocalize_gap_s": 0.3, "frozen_router_gap_s": 5.0, "kills": 20, "lost_stores": 1, "stops": 7,
+    "cuts": 11, "lossy": 2,
+}  # fmt: skip
+
+
 def test_what_is_lost_on_one_store_is_lost_on_both() -> None:
-    one = {
-        "store": "sqlite", "sent": 3, "stored": 3, "undone": 0, "lost": 0, "duplicated": 0, "out_of_order": 0,
-        "maps_equal": True, "recovery_s_p50": 1.0, "recovery_s_p95": 2.0, "relocalize_gap_s": 0.3,
-        "frozen_router_gap_s": 5.0, "kills": 20, "lost_stores": 1, "stops": 7, "cuts": 11, "lossy": 2,
-    }  # fmt: skip
+    one = ON_SQLITE
     other = dict(one, store="postgresql", stored=2, lost=1, maps_equal=False, relocalize_gap_s=0.7)
     assert together([one]) == one and good(one)
     both = together([one, other])
     assert not good(both) and both["stores"] == [one, other] and both["store"] == "sqlite and postgresql"
     assert (both["sent"], both["stored"], both["lost"], both["maps_equal"]) == (6, 5, 1, False)
     assert both["relocalize_gap_s"] == 0.7 and both["kills"] == 40 and both["lossy"] == 4
+
+
+def test_what_stays_unacknowledged_is_in_the_report() -> None:
+    other = dict(ON_SQLITE, unacknowledged=2, recovery_s_p95=percentile([1.0, NEVER], 95))
+    both = together([ON_SQLITE, other])
+    assert not good(other) and not good(both)
+    assert (both["unacknowledged"], both["recovery_s_p95"], both["recovery_s_p50"]) == (2, None, 1.0)
+    json.dumps(both, allow_nan=False)
+
+
+def test_percentiles_of_recoveries_by_hand() -> None:
+    assert percentile([3.0, 1.0, 2.0], 50) == 2.0
+    assert percentile([1.0, 2.0, 3.0, NEVER], 25) == 1.75
+    assert percentile([1.0, NEVER], 50) is None
+    assert percentile([NEVER, NEVER], 50) is None
+
+
+def test_robots_that_are_not_done_are_named(tmp_path: Path) -> None:
+    with FleetProcesses(tmp_path, 2, 1, "sqlite") as fleet:
+        for name, script in (("r0", "pass"), ("r1", "input()")):
+            fleet._commands[name] = [sys.executable, "-c", script]
+            fleet.start(name)
+        assert not comes_true(fleet.done, 0.0)
+        assert comes_true(lambda: fleet.mapping() == ["r1"], 60.0)
 
 
 @pytest.mark.slow
@@ -215,6 +244,7 @@ def test_nothing_is_lost_in_a_short_chaos() -> None:
     assert report["kills"] >= LEAST_KILLS and report["lost_stores"] > 0 and report["lossy"] > 0
     assert report["sent"] == report["stored"] + report["undone"] > 100
     assert (report["lost"], report["duplicated"], report["out_of_order"]) == (0, 0, 0)
+    assert report["unacknowledged"] == 0
     assert report["maps_equal"] is True
     # A question that a stopped server held up would take 3 s.
     assert report["relocalize_gap_s"] < 3.0
