@@ -199,9 +199,9 @@ class Reporter:
 
 def run_schedule(agents: Sequence[AgentLink], orders: Orders, begin: float, reporter: Reporter) -> None:
     """Nodes of all agents, each at its own times; then the burst, in which none reports."""
-    rng = np.random.default_rng([orders.seed, orders.first, 1])
+    rng = np.random.default_rng([orders.seed, orders.first, 2])
     end = begin + orders.seconds
-    due = [(begin + rng.uniform(0.0, INTERVAL), k) for k in range(len(agents))]
+    due = [(at, k) for k, at in enumerate(first_stops(orders, begin))]
     due += [(end + rng.uniform(0.0, 1.0), number - orders.first) for number in burst_numbers(orders)]
     heapq.heapify(due)
     while due and due[0][0] < end + 1.0:
@@ -212,7 +212,15 @@ def run_schedule(agents: Sequence[AgentLink], orders: Orders, begin: float, repo
         agents[k].map_on()
         if at + INTERVAL < end:
             heapq.heappush(due, (at + INTERVAL, k))
+    # Who has nothing more to map reports on, and disturbs on, for as long as the others map.
+    time.sleep(max(0.0, end - time.monotonic()))
     reporter.close()
+
+
+def first_stops(orders: Orders, begin: float) -> list[float]:
+    """When each agent makes its first node of mapping, s."""
+    rng = np.random.default_rng([orders.seed, orders.first, 1])
+    return [begin + rng.uniform(0.0, INTERVAL) for _ in range(orders.count)]
 
 
 def burst_numbers(orders: Orders) -> list[int]:

@@ -1,0 +1,134 @@
+"""The benchmark of fleets: what it says of agents that disturb, and its report by made-up figures."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from benchmarks.fleet import benchmark
+from benchmarks.fleet.agents_process import INTERVAL, Orders, Reporter, first_stops, run_schedule
+from benchmarks.fleet.benchmark import (
+    BEHIND_AFTER,
+    Figures,
+    StatusAsker,
+    main,
+    milliseconds,
+    trouble_of,
+    when_behind,
+)
+from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
+from mapweave.wire.bus import Reply
+from mapweave.wire.messages import encode
+
+FIGURES: Figures = {
+    "ack_p99_ms": 200.0, "burst_p99_ms": None, "burst_s": None, "unacked": 0, "relocalize_p95_ms": 100.0,
+}  # fmt: skip
+SAID = {"slow": "2 changes missing for 0.9 s", "frozen": "gone", "flooding": "over its quota: 9 changes"}
+
+
+class Answering:
+    """A bus on which each question has the next answers, and the last ones again and again."""
+
+    def __init__(self, *answers: Sequence[Reply]) -> None:
+        self.answers = list(answers)
+
+    def ask(self, key: str, payload: bytes, timeout: float) -> Sequence[Reply]:
+        return self.answers.pop(0) if len(self.answers) > 1 else self.answers[0]
+
+
+def status(*entries: RobotEntry) -> list[Reply]:
+    return [Reply(encode(FleetStatus(entries)))]
+
+
+def asked(monkeypatch: pytest.MonkeyPatch, *answers: Sequence[Reply]) -> dict[str, str]:
+    monkeypatch.setattr(benchmark, "THAW_BEFORE", 0.0)
+    names, now = {"r8": "slow", "r9": "flooding"}, time.monotonic()
+    bus: Any = Answering(*answers)
+    return StatusAsker(bus, names, [now, now + 0.02, now + 0.04], now + 0.1).result()
+
+
+def test_what_was_said_while_they_disturbed_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    slow = RobotEntry("r8", True, 0.1, missing=2, lag=0.91)
+    flooding = RobotEntry("r9", True, 0.1, over_quota="over its quota: 3 changes")
+    more = replace(flooding, over_quota="over its quota: 7 changes")
+    other = RobotEntry("r0", False, 99.0)
+    said = asked(
+        monkeypatch, status(other), status(slow, flooding), status(replace(slow, missing=0), more),
+        status(replace(slow, missing=9)),
+    )  # fmt: skip
+    # The third question of four is not asked: it is said of the slow one that it is behind.
+    assert said == {"slow": "2 changes missing for 0.9 s", "flooding": "over its quota: 7 changes"}
+
+
+def test_a_server_that_never_answers_ends_the_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
+    for none in ([], [Reply(error="too busy")]):
+        with pytest.raises(SystemExit, match="does not answer"):
+            asked(monkeypatch, none)
+
+
+def test_trouble_in_words() -> None:
+    entry = RobotEntry("r8", True, 4.9)
+    assert trouble_of(entry) == ""
+    assert trouble_of(replace(entry, age=5.14)) == "silent for 5.1 s"
+    assert trouble_of(replace(entry, alive=False)) == "gone"
+    both = replace(entry, missing=3, lag=1.5, over_quota="over its quota: 1 beacon")
+    assert trouble_of(both) == "3 changes missing for 1.5 s, over its quota: 1 beacon"
+
+
+def test_agents_stay_until_the_end_of_mapping() -> None:
+    """One that floods would else end with its last node."""
+    begin = time.monotonic()
+    run_schedule([], Orders("", "", 0, 0, 1, 0.3, 0, 1), begin, Reporter())
+    assert time.monotonic() >= begin + 0.3
+
+
+def test_a_slow_agent_is_asked_about_behind_each_of_its_nodes() -> None:
+    slow = Orders("", "", 9, 1, 9, 30.0, 0, 1)
+    (first,) = first_stops(slow, 100.0)
+    assert 100.0 <= first < 110.0
+    assert when_behind(slow, 100.0) == pytest.approx([first + k * INTERVAL + BEHIND_AFTER for k in range(3)])
+
+
+def test_a_percentile_of_nothing_is_none() -> None:
+    assert milliseconds(np.array([]), 99) is None
+    assert milliseconds(np.array([0.001, 0.002, np.inf]), 50) == 2.0
+
+
+@pytest.mark.parametrize(
+    ("change", "said", "status"),
+    [
+        ({}, SAID, 0),
+        ({}, {}, 0),
+        ({}, {**SAID, "flooding": ""}, 1),
+        ({"unacked": 1}, {}, 1),
+        ({"disturbers_unacked": 1}, SAID, 1),
+        ({"ack_p99_ms": 500.1}, {}, 1),
+        ({"relocalize_p95_ms": None}, {}, 1),
+    ],
+)
+def test_it_ends_with_1_unless_it_is_good_and_prints_json(
+    change: Figures,
+    said: dict[str, str],
+    status: int,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(benchmark, "measure_floor", lambda folder: {"floor_p50_ms": 1.0})
+    monkeypatch.setattr(benchmark, "measure_fleet", lambda *_: ({**FIGURES, **change}, said))
+    monkeypatch.setattr("sys.argv", ["fleet", "--agents", "9", "--burst", "0", "--json"])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == status
+
+    def no_json(word: str) -> None:
+        raise AssertionError(word)
+
+    report = json.loads(capsys.readouterr().out, parse_constant=no_json)
+    assert report["good"] is (status == 0)
+    assert report["agents"]["9"]["burst_p99_ms"] is None
