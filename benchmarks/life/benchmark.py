@@ -17,14 +17,13 @@ Drives are 3.65 days apart, so a hundred are a year. After each the server prune
 for long, in memory and in a store, and the robot drops from its journal the maps of which nothing is left.
 After 60 drives and more there are also what a drive adds in the long run: the means of memory, merge, store
 and journal over the last five drives by those over the five about the fiftieth. Memory is that of the
-process, less what it was before the first drive. It ends with 1 if any view is answered wrongly.
+process, less what it was before the first drive.
 """
 
 from __future__ import annotations
 
 import json
 import math
-import sys
 import time
 from collections.abc import Callable, Container, Mapping, Sequence
 from contextlib import closing
@@ -101,7 +100,7 @@ class MapAfterDrive:
 
 
 def main() -> None:
-    """Drive, count, ask, print, and exit with 1 if an answer is wrong."""
+    """Drive, count, ask, print."""
     parser = command_line("life", __doc__, "of rooms, stops and noise")
     parser.add_argument("--drives", type=int, default=10, help="through the same rooms (default 10)")
     parser.add_argument("--stops", type=int, default=5, help="in a room on every drive (default 5)")
@@ -126,7 +125,6 @@ def main() -> None:
     console.print(totals)
     if a.json:
         print(json.dumps({"seed": a.seed, "drives": a.drives, **figures}))
-    sys.exit(1 if any(value for name, value in figures.items() if name.startswith("wrong")) else 0)
 
 
 def run(
