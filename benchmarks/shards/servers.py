@@ -74,7 +74,11 @@ class MapServers:
         return next(pid for pid in ours if b"gateway_process" in Path(f"/proc/{pid}/cmdline").read_bytes())
 
     def wait(self, nodes: int) -> None:
-        """Wait until each has merged so many nodes, and shards, if there are any, answer themselves."""
+        """Wait until each has merged so many nodes, and shards, if there are any, answer themselves.
+
+        Raises:
+            SystemExit: one is not ready in time.
+        """
         end = time.monotonic() + PATIENCE
         for name in self.names:
             status: dict[str, Any] = {}

@@ -8,12 +8,14 @@ import sys
 import tempfile
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 
 from benchmarks.shards import benchmark
 from benchmarks.shards.askers import IN_A_ROW, AnswerLog
-from benchmarks.shards.benchmark import all_compared, main
+from benchmarks.shards.benchmark import all_compared, good, in_json, main, summary, unacknowledged
 from benchmarks.shards.fleet import BuildingFleet
 from benchmarks.shards.shared_store import NEEDED, SharedStore
 from mapweave.mapserver.log.opening import open_store
@@ -51,6 +53,36 @@ def test_maps_of_two_servers_are_as_good_as_the_worse(monkeypatch: pytest.Monkey
     assert all_compared([None, None], None) == {  # type: ignore[arg-type, list-item]
         "links": 30, "same_links": False, "max_pose_difference_m": 0.25,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("change", "is_good"),
+    [
+        ({}, True),
+        ({"lost": 1}, False),
+        ({"wrong": 1}, False),
+        ({"same_links": False}, False),
+        ({"max_pose_difference_m": float("inf")}, False),
+    ],
+)
+def test_it_is_good_if_nothing_is_lost_wrong_or_linked_otherwise(
+    change: dict[str, object], is_good: bool
+) -> None:
+    row = {"lost": 0, "wrong": 0, "same_links": True, "max_pose_difference_m": 0.0}
+    rows = {"without": {"lost": 0, "wrong": 0}, "2 shards": row, "killed": {**row, **change}}
+    report = summary(rows)
+    assert good(report) is is_good
+    number = None if "max_pose_difference_m" in change else 0.0
+    assert (
+        json.loads(in_json({**report, "sizes": rows}))["sizes"]["killed"]["max_pose_difference_m"] == number
+    )
+
+
+def test_robots_that_stay_unacknowledged_are_named() -> None:
+    robots: Any = [
+        SimpleNamespace(agent=name, acknowledged=lambda s, n=name: n == "r0") for name in ("r0", "r1")
+    ]
+    assert unacknowledged(robots) == {"r1"}
 
 
 @pytest.mark.slow
