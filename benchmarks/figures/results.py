@@ -46,6 +46,7 @@ def run(command: str, data: Path | None) -> StoredResult:
 
     Raises:
         InvalidValue: it needs recordings and none are given, it fails, or its last line is no JSON object.
+            One that ends with 1 and has figures has not failed: they are not good.
     """
     words = shlex.split(command)
     if any("DATA" in word for word in words):
@@ -56,7 +57,7 @@ def run(command: str, data: Path | None) -> StoredResult:
     load, began = os.getloadavg()[0], _processor_s()
     done = subprocess.run([*program, *words[1:]], stdout=subprocess.PIPE, text=True, check=False)
     spent = _processor_s() - began
-    if done.returncode:
+    if done.returncode not in (0, 1):
         raise InvalidValue(f"{command}: exit status {done.returncode}")
     lines = done.stdout.strip().splitlines() or [""]
     try:
@@ -64,7 +65,11 @@ def run(command: str, data: Path | None) -> StoredResult:
     except ValueError:
         figures = None
     if not isinstance(figures, dict):
-        raise InvalidValue(f"{command}: the last line is no JSON object")
+        status = f"exit status {done.returncode}, and " if done.returncode else ""
+        raise InvalidValue(f"{command}: {status}the last line is no JSON object")
+    if done.returncode:
+        # Figures that are not good are kept as well: else only good ones would ever be published.
+        print(f"{command}: exit status 1, its figures are not good", file=sys.stderr)
     busy = f", load {load:.0f} from other programs" if load >= 0.5 else ""
     return StoredResult(
         command=command,

@@ -63,8 +63,22 @@ def test_the_last_line_of_a_command_is_kept(tmp_path: Path) -> None:
     assert load("one", tmp_path) == result and json.loads(path.read_text())["machine"] == result.machine
 
 
+def test_figures_that_are_not_good_are_kept_and_named(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    script = tmp_path / "measure.py"
+    script.write_text("print('{\"lost\": 2}')\nraise SystemExit(1)\n")
+    assert run(f"python {script}", None).figures == {"lost": 2}
+    assert "exit status 1, its figures are not good" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
-    ("text", "why"), [("print('no figures')", "no JSON object"), ("raise SystemExit(3)", "exit status 3")]
+    ("text", "why"),
+    [
+        ("print('no figures')", "no JSON object"),
+        ("raise SystemExit(1)", "exit status 1"),
+        ("print('{}'); raise SystemExit(3)", "exit status 3"),
+    ],
 )
 def test_a_command_without_figures_is_said(tmp_path: Path, text: str, why: str) -> None:
     script = tmp_path / "measure.py"
