@@ -37,10 +37,15 @@ MEASUREMENTS: dict[str, str] = {
     "wrong_geometry": "python -m benchmarks.wrong_geometry --runs 1 --kinds slip carried --scenes room "
     "--seed 723 --json",
     "agent": "python -m benchmarks.agent --seed 724 --json",
-    "fleet": "python -m benchmarks.fleet --agents 50 200 1000 --seconds 30 --seed 733 --json",
+    "geometry": "python -m benchmarks.geometry --recording DATA/kitti03 --seed 737 --json",
+    "fleet": "python -m benchmarks.fleet --agents 10 50 200 1000 --seconds 30 --seed 733 --json",
+    "fleet_disturbed": "python -m benchmarks.fleet --agents 1000 --disturb --seconds 30 --seed 739 --json",
+    "shards": "python -m benchmarks.shards --shards 1 2 4 --seed 736 --json",
+    "shards_postgresql": "python -m benchmarks.shards --shards 1 2 4 --store postgresql --seed 736 --json",
     "life": "python -m benchmarks.life --drives 6 --stops 4 --seed 713 --json",
     "life_year": "python -m benchmarks.life --drives 100 --seed 735 --json",
     "chaos": "python -m benchmarks.chaos --agents 5 --seconds 60 --seed 734 --json",
+    "fuzz": "python -m benchmarks.fuzz --seconds 60 --seed 738 --json",
     "photographs_corridor": "mapweave eval relocalize DATA/corridor --json",
     "photographs_street": "mapweave eval relocalize DATA/kitti03 --json",
 }

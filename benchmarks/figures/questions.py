@@ -294,9 +294,10 @@ LOSSLESS = Question(
     "Is anything lost?",
     (
         Row(
-            "agents, servers, routers and PostgreSQL killed, frozen and cut off for a minute, on SQLite and "
-            "then on PostgreSQL: changes lost, duplicated, out of order, of so many sent",
-            "{lost}, {duplicated}, {out_of_order} of {sent}",
+            "agents, servers, routers and PostgreSQL killed, frozen, cut off and behind lossy links for a "
+            "minute, on SQLite and then on PostgreSQL: changes lost, duplicated, out of order, of so many "
+            "sent; of these, later ones have replaced",
+            "{lost}, {duplicated}, {out_of_order} of {sent}; {undone}",
             "chaos",
             "0, 0, 0",
         ),
@@ -314,27 +315,30 @@ FLEET = Question(
     "How many robots does a server carry?",
     (
         Row(
-            "50, 200, 1000 robots with a node every 10 s, on the server's machine: from a change to its "
-            "acknowledgement, median",
-            "{agents/50/ack_p50_ms:.0f}, {agents/200/ack_p50_ms:.0f}, {agents/1000/ack_p50_ms:.0f} ms",
+            "10, 50, 200, 1000 robots with a node every 10 s, on the server's machine: from a change to its "
+            "acknowledgement, median; a bare Zenoh query answered after a bare SQLite commit",
+            "{agents/10/ack_p50_ms:.0f}, {agents/50/ack_p50_ms:.0f}, {agents/200/ack_p50_ms:.0f}, "
+            "{agents/1000/ack_p50_ms:.0f} ms; {floor_p50_ms:.1f} ms",
             "fleet",
         ),
         Row(
             "the 99th percentile",
-            "{agents/50/ack_p99_ms:.0f}, {agents/200/ack_p99_ms:.0f}, {agents/1000/ack_p99_ms:.0f} ms",
+            "{agents/10/ack_p99_ms:.0f}, {agents/50/ack_p99_ms:.0f}, {agents/200/ack_p99_ms:.0f}, "
+            "{agents/1000/ack_p99_ms:.0f} ms; {floor_p99_ms:.1f} ms",
             "fleet",
             "500 ms",
         ),
         Row(
             "until an answer to a lost robot meanwhile, 95th percentile",
-            "{agents/50/relocalize_p95_ms:.0f}, {agents/200/relocalize_p95_ms:.0f}, "
-            "{agents/1000/relocalize_p95_ms:.0f} ms",
+            "{agents/10/relocalize_p95_ms:.0f}, {agents/50/relocalize_p95_ms:.0f}, "
+            "{agents/200/relocalize_p95_ms:.0f}, {agents/1000/relocalize_p95_ms:.0f} ms",
             "fleet",
             "250 ms",
         ),
         Row(
             "1000 changes within a second behind that: all acknowledged after",
-            "{agents/50/burst_s:.1f}, {agents/200/burst_s:.1f}, {agents/1000/burst_s:.1f} s",
+            "{agents/10/burst_s:.1f}, {agents/50/burst_s:.1f}, {agents/200/burst_s:.1f}, "
+            "{agents/1000/burst_s:.1f} s",
             "fleet",
         ),
         Row(
@@ -343,6 +347,83 @@ FLEET = Question(
             "fleet",
         ),
         Row("memory of the server with 1000 robots", "{agents/1000/server_rss_mb:.0f} MB", "fleet"),
+        Row(
+            "1000 robots while a slow, a frozen and a flooding one disturb: acknowledgement, 99th "
+            "percentile; answers, 95th percentile; changes of the thousand without acknowledgement",
+            "{agents/1000/ack_p99_ms:.0f} ms; {agents/1000/relocalize_p95_ms:.0f} ms; {agents/1000/unacked}",
+            "fleet_disturbed",
+            "500 ms; 250 ms; 0",
+        ),
+        Row(
+            "1, 2, 4 shards of a Ray cluster on the two cores of the same machine: the same links as "
+            "without; greatest difference of a pose",
+            "{same_links}; {max_pose_difference_m:.3f} m",
+            "shards",
+            "True; 0.001 m",
+        ),
+        Row(
+            "answers a second without a cluster, and with 1, 2, 4 shards",
+            "{sizes/without/answers_per_s:.0f}, {sizes/1 shards/answers_per_s:.0f}, "
+            "{sizes/2 shards/answers_per_s:.0f}, {sizes/4 shards/answers_per_s:.0f}",
+            "shards",
+        ),
+        Row(
+            "worker, shard, gateway, server and head are killed: lost, wrong; until answers are whole again, "
+            "95th percentile",
+            "{lost}, {wrong}; {recovery_s_p95:.1f} s",
+            "shards",
+            "0, 0",
+        ),
+        Row(
+            "the same with two front servers on PostgreSQL, where the second one and the primary are killed "
+            "as well",
+            "{lost}, {wrong}; {recovery_s_p95:.1f} s",
+            "shards_postgresql",
+            "0, 0",
+        ),
+        Row(
+            "there: the same links as without; greatest difference of a pose; answers a second with 1, 2, 4 "
+            "shards of each front server",
+            "{same_links}; {max_pose_difference_m:.3f} m; {sizes/1 shards/answers_per_s:.0f}, "
+            "{sizes/2 shards/answers_per_s:.0f}, {sizes/4 shards/answers_per_s:.0f}",
+            "shards_postgresql",
+            "True; 0.001 m",
+        ),
+    ),
+)
+GEOMETRY = Question(
+    "Is a wrongly declared geometry found?",
+    (
+        Row(
+            "a street (KITTI odometry 03) with the camera 1 m too far ahead, 2 degrees aside, 3 degrees "
+            "down, wheels 5 % too large, 50 ms of delay: error over that with the right geometry",
+            "{ratios/camera 1 m forward:.2f}, {ratios/heading 2 deg:.2f}, {ratios/pitch 3 deg:.2f}, "
+            "{ratios/wheel scale 5 %:.2f}, {ratios/delay 50 ms:.2f}",
+            "geometry",
+            "at most 1.3 each",
+        ),
+        Row(
+            "every cause named; images used, least", "{diagnosed}; {frames_used:.1%}", "geometry", "True; 95%"
+        ),
+        Row(
+            "error over that of the wheels alone with the same geometry, greatest",
+            "{wheels_ratio:.2f}",
+            "geometry",
+            "at most 1",
+        ),
+    ),
+)
+HOSTILE_INPUT = Question(
+    "What does hostile input do?",
+    (
+        Row(
+            "mutated messages, files, images, settings and requests: inputs; crashes, hangs, invalid ones "
+            "that are accepted",
+            "{inputs}; {crashes}, {hangs}, {accepted_invalid}",
+            "fuzz",
+            "0, 0, 0",
+        ),
+        Row("memory at most", "{peak_rss_mb:.0f} MB", "fuzz"),
     ),
 )
 SMALL_COMPUTERS = Question(
@@ -368,4 +449,7 @@ SMALL_COMPUTERS = Question(
         Row("wheels of the base installation", "{wheel_mb:.0f} MB", "agent"),
     ),
 )
-QUESTIONS = (FILTERS, DRIVING, SMALL_COMPUTERS, LANDMARKS, LOST, MERGING, LIFE, FLEET, LOSSLESS)
+QUESTIONS = (
+    FILTERS, DRIVING, SMALL_COMPUTERS, GEOMETRY, LANDMARKS, LOST, MERGING, LIFE, FLEET, LOSSLESS,
+    HOSTILE_INPUT,
+)  # fmt: skip
