@@ -25,6 +25,9 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verification import MOST_SIGMA_HEADING, MOST_SIGMA_XY, examine, verify
 from mapweave.merge.settings import ConsistencySettings, MergeSettings
 
+GIVE_POSE = "give by hand the pose"
+"""What a refusal asks for where the images say nothing; the shell adds by which options."""
+
 
 def checked_link(
     merged: MergedMap, constraints: ManualConstraints, constraint: ManualConstraint, settings: MergeSettings
@@ -91,9 +94,8 @@ def _by_images(merged: MergedMap, asked: Linked, because: str, s: ConsistencySet
         evidence = f"{found.matches} features match, {found.inliers} of them agree on a pose: {evidence}"
     if asked.pose is None:
         raise InvalidValue(
-            f"the images of {asked} do not show one place: {evidence}. If you know that they do, give by "
-            f"hand the pose of {asked.b} seen from {asked.a}, and a reason (shell: --pose X,Y,DEGREES "
-            "--because TEXT)"
+            f"the images of {asked} do not show one place: {evidence}. If you know that they do, "
+            f"{GIVE_POSE} of {asked.b} seen from {asked.a}, and a reason"
         )
     if not because:
         raise InvalidValue(f"a pose by hand, without the images ({evidence}), needs a reason")

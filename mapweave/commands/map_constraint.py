@@ -22,7 +22,7 @@ from mapweave.commands.network import (
     settings_of,
 )
 from mapweave.commands.usage import UsageError, arguments_read
-from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.errors import InvalidFile, MapweaveError
 
 if TYPE_CHECKING:
     from mapweave.hybridmap.constraint_subject import Subject
@@ -211,7 +211,15 @@ def run_link(arguments: argparse.Namespace) -> int:
     a, b = map(node_of, own_ids_of(arguments.nodes, *names_of(arguments)))
     with arguments_read():
         about = Linked(a, b, pose)
-    constrain(arguments, about)
+    try:
+        constrain(arguments, about)
+    except MapweaveError as error:
+        from mapweave.merge.link_checks import GIVE_POSE
+
+        # The refusal is the same on the page, where an option of the shell means nothing.
+        if GIVE_POSE not in str(error):
+            raise
+        raise type(error)(f"{error}: --pose X,Y,DEGREES --because TEXT") from None
     return 0
 
 
