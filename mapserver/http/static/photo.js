@@ -43,12 +43,16 @@ function whyNot(similar, show) {
   for (const place of similar) {
     const item = add(list, "li");
     button(item, place.node, () => show(place.node));
+    const short = place.inliers < place.needed ? `; ${place.needed} are needed` : "";
     const counts = place.lacks.includes("are needed") ? ""
-      : ` ${place.matches} landmarks match, ${place.inliers} agree on one pose; ${place.needed} are needed.`;
+      : ` ${place.matches} landmarks match, ${place.inliers} agree on one pose${short}.`;
     item.append(` ${place.lacks}.${counts}`);
     if (place.turn !== null && Math.abs(place.turn) > 0.12) item.append(` Turn by ${side(place.turn)} and try again.`);
     else if (place.turn !== null) item.append(" Go a step aside and try again.");
   }
+  if (similar.every(({ matches, needed }) => matches < needed))
+    add(result, "p", "None of them need be the place: no robot may have mapped what the photo shows. Turn, or go a few steps, "
+      + "and try again.");
   if (similar.some(({ matches, inliers, needed }) => matches >= MANY * needed && inliers < needed))
     add(result, "p", "Many landmarks match, but not where this camera would see them: check the height of the lens and the "
       + "angle of view above, and hold the camera level.");

@@ -1,14 +1,17 @@
-"""The views of nodes on the page in a real browser, with agents that keep them and a map server behind."""
+"""Images on the page in a real browser, with agents and a server behind: views of nodes, and photos."""
 
 from __future__ import annotations
 
+import re
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
+import skimage.data
 
 from mapweave.agent.observation import Observation
 from mapweave.agent.settings import AgentSettings
@@ -33,6 +36,8 @@ KEYS = Keys("views")
 SHOWN = "return document.querySelectorAll('{} svg.seen image').length"
 WORDS = "return document.querySelector('#selected small').textContent"
 LABEL = "return document.querySelector('{} svg').getAttribute('aria-label')"
+ANSWER = "return document.getElementById('answer').{}"
+CELLS = "return [...document.querySelectorAll('#answer td')].map(cell => cell.textContent)"
 
 
 class Fleet:
@@ -182,3 +187,92 @@ def test_a_view_that_is_lost_is_left_out(fleet: Fleet, page: Browser, show: Call
     eventually(lambda: f"No view: r1 has kept no view of {node}" in page.run(WORDS))
     assert page.run("return document.querySelector('#selected svg image')") is None
     assert "landmarks in the image of" in page.run(LABEL.format("#selected"))
+
+
+def choose(page: Browser, path: Path) -> None:
+    """By the field for files."""
+    page.type("#image", str(path))
+
+
+def drop(page: Browser, path: Path) -> None:
+    """From a folder of the desktop onto the map, as Chromium hears of it from the window system."""
+    data = {"items": [], "files": [str(path)], "dragOperationsMask": 1}
+    hint = "return document.getElementById('drop').hidden"
+    assert page.run(hint)
+    for kind in ("dragEnter", "dragOver"):
+        page.devtools("Input.dispatchDragEvent", type=kind, x=100, y=200, data=data)
+    eventually(lambda: not page.run(hint))
+    page.devtools("Input.dispatchDragEvent", type="drop", x=100, y=200, data=data)
+    eventually(lambda: page.run(hint))
+
+
+@pytest.fixture
+def photo(page: Browser, tmp_path: Path) -> Callable[[np.ndarray], Path]:
+    """Writes what the robots' camera sees, which the page knows."""
+    hfov = np.degrees(2 * np.arctan(CAMERA.width / 2 / CAMERA.fx))
+    page.run(
+        "const at = name => document.getElementById(name);"
+        "at('answer').textContent = ''; delete at('answer').dataset.certainty;"
+        f"at('height_m').value = {CAMERA.mount_height}; at('hfov').value = {hfov:.0f}"
+    )
+
+    def write(image: np.ndarray) -> Path:
+        cv2.imwrite(str(tmp_path / "photo.png"), image)
+        return tmp_path / "photo.png"
+
+    return write
+
+
+@pytest.mark.parametrize("give", [choose, drop])
+def test_a_photo_is_found_where_it_was_taken(
+    page: Browser, photo: Callable[[np.ndarray], Path], give: Callable[[Browser, Path], None]
+) -> None:
+    """All maps begin where the first robot was, so that the truth is in the frame of the merged map."""
+    taken = Pose2(0.3, 0.2, 0.1)
+    give(page, photo(PhotoWalls().render(taken)))
+    eventually(lambda: page.run(ANSWER.format("dataset.certainty")) == "found")
+    node, ahead, left, turned, _ = page.run(CELLS)
+    shown = page.run(f"const m = mapweave.model, row = m.rowOf('{node}'); return [m.x[row], m.y[row]]")
+    assert shown[0] + float(ahead.split()[0]) == pytest.approx(taken.x, abs=0.03)
+    assert shown[1] + float(left.split()[0]) == pytest.approx(taken.y, abs=0.03)
+    assert turned == "6\u00b0"
+    x, y, heading = page.run("return mapweave.page.photo[0].merged_from_robot.mean")
+    assert (x, y, heading) == pytest.approx((taken.x, taken.y, taken.heading), abs=0.03)
+    assert page.run("const v = mapweave.viewport; return [v.x, v.y]") == pytest.approx([x, y])
+    eventually(
+        lambda: "photo, " in page.run("return mapweave.painter.labels.texts.map(one => one.text).join()")
+    )
+
+
+@pytest.mark.parametrize(("heading", "side"), [(0.95, "right"), (-0.9, "left")])
+@pytest.mark.parametrize("give", [choose, drop])
+def test_a_photo_that_shows_too_little_says_where_to_turn(
+    page: Browser,
+    photo: Callable[[np.ndarray], Path],
+    give: Callable[[Browser, Path], None],
+    heading: float,
+    side: str,
+) -> None:
+    """Turned so far that one edge of the image shows what the robots have mapped."""
+    give(page, photo(PhotoWalls().render(Pose2(0.3, 0.0, heading))))
+    eventually(lambda: page.run(ANSWER.format("dataset.certainty")) == "unknown")
+    words = page.run("return document.querySelector('#answer li').textContent")
+    assert re.match(r"r\d\.1\.\d the \d+ landmarks that agree lie in \d of 24 image cells\.", words), words
+    assert re.search(r"\d+ landmarks match, \d+ agree on one pose\. ", words), "enough of them agree"
+    turn = re.search(r"Turn by (\d+)\u00b0 to the (left|right) and try again\.", words)
+    assert turn, words
+    assert turn[2] == side and np.radians(float(turn[1])) == pytest.approx(abs(heading), abs=0.1)
+    assert page.run("return mapweave.page.photo") == []
+
+
+def test_a_photo_of_another_place_is_not_known(page: Browser, photo: Callable[[np.ndarray], Path]) -> None:
+    cat = cv2.cvtColor(skimage.data.chelsea(), cv2.COLOR_RGB2GRAY)
+    drop(page, photo(cv2.resize(cat, (CAMERA.width, CAMERA.height))))
+    eventually(lambda: page.run(ANSWER.format("dataset.certainty")) == "unknown")
+    words = page.run(ANSWER.format("textContent"))
+    assert re.search(
+        r"It looks most like:r\d\.1\.\d \d features match, \d with a depth; 10 are needed\.", words
+    ), words
+    assert "Turn by" not in words and "no robot may have mapped what the photo shows" in words
+    page.run("document.querySelector('#answer li button').click()")
+    eventually(lambda: "Node r" in page.run("return document.querySelector('#selected h2').textContent"))
