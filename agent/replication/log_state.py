@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.ids import MapId
 from mapweave.wire.log_messages import Ack, Head
+
+LATE = 30.0
+"""How long a message may be on its way, s: on each of three connections (server, two routers, agent) until
+the longest lease is over, which ends the connection with all that waits in it."""
 
 
 @dataclass
@@ -23,6 +28,8 @@ class LogState:
         failure: why servers do not take this log at all; empty if they do.
         stores: by which id each server's store was known last, see mapweave.wire.log_messages.Ack.
         status_periods: that each server wants, s, likewise.
+        left: when which server was first heard of with another store than this one, in the last `LATE`; s of
+            the monotonic clock.
     """
 
     map: MapId
@@ -33,6 +40,7 @@ class LogState:
     failure: str = ""
     stores: dict[str, int] = field(default_factory=dict)
     status_periods: dict[str, float] = field(default_factory=dict)
+    left: dict[tuple[str, int], float] = field(default_factory=dict)
 
     @staticmethod
     def of(journal: Journal, map_id: MapId) -> LogState:
@@ -53,11 +61,23 @@ class LogState:
         """The beacon."""
         return Head(self.log_id, self.newest, dict(self.acknowledged))
 
+    def outdated(self, server: str, ack: Ack) -> bool:
+        """Whether an acknowledgement comes late, of a store that the server no longer has.
+
+        It may have the former store again, of a backup: `LATE` after it had another, what comes is new.
+        """
+        left = self.left.get((server, ack.store))
+        return self.stores.get(server) != ack.store and left is not None and time.monotonic() < left + LATE
+
     def lost(self, server: str, ack: Ack) -> bool:
         """Whether a server has less than it once acknowledged: it has another store now."""
-        if not ack.store or self.stores.get(server) == ack.store:
+        before, now = self.stores.get(server), time.monotonic()
+        if not ack.store or before == ack.store:
             return False
         self.stores[server] = ack.store
+        if before is not None:
+            self.left = {one: at for one, at in self.left.items() if now < at + LATE}
+            self.left[server, before] = now
         return ack.watermark < self.acknowledged.get(server, 0)
 
     def take(self, server: str, ack: Ack) -> list[str]:

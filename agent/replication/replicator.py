@@ -372,7 +372,7 @@ class Replicator:
             log.warning("%s", error)
             return
         state = self._logs.get(ack.map)
-        if state is None or ack.log_id != state.log_id:
+        if state is None or ack.log_id != state.log_id or state.outdated(server, ack):
             return
         with self._changed:
             news = state.take(server, ack)

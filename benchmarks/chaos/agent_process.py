@@ -24,6 +24,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from benchmarks.chaos.disorder import DisorderedBus
 from benchmarks.chaos.scripted_robot import ScriptedRobot
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission_control import MissionControl
@@ -122,7 +123,8 @@ def main() -> None:
         raise SystemExit(f"{name}: half of step {step} is in the journal")
     if step:
         truth.write(f"C {step} {head} {time.monotonic()}")
-    bus = ZenohBus(BusSettings(endpoints=tuple(orders.endpoints)))
+    link = ZenohBus(BusSettings(endpoints=tuple(orders.endpoints)))
+    bus = DisorderedBus(link, folder, [orders.seed, orders.robot, 2, head])
     replicator = Replicator(bus, keys, journal, map_id, orders.servers)
     client = FleetClient(
         bus, keys, map_id, MissionControl(name), answer_timeout=3.0, unsent=replicator.unacknowledged
@@ -146,6 +148,7 @@ def main() -> None:
         client.close()
         replicator.close()
         bus.close()
+        link.close()
         journal.close()
 
 

@@ -6,8 +6,11 @@
 Real processes over TCP on loopback: agents (journal, replicator, fleet client), two map servers, two routers,
 and a link between each of them and each router that can be cut, slowed, frozen, half closed and made lossy.
 The schedule is drawn with the seed and printed: at least 20 kill -9, a third as many SIGSTOP, two thirds as
-many links. A lossy link loses a fifth of TCP's segments and delays each by 50 ms: what comes through stalls
-for 0.2 s, 0.6 s, 1.4 s and more, at 39 kB a second (`mapweave.scenarios.network_emulator`).
+many links, and a third as many times in which messages come twice, late and in another order. A lossy link
+loses a fifth of TCP's segments and delays each by 50 ms: what comes through stalls for 0.2 s, 0.6 s, 1.4 s
+and more, at 39 kB a second (`mapweave.scenarios.network_emulator`). Messages of an agent (changes, beacons,
+statuses) or of a server (acknowledgements) are disordered at the agents' links (`benchmarks.chaos.disorder`);
+`doubled` and `reordered` are changes, as a listener at the routers hears them meanwhile.
 With SQLite a server is also killed and its store deleted; it gets everything from the agents again. With
 PostgreSQL both servers share a database, which is killed as well. Without `--store` the fleet runs on both,
 one after the other, where there is a PostgreSQL: counts are summed, times are those of the worse store, and
@@ -44,6 +47,8 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
 from benchmarks.chaos.account import Account, account, sent_changes
+from benchmarks.chaos.agent_process import FLEET
+from benchmarks.chaos.disorder import RouterListener
 from benchmarks.chaos.fleet_processes import DATABASE, ROUTERS, SERVERS, SQLITE, FleetProcesses
 from benchmarks.chaos.questions import LostRobot
 from benchmarks.chaos.recovery import RobotTimes, recoveries
@@ -56,8 +61,8 @@ from mapweave.scenarios.children import ChildFailed
 from synthetic.postgres_server import PostgresServer, binaries
 
 POSTGRESQL = "postgresql"
-COUNTED = ("kills", "lost_stores", "stops", "cuts", "lossy")
-"""Disturbances, in a report."""
+COUNTED = ("kills", "lost_stores", "stops", "cuts", "lossy", "disorders", "doubled", "reordered")
+"""Disturbances in a report, and messages that they have doubled and reordered."""
 START = 120.0
 """Longest wait until both servers answer, s."""
 SETTLE = 120.0
@@ -166,7 +171,8 @@ def run(
         step = progress.add_task("the fleet starts", total=None)
         wait_until(lambda: acknowledged(folder, names), START, "not all robots are acknowledged at the start")
         progress.update(step, description="the fleet runs", total=1, completed=1)
-        done = disturb(fleet, schedule, seconds, progress)
+        with RouterListener(fleet.endpoints, FLEET) as heard:
+            done = disturb(fleet, schedule, seconds, progress)
         *gaps, frozen = relocalize_gaps(fleet, seed, progress)
         fleet.stop_mapping()
         (folder / "disturbances.json").write_text(json.dumps(done))
@@ -199,6 +205,7 @@ def run(
         "kills": sum(kind in KILLS for kind in kinds), "lost_stores": kinds.count(Kind.LOSE_STORE),
         "stops": kinds.count(Kind.STOP), "lossy": kinds.count(Kind.LOSSY),
         "cuts": sum(kind in LINKS for kind in kinds) - kinds.count(Kind.LOSSY),
+        "disorders": kinds.count(Kind.DISORDER), "doubled": heard.doubled, "reordered": heard.reordered,
     }  # fmt: skip
 
 

@@ -18,6 +18,7 @@ from itertools import chain
 from pathlib import Path
 
 from benchmarks.chaos.agent_process import ENOUGH, FLEET, Orders
+from benchmarks.chaos.disorder import flag
 from benchmarks.chaos.schedule import Kind
 from benchmarks.fleet.drives import name_of
 from mapweave.processes import parent_watchdog
@@ -157,6 +158,8 @@ class FleetProcesses:
                 self.kill(target)
             case Kind.STOP:
                 self._signal(target, signal.SIGSTOP)
+            case Kind.DISORDER:
+                flag(self.folder, target).touch()
         if kind is Kind.LOSE_STORE:
             path = Path(self.store_of(target))
             for part in path.parent.glob(f"{path.name}*"):
@@ -186,6 +189,8 @@ class FleetProcesses:
                 self.start(target)
             case Kind.STOP:
                 self._signal(target, signal.SIGCONT)
+            case Kind.DISORDER:
+                flag(self.folder, target).unlink()
         for link in self.links.get(target, []):
             link.restore()
 

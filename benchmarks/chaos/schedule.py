@@ -26,6 +26,8 @@ class Kind(StrEnum):
     HALF = "links half closed"
     LOSSY = "links lossy"
     """A share of TCP's segments is lost: stalls, and little throughput."""
+    DISORDER = "messages doubled and late"
+    """What it has published comes twice, late and in another order."""
 
 
 KILLS = (Kind.KILL, Kind.LOSE_STORE)
@@ -40,7 +42,7 @@ LINKS = (
 LASTING = {
     Kind.KILL: (0.1, 1.5), Kind.LOSE_STORE: (0.1, 1.5), Kind.STOP: (0.5, 7.0), Kind.CUT: (0.2, 3.0),
     Kind.SLOW: (1.0, 4.0), Kind.FROZEN: (0.5, 7.0), Kind.FLAP: (1.0, 4.0), Kind.HALF: (0.1, 0.5),
-    Kind.LOSSY: (2.0, 7.0),
+    Kind.LOSSY: (2.0, 7.0), Kind.DISORDER: (2.0, 7.0),
 }  # fmt: skip
 """Shortest and longest time between beginning and end, s. The lease of a connection is 5 s."""
 
@@ -95,6 +97,9 @@ def draw_schedule(
         kinds.append(LINKS[k % len(LINKS)])
         # Each kind meets agents and servers.
         victims.append((agents, agents, servers)[(k + k // len(LINKS)) % 3])
+    for k in range(kills // 3):
+        kinds.append(Kind.DISORDER)
+        victims.append((agents, agents, servers)[k % 3])
     order = rng.permutation(len(kinds))
     slot = seconds / len(kinds)
     free = dict.fromkeys((name for group in groups for name in group), 0.0)

@@ -19,15 +19,21 @@ import pytest
 from benchmarks.chaos.account import Account, BrokenLog, account, sent_changes
 from benchmarks.chaos.agent_process import STAMP, digest
 from benchmarks.chaos.benchmark import comes_true, good, percentile, together
+from benchmarks.chaos.disorder import ChangeListener, DisorderedBus, flag
 from benchmarks.chaos.fleet_processes import FleetProcesses
 from benchmarks.chaos.recovery import NEVER, RobotTimes, recoveries
 from benchmarks.chaos.schedule import KILLS, LEAST_KILLS, Kind, draw_schedule
 from benchmarks.chaos.scripted_robot import ScriptedRobot
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import element_of, encode_change
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import Mark
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.waiting import eventually
 
 STEPS = 40
 GROUPS = (("r0", "r1"), ("s0", "s1"), ("z0", "z1"))
@@ -183,7 +189,8 @@ def test_a_schedule_is_that_of_its_seed_and_kills_often_enough() -> None:
         schedule = draw_schedule(60.0, GROUPS, seed, True)
         assert sum(one.kind in KILLS for one in schedule) >= LEAST_KILLS
         lossy = {one.target[0] for one in schedule if one.kind is Kind.LOSSY}
-        assert lossy == {"r", "s"}, "links of robots and of servers"
+        disordered = {one.target[0] for one in schedule if one.kind is Kind.DISORDER}
+        assert lossy == disordered == {"r", "s"}, "links and messages of robots and of servers"
         for name in ("r0", "s1", "z0"):
             mine = [one for one in schedule if one.target == name]
             assert mine and all(a.at + a.lasts <= b.at for a, b in pairwise(mine))
@@ -193,8 +200,47 @@ ON_SQLITE = {
     "store": "sqlite", "sent": 3, "stored": 3, "undone": 0, "lost": 0, "duplicated": 0, "out_of_order": 0,
     "unacknowledged": 0, "maps_equal": True, "recovery_s_p50": 1.0, "recovery_s_p95": 2.0,
     "relocalize_gap_s": 0.3, "frozen_router_gap_s": 5.0, "kills": 20, "lost_stores": 1, "stops": 7,
-    "cuts": 11, "lossy": 2,
+    "cuts": 11, "lossy": 2, "disorders": 7, "doubled": 5, "reordered": 3,
 }  # fmt: skip
+
+
+def test_messages_come_twice_and_late_and_none_is_lost(
+    hub: MemoryHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("benchmarks.chaos.disorder.LONGEST", 0.5)
+    robot, server, keys = MemoryBus(hub), MemoryBus(hub), Keys("fleet")
+    link = DisorderedBus(robot, tmp_path, [3])
+    map_id, heard = MapId("r0", 1), list[int]()
+    listener = ChangeListener(server, keys)
+    server.subscribe(keys.changes(), lambda sample: heard.append(Mark.decode(sample.attachment).sequence))
+    acks = list[bytes]()
+    link.subscribe(keys.acks("r0"), lambda sample: acks.append(sample.payload), direct=True)
+
+    def publish(first: int, last: int) -> None:
+        for sequence in range(first, last + 1):
+            link.publish(keys.change(map_id), b"change", Mark(sequence, 7).encode())
+            for name in ("s0", "s1"):
+                server.publish(keys.ack(name, "r0"), f"{name} {sequence}".encode())
+
+    publish(1, 50)
+    eventually(lambda: heard == list(range(1, 51)) and len(acks) == 100)
+    assert (listener.doubled, listener.reordered) == (0, 0)
+    flag(tmp_path, "r0").touch()
+    flag(tmp_path, "s1").touch()
+    publish(51, 100)
+    flag(tmp_path, "r0").unlink()
+    eventually(lambda: set(heard) == set(range(1, 101)) and len(set(acks)) == 200)
+    link.close()
+    eventually(lambda: listener.doubled == len(heard) - 100 > 5)
+    # By hand: what comes again, and what comes first behind a greater one.
+    first = [number for k, number in enumerate(heard) if number not in heard[:k]]
+    assert listener.reordered == sum(n < max(first[: k + 1]) for k, n in enumerate(first)) > 5
+    steady = [ack for ack in acks if ack.startswith(b"s0")]
+    assert steady == [f"s0 {k}".encode() for k in range(1, 101)], "the messages of s0 stay as they are"
+    late = [ack for ack in acks if ack.startswith(b"s1")]
+    assert len(late) > 105 and late != sorted(late, key=lambda ack: int(ack[3:]))
+    for bus in (robot, server):
+        bus.close()
 
 
 def test_what_is_lost_on_one_store_is_lost_on_both() -> None:
@@ -205,6 +251,7 @@ def test_what_is_lost_on_one_store_is_lost_on_both() -> None:
     assert not good(both) and both["stores"] == [one, other] and both["store"] == "sqlite and postgresql"
     assert (both["sent"], both["stored"], both["lost"], both["maps_equal"]) == (6, 5, 1, False)
     assert both["relocalize_gap_s"] == 0.7 and both["kills"] == 40 and both["lossy"] == 4
+    assert (both["disorders"], both["doubled"], both["reordered"]) == (14, 10, 6)
 
 
 def test_what_stays_unacknowledged_is_in_the_report() -> None:
@@ -242,6 +289,7 @@ def test_nothing_is_lost_in_a_short_chaos() -> None:
     assert ran.returncode == 0, ran.stderr[-2000:]
     report = json.loads(ran.stdout.splitlines()[-1])
     assert report["kills"] >= LEAST_KILLS and report["lost_stores"] > 0 and report["lossy"] > 0
+    assert report["doubled"] > 0 and report["reordered"] > 0
     assert report["sent"] == report["stored"] + report["undone"] > 100
     assert (report["lost"], report["duplicated"], report["out_of_order"]) == (0, 0, 0)
     assert report["unacknowledged"] == 0

@@ -317,6 +317,32 @@ def test_a_server_that_has_lost_its_store_lacks_everything_again(
     agent.close()
 
 
+def test_a_late_acknowledgement_of_a_store_that_is_lost_says_nothing(
+    hub: MemoryHub, path: Path, server: HandServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot would drop retirements that the new store has never had."""
+    agent = Agent(hub, path)
+    agent.replicator.submit(bodies(1, 3), 0)
+    assert agent.replicator.flush(30)
+    server.acknowledge(agent.log_id, 3, store=5)
+    assert agent.replicator.wait_acknowledged(30)
+    server.acknowledge(agent.log_id, 1, store=6)
+    eventually(lambda: agent.replicator.status().unacknowledged == 2)
+    # On their way since before the store was lost; what s9 says shows that they were heard.
+    for _ in range(2):
+        server.acknowledge(agent.log_id, 3, store=5)
+    server.bus.publish(KEYS.ack("s9", "r0"), Ack(MAP, agent.log_id, 1).encode())
+    eventually(lambda: "s9" in agent.journal.acknowledged(MAP))
+    assert agent.journal.acknowledged(MAP) == {"s0": 1, "s9": 1}
+    server.acknowledge(agent.log_id, 2, store=6)
+    eventually(lambda: agent.replicator.status().unacknowledged == 1)
+    # A backup of the former store was put back.
+    monkeypatch.setattr("mapweave.agent.replication.log_state.LATE", 0.0)
+    server.acknowledge(agent.log_id, 3, store=5)
+    assert agent.replicator.wait_acknowledged(30)
+    agent.close()
+
+
 def test_a_server_that_has_more_than_the_disk(
     agent: Agent, server: HandServer, caplog: pytest.LogCaptureFixture
 ) -> None:
