@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -30,19 +29,8 @@ from mapweave.scenarios.process_fleet import ProcessFleet
 from mapweave.scenarios.scenario import load_scenario, scenario_path
 from mapweave.storage.map_file import read_map_file
 from tests.mapweave.command_line import complaint
+from tests.mapweave.log_readers import read
 from tests.mapweave.wall_drive import COUNT, STEP, wall_drive
-from tests.simulator import needs_simulator
-
-
-def read(folder: Path) -> dict[str, list[tuple[int, Any]]]:
-    """Stamps and messages by topic."""
-    found: dict[str, list[tuple[int, Any]]] = {}
-    with AnyReader([folder]) as reader:
-        for connection, stamp, data in reader.messages():
-            found.setdefault(connection.topic, []).append(
-                (stamp, reader.deserialize(data, connection.msgtype))
-            )
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -183,24 +171,6 @@ def test_what_is_no_place_for_a_log_is_refused(
     assert "--mcap-log" in output and "not empty" in output
     with pytest.raises(SettingsError, match=r"--mcap-log .*camera\.toml"):
         McapLog(str(drive / "camera.toml" / "x"))
-
-
-@needs_simulator
-def test_each_robot_of_a_trial_has_a_log_and_one_that_is_started_again_another(tmp_path: Path) -> None:
-    from mapweave.scenarios.local_fleet import LocalFleet
-
-    scenario = load_scenario(scenario_path("office"), ["robots=2", "world.rooms=3"])
-    fleet = LocalFleet(TrialStage(scenario, 1, tmp_path, AgentSettings(), mcap_log=True))
-    fleet.start()
-    fleet.advance(6)
-    fleet.kill_agent("r0")
-    fleet.start_agent("r0")
-    fleet.advance(10)
-    fleet.end()
-    names = ("r0.1", "r0.2", "r1.1")
-    assert sorted(path.name for path in (tmp_path / "mcap").iterdir()) == sorted(names)
-    counts = [len(read(tmp_path / "mcap" / name)["/status"]) for name in names]
-    assert counts[0] + counts[1] == counts[2] == 10
 
 
 def test_agents_in_processes_of_their_own_are_given_folders_for_their_logs(

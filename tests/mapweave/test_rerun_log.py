@@ -20,48 +20,23 @@ from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.camera_file import read_camera
-from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.scenarios.fleet import TrialStage
-from mapweave.scenarios.scenario import load_scenario, scenario_path
 from mapweave.storage.map_file import read_map_file
 from mapweave.vision.lens import Lens
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.agent.localization.test_node_localizer import located
 from tests.mapweave.command_line import complaint
+from tests.mapweave.log_readers import rows_of
 from tests.mapweave.wall_drive import COUNT, STEP, wall_drive
-from tests.simulator import needs_simulator
 from tests.waiting import free_port
 
 # Each process that collects tests would wait for it, so it is imported where it is used.
 pytestmark = pytest.mark.skipif(find_spec("rerun") is None, reason='needs the extra "rerun"')
-
-Rows = dict[str, list[tuple[int, Any]]]
-
-
-def rows_of(path: Path) -> Rows:
-    """By `entity:component`, the stamps and the values of a recording."""
-    from rerun.chunk import RrdReader
-
-    reader = RrdReader(path)
-    (recording,) = reader.recordings()
-    assert recording.application_id == "mapweave"
-    found: Rows = {}
-    for chunk in reader.store().stream():
-        table = chunk.to_record_batch().to_pydict()
-        stamps = table.get("stamp", [None] * chunk.num_rows)
-        for name, column in table.items():
-            if name not in ("stamp", "rerun.controls.RowId"):
-                for stamp, value in zip(stamps, column, strict=True):
-                    if value is not None:
-                        at = 0 if stamp is None else stamp.value if hasattr(stamp, "value") else int(stamp)
-                        found.setdefault(f"{chunk.entity_path}:{name.split(':')[-1]}", []).append((at, value))
-    return {name: sorted(column, key=lambda row: row[0]) for name, column in found.items()}
 
 
 @pytest.fixture(scope="module")
@@ -229,21 +204,3 @@ def test_while_navigating_it_shows_the_landmarks_of_the_node_where_the_image_has
     rays = points - [camera.mount_forward, 0.0, camera.mount_height]
     along = np.abs(np.einsum("ni,ni->n", axes[:, :, 2], rays)) / np.linalg.norm(rays, axis=1)
     assert np.median(along) > 0.95
-
-
-@needs_simulator
-def test_each_robot_of_a_trial_has_a_log_and_one_that_is_started_again_another(tmp_path: Path) -> None:
-    from mapweave.scenarios.local_fleet import LocalFleet
-
-    scenario = load_scenario(scenario_path("office"), ["robots=2", "world.rooms=3"])
-    fleet = LocalFleet(TrialStage(scenario, 1, tmp_path, AgentSettings(), rerun=True))
-    fleet.start()
-    fleet.advance(6)
-    fleet.kill_agent("r0")
-    fleet.start_agent("r0")
-    fleet.advance(10)
-    fleet.end()
-    names = ("r0.1", "r0.2", "r1.1")
-    assert sorted(path.stem for path in (tmp_path / "rerun").iterdir()) == sorted(names)
-    counts = [len(rows_of(tmp_path / "rerun" / f"{name}.rrd")[f"/{name[:2]}/now:text"]) for name in names]
-    assert counts[0] + counts[1] == counts[2] == 10
