@@ -11,6 +11,7 @@ import numpy as np
 from mapweave.hybridmap.annotation import BODIES, Annotation, Annotations, Body, Place
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.floor_plan import IDENTITY, PlacedPlans, PlanPart
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.named_nodes import Resolve
@@ -18,6 +19,7 @@ from mapweave.hybridmap.query import Resolved, ResolveRequest
 from mapweave.hybridmap.wall_time import read_time
 from mapweave.mapserver.field_words import field_words
 from mapweave.mapserver.places import others_of, position_of
+from mapweave.mapserver.plan_answers import in_merged, near_part, word_in_merged
 from mapweave.wire.typed import packed, value_of
 
 NODES = ("node", "anchor", "a", "b", "merged_from_node")
@@ -50,7 +52,12 @@ Value = TypeVar("Value")
 
 
 def body_of_words(
-    kind: str, fields: Mapping[str, Any], resolve: Resolve, annotations: Annotations, now_ns: int
+    kind: str,
+    fields: Mapping[str, Any],
+    resolve: Resolve,
+    annotations: Annotations,
+    plans: Callable[[], PlacedPlans],
+    now_ns: int,
 ) -> Body:
     """The body of an annotation.
 
@@ -62,9 +69,12 @@ def body_of_words(
             or `corners`, a list of positions in the merged map (in the frame of the component of `near`, a
             node or place; of the largest component without), or `radius`, m, around `node`; or
             `place`, a named place. A pair of a plan has `at`, such a word, or `node` with `x` and `y`. A pin
-            without `merged_from_node` holds its node where it is.
+            without `merged_from_node` holds its node where it is. With `plan`, the name of a floor plan,
+            positions are on it, under the component of `near` or that with most of its pairs; a pin then
+            gives its component the coordinates of the plan.
         resolve: returns nodes for words.
         annotations: the record.
+        plans: returns the floor plans under the map.
         now_ns: the present time.
 
     Raises:
@@ -76,6 +86,14 @@ def body_of_words(
     corners, radius, near = (plain.pop(name, None) for name in ("corners", "radius", "near"))
     if not isinstance(near, str | None):
         raise InvalidValue(f"`near` is a node or the name of a place, not {near!r:.40}")
+    plan = plain.pop("plan", None) if kind != "plan" else None
+    placed = None if plan is None else plans().plan(str(plan))
+    if placed is not None and kind != "pin":
+        part = placed.part(_found(near, "", resolve).component if near else None)
+        near = near or near_part(part)
+        plain = {name: _in_merged(value, name, part) for name, value in plain.items()}
+        if corners is not None:
+            corners = [in_merged(corner, part) for corner in _corners(corners)]
     for name in TIMES:
         if isinstance(plain.get(name), str):
             begin_ns = plain.get("begin_ns")
@@ -100,8 +118,13 @@ def body_of_words(
         plain["edge"] = [_node(word, "node", near, resolve) for word in edge]
     if isinstance(pairs := plain.get("pairs"), list | tuple):
         plain["pairs"] = [_pair(pair, near, resolve) for pair in pairs]
-    if kind == "pin" and "merged_from_node" not in plain and isinstance(word := plain.get("node"), str):
-        plain["merged_from_node"] = packed(_found(word, near or "", resolve).merged_from_node)
+    if kind == "pin" and isinstance(word := plain.get("node"), str):
+        if placed is not None and "merged_from_node" in plain:
+            raise InvalidValue(f"plan {placed.name} says where {word} is on it: leave the pose out")
+        if "merged_from_node" not in plain:
+            found = _found(word, near or "", resolve)
+            frame = IDENTITY if placed is None else placed.part(found.component).plan_from_merged
+            plain["merged_from_node"] = packed(frame @ found.merged_from_node)
     body = {name: _node(value, name, near, resolve) for name, value in plain.items()}
     unknown = body.keys() - BODIES[kind].__dataclass_fields__.keys() - {"kind"}
     if unknown:
@@ -161,8 +184,21 @@ def _pair(pair: Any, near: str | None, resolve: Resolve) -> Any:
     return {**plain, "node": packed(found.node), "x": x, "y": y}
 
 
+def _in_merged(value: Any, name: str, part: PlanPart) -> Any:
+    """A field whose words that are positions on a plan become such in the frame of a component."""
+    if name in NODES and isinstance(value, str):
+        return word_in_merged(value, part)
+    if name == "edge" and isinstance(value, list | tuple):
+        return [_in_merged(word, "node", part) for word in value]
+    return value
+
+
+def _corners(corners: Any) -> list[tuple[float, float]]:
+    return _value(corners, list[tuple[float, float]], "corners")
+
+
 def _area(corners: Any, near: str, resolve: Resolve) -> Area:
-    points = _value(corners, list[tuple[float, float]], "corners")
+    points = _corners(corners)
     if not points:
         raise InvalidValue("an area has 3 corners or more")
     # Written so that NaN fails.
@@ -179,6 +215,7 @@ def annotation_of_words(
     removed: bool,
     annotations: Callable[[], Annotations],
     resolve: Resolve,
+    plans: Callable[[], PlacedPlans],
     who: str,
     because: str,
     stamp_ns: int,
@@ -191,6 +228,7 @@ def annotation_of_words(
         removed: whether the entry of this name is withdrawn.
         annotations: returns the record.
         resolve: returns nodes for words.
+        plans: returns the floor plans under the map.
         who: says so.
         because: why.
         stamp_ns: the present time.
@@ -207,5 +245,5 @@ def annotation_of_words(
             raise not_there(kind, name, annotations())
         body = before.body
     else:
-        body = body_of_words(kind, fields, resolve, annotations(), stamp_ns)
+        body = body_of_words(kind, fields, resolve, annotations(), plans, stamp_ns)
     return Annotation(name, body, removed, who, stamp_ns, because)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -9,10 +10,17 @@ import numpy as np
 
 from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
 from mapweave.hybridmap.errors import Refused
-from mapweave.hybridmap.floor_plan import PlacedPlan
+from mapweave.hybridmap.floor_plan import PlacedPlan, PlanPart
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.named_nodes import Resolve
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import NO_COMPONENT, RelocalizeAnswer, ResolveRequest, Whereabouts
+from mapweave.hybridmap.query import (
+    MAX_WORDS_ASKED,
+    NO_COMPONENT,
+    RelocalizeAnswer,
+    ResolveRequest,
+    Whereabouts,
+)
 from mapweave.mapserver.places import position_of
 
 
@@ -93,8 +101,7 @@ def goal_on_plan(goal: str, plan: PlacedPlan, component: int, resolve: Resolve) 
         Refused: the plan does not lie where the robot is.
         InvalidValue: no node is near.
     """
-    position = position_of(goal)
-    if position is None:
+    if position_of(goal) is None:
         return goal
     if component == NO_COMPONENT and len(plan.parts) > 1:
         raise Refused(
@@ -102,9 +109,42 @@ def goal_on_plan(goal: str, plan: PlacedPlan, component: int, resolve: Resolve) 
             "the robot is: give a node, or the name of a place"
         )
     part = plan.part(None if component == NO_COMPONENT else component)
-    x, y = part.plan_from_merged.inverse().apply(np.array(position))
-    near = str(part.pairs[0].node)
-    return str(resolve(ResolveRequest((f"{x:.3f},{y:.3f}",), near)).found[0].node)
+    request = ResolveRequest((word_in_merged(goal, part),), near_part(part))
+    return str(resolve(request).found[0].node)
+
+
+def nodes_on_plan(nodes: Sequence[NodeId], plan: PlacedPlan, resolve: Resolve) -> list[Pose2 | None]:
+    """Where nodes of the merged map are on a plan, m and rad; None where the plan does not lie.
+
+    Raises:
+        InvalidValue: one is not in the merged map.
+    """
+    found = (
+        one
+        for begin in range(0, len(nodes), MAX_WORDS_ASKED)
+        for one in resolve(ResolveRequest(tuple(map(str, nodes[begin : begin + MAX_WORDS_ASKED])))).found
+    )
+    return [plan.pose(one.component, one.merged_from_node) for one in found]
+
+
+def word_in_merged(word: str, part: PlanPart) -> str:
+    """A position on a plan, `9.0,7.0`, as one in the frame of a component; all other words as they are."""
+    position = position_of(word)
+    if position is None:
+        return word
+    x, y = in_merged(position, part)
+    return f"{x:.3f},{y:.3f}"
+
+
+def in_merged(position: tuple[float, float], part: PlanPart) -> tuple[float, float]:
+    """A position on a plan, m, in the frame of a component."""
+    x, y = part.plan_from_merged.inverse().apply(np.array(position)).tolist()
+    return x, y
+
+
+def near_part(part: PlanPart) -> str:
+    """A node of a component, as `near` of a question: positions are in its frame."""
+    return str(part.pairs[0].node)
 
 
 def component_of(robot: str, status: FleetStatus) -> int:

@@ -16,7 +16,7 @@ from mapweave.wire.typed import packed
 NodeWord = NodeId | str
 """A node, also as people write it: `r0.1.17`, the name of a place, a position `3.1,-2.0`."""
 Corners = Sequence[tuple[float, float]]
-"""Of an area, in order around it, m, in the merged map."""
+"""Of an area, in order around it, m, in the merged map, or on a plan."""
 Time = str | int
 """ns since 1970, or text such as `2026-03-01 14:00`, in UTC unless it names a zone."""
 
@@ -54,6 +54,7 @@ class AnnotationMethods(ABC):
         radius: float | None = None,
         corners: Corners | None = None,
         near: str = "",
+        plan: str | None = None,
         because: str = "",
         check: bool = False,
     ) -> str:
@@ -65,10 +66,11 @@ class AnnotationMethods(ABC):
             radius: of the floor around it, m.
             corners: of an area.
             near: in the part of the map where this node or place is; the largest part without.
+            plan: a floor plan, in whose frame positions are then, instead of in the merged map.
             because: why.
             check: only say what it would do.
         """
-        fields = _given(node=_word(node), radius=radius, corners=corners, near=near)
+        fields = _given(node=_word(node), radius=radius, corners=corners, near=near, plan=plan)
         return self.annotate("place", name, because, check=check, **fields)
 
     def close_way(
@@ -81,6 +83,7 @@ class AnnotationMethods(ABC):
         radius: float | None = None,
         corners: Corners | None = None,
         near: str = "",
+        plan: str | None = None,
         begin: Time | None = None,
         end: Time | None = None,
         because: str = "",
@@ -96,12 +99,13 @@ class AnnotationMethods(ABC):
             radius: of the floor around it, or around the place, m.
             corners: of an area.
             near: see `place`.
+            plan: see `place`.
             begin: from when on; from now on without.
             end: until when; until it is withdrawn without.
             because: why.
             check: only say what it would do.
         """
-        where = _where(edge, place, node, radius, corners, near)
+        where = _where(edge, place, node, radius, corners, near, plan)
         fields = {**where, **_given(begin_ns=begin, end_ns=end)}
         return self.annotate("closure", name, because, check=check, **fields)
 
@@ -116,6 +120,7 @@ class AnnotationMethods(ABC):
         radius: float | None = None,
         corners: Corners | None = None,
         near: str = "",
+        plan: str | None = None,
         because: str = "",
         check: bool = False,
     ) -> str:
@@ -130,10 +135,11 @@ class AnnotationMethods(ABC):
             radius: see there, m.
             corners: see there.
             near: see there.
+            plan: see there.
             because: why.
             check: only say what it would do.
         """
-        fields = {**_where(edge, place, node, radius, corners, near), "factor": factor}
+        fields = {**_where(edge, place, node, radius, corners, near, plan), "factor": factor}
         return self.annotate("preference", name, because, check=check, **fields)
 
     def floor(self, node: NodeWord, label: str, *, because: str = "", check: bool = False) -> str:
@@ -189,11 +195,19 @@ class AnnotationMethods(ABC):
         return self.annotate("plan", name, because, check=check, **fields)
 
     def pin(
-        self, node: NodeWord, pose: Pose2 | None = None, *, because: str = "", check: bool = False
+        self,
+        node: NodeWord,
+        pose: Pose2 | None = None,
+        *,
+        plan: str | None = None,
+        because: str = "",
+        check: bool = False,
     ) -> str:
-        """Hold the frame of a component by one of its nodes: at a pose, or where it is now."""
+        """Hold the frame of a component by one of its nodes: at a pose, or where it is now; with a floor plan
+        at its pose on that, so that the component gets the coordinates of the plan.
+        """
         own = str(self.resolve(_word(node)).found[0].node)
-        fields = {} if pose is None else {"merged_from_node": packed(pose)}
+        fields = _given(plan=plan, merged_from_node=None if pose is None else packed(pose))
         return self.annotate("pin", own, because, check=check, node=own, **fields)
 
 
@@ -204,8 +218,9 @@ def _where(
     radius: float | None,
     corners: Corners | None,
     near: str,
+    plan: str | None,
 ) -> dict[str, Any]:
-    fields = _given(place=place, node=_word(node), radius=radius, corners=corners, near=near)
+    fields = _given(place=place, node=_word(node), radius=radius, corners=corners, near=near, plan=plan)
     return fields if edge is None else {**fields, "edge": [_word(end) for end in edge]}
 
 

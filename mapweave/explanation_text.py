@@ -114,11 +114,20 @@ def maps_words(explanation: MapsExplanation) -> list[str]:
     return lines
 
 
-def route_words(explanation: RouteExplanation) -> list[str]:
-    """The explanation of a route, line by line."""
+def route_words(explanation: RouteExplanation, places: Sequence[str] | None = None) -> list[str]:
+    """The explanation of a route, line by line.
+
+    Args:
+        explanation: of the route.
+        places: where its start and the end of each of its hops are, in words.
+    """
     way = "the route is" if explanation.found else "there is no way"
     lines = [f"{explanation.start} to {explanation.goal}: {way}: {explanation.reason}"]
-    lines += [f"  {_hop(hop)}" for hop in explanation.hops]
+    steps = [f"  {_hop(hop)}" for hop in explanation.hops]
+    if places is not None:
+        lines.append(f"  {explanation.start} {places[0]}")
+        steps = [f"{step}, {place}" for step, place in zip(steps, places[1:], strict=True)]
+    lines += steps
     if explanation.gaps:
         lines.append("  not driven, and so not taken:" if explanation.found else "  what is missing:")
     lines += [f"    {_hop(hop)}" for hop in explanation.gaps[:MOST_LINKS]]

@@ -112,8 +112,9 @@ class FleetAnnotations(FleetQuestions, AnnotationMethods):
         self._check_role()
         with refusals():
             annotation = annotation_of_words(
-                name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
-            )
+                name, fields, removed, self.annotations, self.resolve, self.plans, self._by, because,
+                time.time_ns(),
+            )  # fmt: skip
         key = sent_by(self._keys.any_annotate(), self._sender)
         return str(
             decode_record(self._question(key, encode(AnnotationRequest(annotation, check)), ANSWER))["said"]

@@ -43,7 +43,7 @@ from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.named_nodes import asked_of, ids_of
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pin import Pin
-from mapweave.hybridmap.pose import PoseGaussian
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.login import login
 from mapweave.map_reading import MapReading
@@ -121,6 +121,15 @@ class Map(ABC):
         """The nodes in columns, which are NumPy arrays."""
         return self._reading.nodes
 
+    def nodes_on(self, plan: str) -> NodeTable:
+        """The nodes of the components under which a floor plan lies, with their poses in its frame.
+
+        Raises:
+            MissingExtra: that needs the extra "server".
+            Refused: there is no such plan.
+        """
+        return self._reading.nodes_on(plan)
+
     def node(self, node: NodeName) -> Node:
         """A node with its camera and landmarks.
 
@@ -158,26 +167,39 @@ class Map(ABC):
             lambda edge: {name: float(edge.evidence[name]) for name in wanted if name in edge.evidence},
         )  # fmt: skip
 
-    def plot(self, axes: Axes | None = None, component: int = 0, landmarks: bool = True) -> Axes:
+    def plot(
+        self,
+        axes: Axes | None = None,
+        component: int | None = None,
+        landmarks: bool = True,
+        plan: str | None = None,
+    ) -> Axes:
         """Draw a component: nodes, edges and links, with the landmarks that the nodes see.
 
         Args:
             axes: where; by default in a new figure.
-            component: which; each has a frame of its own.
+            component: which; each has a frame of its own. By default 0, the largest; with a plan that with
+                most of its pairs.
             landmarks: whether they are drawn.
+            plan: a floor plan, in whose frame the axes are then; with the extra "server".
 
         Returns:
             The axes; `axes.figure.savefig("map.png")` writes the picture.
 
         Raises:
             MissingExtra: matplotlib is not installed.
-            Refused: there is no such component.
+            Refused: there is no such component, or no such plan under it.
         """
         need("viz")
         from mapweave.drawing.map_picture import MapPicture, draw_on
 
         reading = self._reading
-        poses = {n: pose.mean for n, (number, pose) in reading.placed.items() if number == component}
+        component, frame_from_merged = self._frame(component, plan)
+        poses = {
+            n: frame_from_merged @ pose.mean
+            for n, (number, pose) in reading.placed.items()
+            if number == component
+        }
         check_component(component, len({number for number, _ in reading.placed.values()}))
         if axes is None:
             from matplotlib import pyplot
@@ -243,6 +265,7 @@ class Map(ABC):
         goal: NodeName,
         blocked: Iterable[tuple[NodeName, NodeName]] = (),
         via: Iterable[NodeName] = (),
+        plan: str | None = None,
     ) -> RouteExplanation:
         """The way that a robot would drive, step by step, or why there is none.
 
@@ -251,6 +274,7 @@ class Map(ABC):
             goal: another one.
             blocked: as if a robot could not get through between these.
             via: what to pass before, in order.
+            plan: a floor plan, in whose frame positions are then, under the component with most of its pairs.
 
         Raises:
             InvalidValue: one place is given for a list of places, or for a pair.
@@ -260,7 +284,13 @@ class Map(ABC):
         pairs_of_names = [listed("blocked", pair) for pair in blocked]
         if any(len(pair) != 2 for pair in pairs_of_names):
             raise InvalidValue("`blocked` is a list of pairs of nodes")
-        nodes = self._named(*stops, *(end for pair in pairs_of_names for end in pair))
+        words = [*stops, *(end for pair in pairs_of_names for end in pair)]
+        if plan is not None:
+            from mapweave.mapserver.plan_answers import goal_on_plan
+
+            placed = self.plans().plan(plan)
+            words = [goal_on_plan(str(w), placed, placed.part().component, self.resolve) for w in words]
+        nodes = self._named(*words)
         stopping, closed = nodes[: len(stops)], nodes[len(stops) :]
         pairs = tuple(zip(closed[::2], closed[1::2], strict=True))
         legs = []
@@ -309,20 +339,39 @@ class Map(ABC):
         """
         return [NodeId.parse(word) for word in ids_of(map(str, names), self.resolve)]
 
-    def export(self, path: str | os.PathLike[str], to: str = "", component: int = 0) -> list[Path]:
+    def _frame(self, component: int | None, plan: str | None) -> tuple[int, Pose2]:
+        """A component, and what takes its coordinates to those of a plan.
+
+        Raises:
+            Refused: there is no such plan, or it does not lie there.
+        """
+        if plan is None:
+            return component or 0, Pose2()
+        part = self._reading.plans.plan(plan).part(component)
+        return part.component, part.plan_from_merged
+
+    def export(
+        self,
+        path: str | os.PathLike[str],
+        to: str = "",
+        component: int | None = None,
+        plan: str | None = None,
+    ) -> list[Path]:
         """Write a component for others' tools, as `mapweave map export` does.
 
         Args:
             path: the file, or the folder for several trajectories.
             to: `g2o`, `tum`, `graphml` or `geojson`; by default as the file is called.
-            component: which.
+            component: which; by default 0, the largest, with a plan that with most of its pairs.
+            plan: a floor plan, in whose coordinates it is written.
 
         Returns:
             What was written.
 
         Raises:
             MissingExtra: that needs the extra "server".
-            InvalidValue: there is no such format or component.
+            InvalidValue: there is no such format.
+            Refused: there is no such component, or no such plan under it.
         """
         merged, out = self._reading.merged, Path(path)
         from mapweave.formats.export import FORMATS
@@ -331,7 +380,7 @@ class Map(ABC):
         write = FORMATS.get(to or out.suffix[1:])
         if write is None:
             raise InvalidValue(f"{out}: give its format with `to`: {', '.join(FORMATS)}")
-        return write(MapPart(merged, component), out)
+        return write(MapPart(merged, *self._frame(component, plan)), out)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the map into a map file, all or nothing.
@@ -444,9 +493,7 @@ class FileMap(Map, ConstraintMethods, AnnotationMethods):
 
     def plans(self) -> PlacedPlans:
         """Floor plans under the map."""
-        from mapweave.mapserver.floor_plans import placed_plans
-
-        return placed_plans(self.annotations(), self._router().merged)
+        return self._read.plans
 
     def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
         """Nodes for words; see Map."""
@@ -467,8 +514,9 @@ class FileMap(Map, ConstraintMethods, AnnotationMethods):
 
         with refusals():
             annotation = annotation_of_words(
-                name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
-            )
+                name, fields, removed, self.annotations, self.resolve, self.plans, self._by, because,
+                time.time_ns(),
+            )  # fmt: skip
         words = checked_annotation(self.content, router, annotation, self.plan_image)
         if check:
             return CHECKED + words

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
 
 from mapweave.extras import need
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.floor_plan import PlacedPlans
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Node
@@ -68,6 +71,20 @@ class MapReading:
         """All nodes, in columns."""
         return NodeTable.of(self.graph.nodes, self.placed, self.content.superseded)
 
+    def nodes_on(self, plan: str) -> NodeTable:
+        """The nodes of the components under which a floor plan lies, with their poses on it; see `plans`.
+
+        Raises:
+            Refused: there is no such plan.
+        """
+        on_plan = {part.component: part.plan_from_merged for part in self.plans.plan(plan).parts}
+        placed = {
+            node: (component, replace(pose, mean=on_plan[component] @ pose.mean))
+            for node, (component, pose) in self.placed.items()
+            if component in on_plan
+        }
+        return NodeTable.of(self.graph.nodes, placed, self.content.superseded)
+
     @cached_property
     def merged(self) -> MergedMap:
         """The map solved again.
@@ -80,6 +97,14 @@ class MapReading:
         from mapweave.mapserver.map_files import merged_of
 
         return merged_of(self.content, self.settings)
+
+    @cached_property
+    def plans(self) -> PlacedPlans:
+        """Floor plans under the map; see `merged`."""
+        merged = self.merged
+        from mapweave.mapserver.floor_plans import placed_plans
+
+        return placed_plans(Annotations(self.content.annotations), merged)
 
     @cached_property
     def router(self) -> Router:

@@ -168,8 +168,9 @@ class OfflineAnnotations(AnnotationMethods):
             check_place(out)
         with refusals():
             annotation = annotation_of_words(
-                name, fields, removed, self.annotations, self.resolve, self._by, because, time.time_ns()
-            )
+                name, fields, removed, self.annotations, self.resolve, self.plans, self._by, because,
+                time.time_ns(),
+            )  # fmt: skip
         words = checked_annotation(self._opened.content, self._router, annotation, self.plan_image)
         if check or out is None:
             return CHECKED + words

@@ -73,7 +73,7 @@ def annotate(server: Answering, data: bytes, by: str, who: str = "") -> Mapping[
         raise InvalidValue(f"{error}; send {FORM}") from None
     annotation = annotation_of_words(
         posted.name[: MAX_NAME + 1], posted.body, posted.removed, server.annotations, server.resolve,
-        who or posted.who or by, posted.because, time.time_ns(),
+        server.plans, who or posted.who or by, posted.because, time.time_ns(),
     )  # fmt: skip
     answer = {"said": server.annotate(annotation, posted.check), "annotation": json_values(annotation)}
     if posted.check and not posted.removed and isinstance(annotation.body, FloorPlan):

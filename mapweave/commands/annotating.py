@@ -47,6 +47,12 @@ def add_area_options(parser: argparse.ArgumentParser) -> None:
         "--corners", nargs="+", metavar="X,Y", help="the floor within these corners in the merged map, m"
     )
     add_near(parser)
+    add_plan_option(parser)
+
+
+def add_plan_option(parser: argparse.ArgumentParser) -> None:
+    """Declare `--plan` of commands that take or give coordinates."""
+    parser.add_argument("--plan", metavar="NAME", help="in the coordinates of this floor plan")
 
 
 def add_near(parser: argparse.ArgumentParser) -> None:
@@ -118,9 +124,7 @@ def area_fields(arguments: argparse.Namespace) -> dict[str, object]:
         except InvalidValue as error:
             raise UsageError(f"--corners: {error}") from None
         fields["corners"] = corners
-    if arguments.near:
-        fields["near"] = arguments.near
-    return fields
+    return fields | {name: said for name in ("near", "plan") if (said := getattr(arguments, name))}
 
 
 def two_numbers(word: str) -> tuple[float, float] | None:

@@ -13,10 +13,12 @@ from typing import TYPE_CHECKING, Any
 from mapweave.commands import values
 from mapweave.commands.annotating import (
     add_area_options,
+    add_plan_option,
     add_record_options,
     area_fields,
     print_said,
     record_of,
+    two_numbers,
 )
 from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.errors import InvalidValue
@@ -54,6 +56,7 @@ def add_to(commands: Any) -> None:
         "`mapweave reopen r0.1.17 r0.1.19`. `mapweave closures` lists the names.",
     )
     reopen.add_argument("where", nargs="+", metavar="NAME|NODE", help="the name, or the two nodes")
+    add_plan_option(reopen)
     add_record_options(reopen, changes=True)
     reopen.set_defaults(run=lambda arguments: _withdraw(arguments, "closure"))
 
@@ -181,6 +184,9 @@ def _names(arguments: argparse.Namespace, kind: str, record: Fleet | OfflineAnno
     if getattr(arguments, "name", None):
         return [arguments.name]
     where = arguments.where or getattr(arguments, "corners", None) or []
+    if arguments.plan and any(map(two_numbers, where)):
+        # The same numbers are another place in the merged map.
+        return [_name([*where, "on", arguments.plan])]
     names = [_name(where), *([_name(where[::-1])] if len(where) == 2 else [])]
     said = record.annotations()
     return [name for name in names if said.last(kind, name) is not None] or names[:1]

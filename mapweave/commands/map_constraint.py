@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import print_said
+from mapweave.commands.annotating import add_plan_option, print_said
 from mapweave.commands.map_input import SOURCES, map_source, merge_progress, merged_with_progress, opened
 from mapweave.commands.network import (
     add_network,
@@ -21,6 +21,7 @@ from mapweave.commands.network import (
     network_of,
     settings_of,
 )
+from mapweave.commands.plan import plan_of
 from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.errors import InvalidFile, MapweaveError
 
@@ -279,11 +280,13 @@ def _add_retire(actions: Any) -> None:
     )  # fmt: skip
     parser.add_argument(
         "--area", nargs=2, metavar=("NODE|PLACE", "CORNERS"),
-        help='what lies in a polygon in the frame of a node, m: --area r0.1.17 "0,-1 2,-1 2,1 0,1"',
+        help='what lies in a polygon in the frame of a node, m: --area r0.1.17 "0,-1 2,-1 2,1 0,1"; '
+        "with --plan on the plan, under the part of the map where the node is",
     )  # fmt: skip
     parser.add_argument("--from", dest="begin", type=values.given, metavar="TIME",
                         help="nodes of the map from then on: 2026-03-01T12:00, or ns")  # fmt: skip
     parser.add_argument("--until", dest="end", type=values.given, metavar="TIME", help="until then")
+    add_plan_option(parser)
     add_constraint_options(parser)
     parser.set_defaults(run=run_retire)
 
@@ -299,15 +302,26 @@ def _subject(arguments: argparse.Namespace) -> Subject:
     from mapweave.hybridmap.area import Area, read_corner
     from mapweave.hybridmap.constraint_subject import RetiredArea, read_window
     from mapweave.hybridmap.named_nodes import own_ids_of, retired_of
+    from mapweave.hybridmap.query import ResolveRequest
+    from mapweave.mapserver.plan_answers import in_merged
 
     in_time = bool(arguments.begin or arguments.end)
     if (arguments.area is not None) == bool(arguments.which) or (in_time and len(arguments.which) != 1):
         raise UsageError("give a map or nodes, or --area; --from and --until go with one map")
+    if arguments.plan is not None and arguments.area is None:
+        raise UsageError("--plan goes with --area")
     with arguments_read():
         if arguments.area is not None:
-            anchor, corners = arguments.area
-            (node,) = map(node_of, own_ids_of([anchor], *names_of(arguments)))
-            return RetiredArea(Area(node, tuple(map(read_corner, corners.split()))))
+            anchor, corners = arguments.area[0], list(map(read_corner, arguments.area[1].split()))
+            record, resolve = names_of(arguments)
+            (node,) = map(node_of, own_ids_of([anchor], record, resolve))
+            placed = plan_of(arguments)
+            if placed is None:
+                return RetiredArea(Area(node, tuple(corners)))
+            (found,) = resolve(ResolveRequest((str(node),))).found
+            part = placed.part(found.component)
+            merged = [in_merged(corner, part) for corner in corners]
+            return RetiredArea(Area.of_merged(found.node, found.merged_from_node, merged))
         if in_time:
             which, now = map_of(arguments.which[0]), time.time_ns()
             if arguments.begin and arguments.end:

@@ -7,8 +7,8 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.annotating import add_plan_option
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
-from mapweave.commands.plan import add_plan_option
 from mapweave.hybridmap.counted import counted
 
 FORMATS = ("g2o", "tum", "graphml", "geojson")

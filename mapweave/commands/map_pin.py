@@ -5,11 +5,20 @@ from __future__ import annotations
 import argparse
 import json
 import math
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_record_options, print_said, record_of
+from mapweave.commands.annotating import add_plan_option, add_record_options, print_said, record_of
+from mapweave.commands.plan import plan_place
 from mapweave.commands.usage import UsageError
+from mapweave.hybridmap.errors import InvalidValue
+
+if TYPE_CHECKING:
+    from mapweave.fleet import Fleet
+    from mapweave.hybridmap.floor_plan import PlacedPlan
+    from mapweave.hybridmap.ids import NodeId
+    from mapweave.hybridmap.pose import Pose2
+    from mapweave.offline_annotations import OfflineAnnotations
 
 
 def add_to(actions: Any) -> None:
@@ -19,13 +28,15 @@ def add_to(actions: Any) -> None:
         help="keep the frame of a part of the map by the pose of a node",
         description="Pin a node: the part of the map in which it is keeps its frame, also when others join "
         "it: `mapweave map pin r0.1.17`. With a pose (x,y in m, heading in degrees) the part is moved there: "
-        "`mapweave map pin r0.1.17 12.5,-3,90`. Where two pinned parts join, the older pin holds, and "
-        "`mapweave map history` says by which transform the other frame has moved. Without NODE the pins are "
-        "listed.",
+        "`mapweave map pin r0.1.17 12.5,-3,90`; with --plan to where the node is on a floor plan, so that "
+        "the part has the coordinates of the plan: `mapweave map pin r0.1.17 --plan office`. Where two "
+        "pinned parts join, the older pin holds, and `mapweave map history` says by which transform the "
+        "other frame has moved. Without NODE the pins are listed.",
     )
     parser.add_argument("node", nargs="?", type=values.node, metavar="NODE|PLACE", help="a node, or a place")
     parser.add_argument("pose", nargs="?", metavar="X,Y,DEGREES", help="its pose (default: as it is now)")
     parser.add_argument("--undo", action="store_true", help="take the pin out")
+    add_plan_option(parser)
     add_record_options(parser, changes=True)
     parser.set_defaults(run=run)
 
@@ -38,7 +49,9 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.undo:
             raise UsageError("name the node whose pin is taken out")
         return _list(arguments)
-    fields: dict[str, Any] = {}
+    if None not in (arguments.plan, arguments.pose):
+        raise UsageError("--plan says where the node is on the plan: leave the pose out")
+    fields: dict[str, Any] = {} if arguments.plan is None else {"plan": arguments.plan}
     if arguments.pose is not None:
         fields["merged_from_node"] = _pose(arguments.pose)
     with record_of(arguments) as record:
@@ -58,15 +71,33 @@ def _list(arguments: argparse.Namespace) -> int:
 
     with record_of(arguments) as record:
         pins = sorted(record.annotations().in_force(Pin), key=lambda item: item[0].stamp_ns)
+        placed = None if arguments.plan is None else record.plans().plan(arguments.plan)
+        at = [None if placed is None else _on_plan(record, pin.node, placed) for _, pin in pins]
     if arguments.json:
-        print(json.dumps({"pins": [json_values(entry) for entry, _ in pins]}))
+        values = [json_values(entry) for entry, _ in pins]
+        if placed is not None:
+            values = [
+                {**one, "plan_from_node": json_values(pose)} for one, pose in zip(values, at, strict=True)
+            ]
+        print(json.dumps({"pins": values}))
         return 0
-    for entry, pin in pins:
+    for (entry, pin), pose in zip(pins, at, strict=True):
+        where = pin.words if placed is None else plan_place(placed, pose)
         said = f" ({entry.because})" if entry.because else ""
-        print(f"{pin.node} {pin.words}{said}, by {entry.who or 'a person'}")
+        print(f"{pin.node} {where}{said}, by {entry.who or 'a person'}")
     if not pins:
         print("nothing is pinned: mapweave map pin NODE")
     return 0
+
+
+def _on_plan(record: Fleet | OfflineAnnotations, node: NodeId, placed: PlacedPlan) -> Pose2 | None:
+    """Where a node is on a plan; None if it is on neither the plan nor the merged map now."""
+    from mapweave.mapserver.plan_answers import nodes_on_plan
+
+    try:
+        return nodes_on_plan([node], placed, record.resolve)[0]
+    except InvalidValue:
+        return None
 
 
 def _pose(word: str) -> list[float]:

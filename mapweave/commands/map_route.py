@@ -9,6 +9,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
+from mapweave.commands.annotating import add_plan_option
 from mapweave.commands.map_input import SOURCES, map_source, router_of
 from mapweave.commands.network import add_network, add_timeout
 from mapweave.exit_status import DONE, NO
@@ -44,6 +45,7 @@ def add_to(actions: Any) -> None:
         help="pass this first: a node, a place or a position; may be given again, in the order of the way",
     )
     parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
+    add_plan_option(parser)
     parser.add_argument("--draw", type=values.png, metavar="PNG", help="draw the way on the map")
     parser.add_argument("--json", action="store_true", help="print one JSON object")
     add_timeout(parser)
@@ -53,23 +55,37 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
-    from mapweave.commands.map_ends import node_of, resolved
+    from mapweave.commands.map_ends import names_of, node_of, resolved
+    from mapweave.commands.plan import plan_of, plan_place
     from mapweave.explanation_text import route_words
     from mapweave.extras import need
     from mapweave.hybridmap.explanation import route_over
     from mapweave.mapserver.http.json_values import json_values
+    from mapweave.mapserver.plan_answers import goal_on_plan, nodes_on_plan
 
     if arguments.draw is not None:
         need("viz")
     stops = [arguments.start, *arguments.via, arguments.goal]
     words = [*stops, *(word for pair in arguments.blocked for word in pair)]
     router = None if arguments.map is None else router_of(arguments)
+    plan, resolve = plan_of(arguments, router), names_of(arguments, router)[1]
+    if plan is not None:
+        words = [goal_on_plan(word, plan, plan.part().component, resolve) for word in words]
     nodes = list(map(node_of, resolved(arguments, words, router)))
     rest = nodes[len(stops) :]
     blocked = tuple(zip(rest[::2], rest[1::2], strict=True))
     legs = [_explained(arguments, router, *ends, blocked) for ends in pairwise(nodes[: len(stops)])]
     explanation = route_over(legs)
-    values, lines = json_values(explanation), route_words(explanation)
+    values, on_plan = json_values(explanation), None
+    if plan is not None:
+        way = (explanation.start, *(hop.b for hop in explanation.hops))
+        poses = nodes_on_plan(way, plan, resolve)
+        values["stops"] = [
+            {"node": str(node), "plan_from_node": json_values(pose)}
+            for node, pose in zip(way, poses, strict=True)
+        ]
+        on_plan = [plan_place(plan, pose) for pose in poses]
+    lines = route_words(explanation, on_plan)
     if arguments.draw is not None and explanation.found:
         draw_route(arguments, None if router is None else router.merged, explanation)
         values["picture"] = str(arguments.draw)

@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from mapweave.fleet import Fleet
     from mapweave.hybridmap.floor_plan import PlacedPlan
     from mapweave.hybridmap.pose import Pose2
+    from mapweave.mapserver.routes import Router
     from mapweave.merge.pose_graph.merged_map import MergedMap
     from mapweave.offline_annotations import OfflineAnnotations
 
@@ -177,19 +178,22 @@ def run_export(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def add_plan_option(parser: argparse.ArgumentParser) -> None:
-    """Declare `--plan` of commands that answer in coordinates."""
-    parser.add_argument("--plan", metavar="NAME", help="in the coordinates of this floor plan")
-
-
-def plan_of(arguments: argparse.Namespace) -> PlacedPlan | None:
+def plan_of(arguments: argparse.Namespace, router: Router | None = None) -> PlacedPlan | None:
     """The plan that `--plan` names, of a server or of the map of `--map`; None if it is not given.
+
+    Args:
+        arguments: of the command line.
+        router: of the map of `map`, if it is there already.
 
     Raises:
         MapweaveError: there is none of this name, no server answers, or the map cannot be read.
     """
     if arguments.plan is None:
         return None
+    if router is not None:
+        from mapweave.mapserver.floor_plans import placed_plans
+
+        return placed_plans(router.annotations, router.merged).plan(arguments.plan)
     with record_of(arguments) as record:
         return record.plans().plan(arguments.plan)
 

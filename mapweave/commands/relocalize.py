@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
+from mapweave.commands.annotating import add_plan_option
 from mapweave.commands.map_input import SOURCES, map_source, router_of
 from mapweave.commands.network import (
     add_network,
@@ -20,7 +21,7 @@ from mapweave.commands.network import (
     reach,
     settings_of,
 )
-from mapweave.commands.plan import add_plan_option, plan_of, plan_place
+from mapweave.commands.plan import plan_of, plan_place
 from mapweave.commands.usage import UsageError
 from mapweave.exit_status import DONE, NO
 from mapweave.hybridmap.errors import DeviceError, NotConnected

@@ -10,9 +10,9 @@ import time
 from contextlib import nullcontext
 from typing import TYPE_CHECKING, Any, NoReturn
 
+from mapweave.commands.annotating import add_plan_option
 from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_network
-from mapweave.commands.plan import add_plan_option
 from mapweave.hybridmap.errors import NotConnected
 
 if TYPE_CHECKING:

@@ -211,6 +211,15 @@ def test_answers_and_goals_in_coordinates_of_a_plan(
     report = fleet.go("r0", goal, via=["5,6"], plan="flat")
     assert report.order.node == node and len(report.order.via) == 1
     assert fleet.go("r0", str(node), plan="flat").order.node == node, "what is no position is as without"
+    assert fleet.place("spot", goal, plan="flat") == f"place spot is node {node}, by anna"
+    with Web(("127.0.0.1", 0), house.server) as served:
+        for plan, status, words in (
+            ("flat", 200, f"place sink is node {node}, by"),
+            ("none", 400, "no plan 'none'"),
+        ):
+            body = {"kind": "place", "node": goal, "plan": plan}
+            answer = ask(served, "POST", "/annotations", json.dumps({"name": "sink", "body": body}).encode())
+            assert answer[0] == status and words in answer[2].decode(), answer
     with pytest.raises(InvalidValue, match="no plan 'none'"):
         fleet.go("r0", goal, plan="none")
     with pytest.raises(InvalidValue, match="no plan 'none'"):
