@@ -9,6 +9,7 @@ import numpy as np
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Floor, Place, Preference
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.counted import counted
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.portal import Portal
@@ -34,6 +35,12 @@ def effects_of(annotation: Annotation, places: PlaceResolver) -> Iterator[str]:
     match annotation.body:
         case Place(area=Area() as area):
             yield f"{counted(_nodes_in(area, places.merged), 'node')} in it"
+        case Place(node=NodeId() as node) if node in places.merged.superseded:
+            # The name stays where the node is; robots park at nodes that are in use.
+            try:
+                yield PlaceResolver(places.router, Annotations((annotation,))).resolve(annotation.name).note
+            except InvalidValue as error:
+                yield str(error)
         case Closure() | Preference() as body:
             # A closure of tomorrow has no effect now: at its beginning it has the one that is meant.
             when = (body.begin_ns or 0) if isinstance(body, Closure) else annotation.stamp_ns

@@ -147,7 +147,11 @@ class PlaceResolver:
             if anchor not in self.merged.superseded:
                 return Resolved(anchor, pose, component)
             found = self._nearest((pose.x, pose.y), component, REACH, f"place {entry.name}")
-            return replace(found, note=f"{anchor} is superseded; the nearest active node is {found.node}")
+            return replace(
+                found,
+                note=f"{anchor} is superseded by {self.merged.superseded[anchor].by}; "
+                f"the nearest active node is {found.node}",
+            )
         polygon = place.area.polygon(pose)
         nodes = self._active(component)
         at = np.array([(self.router.roads.poses[node].x, self.router.roads.poses[node].y) for node in nodes])
