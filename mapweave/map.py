@@ -538,8 +538,8 @@ class FileMap(Map, ConstraintMethods, AnnotationMethods):
 def open(path: str | os.PathLike[str], by: str = "") -> FileMap:
     """Open a map file, a server's store, also one in PostgreSQL, or an agent's journal. It is never changed.
 
-    Several maps of a store or journal are merged first. Of a damaged one what can be read is opened, with a
-    warning that says what is lost.
+    Several maps of a store or journal are merged first, and so is a single one that people have corrected. Of
+    a damaged one what can be read is opened, with a warning that says what is lost.
 
     Args:
         path: of the file, or the address of the database.
@@ -547,15 +547,15 @@ def open(path: str | os.PathLike[str], by: str = "") -> FileMap:
 
     Raises:
         InvalidFile: it cannot be read, is damaged, in use, or none of these.
-        MissingExtra: several maps are merged with the extra "server".
+        MissingExtra: maps are merged with the extra "server".
     """
     # A fleet's map comes over the network: who connects need not wait for what reads stores and journals.
-    from mapweave.opened_map import MapSource, open_map
+    from mapweave.opened_map import open_map
 
     opened = open_map(os.fspath(path))
     for complaint in opened.complaints.values():
         warnings.warn(complaint, stacklevel=2)
-    if opened.source is MapSource.FILE or len(opened.maps) < 2:
+    if opened.decided:
         return FileMap(opened.content, by=by)
     need("server")
     return FileMap(opened.file(opened.merged()), by=by)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Collection, Iterable, Mapping
 from contextlib import closing
 from dataclasses import dataclass, replace
 from enum import StrEnum
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, TypeVar
 
@@ -86,6 +86,13 @@ class OpenedMap:
         """The name for people: that of the file, without its folder."""
         return self.path.name if isinstance(self.path, Path) else self.path
 
+    @cached_property
+    def decided(self) -> bool:
+        """Whether there is nothing to merge: a file was merged, and a single map needs it for constraints."""
+        return self.source is MapSource.FILE or (
+            len(maps_of(self.content)) < 2 and not ManualConstraints(self.content.constraints).in_force
+        )
+
     def merged(
         self,
         settings: MergeSettings | None = None,
@@ -103,10 +110,7 @@ class OpenedMap:
         # This loads the libraries that solve pose graphs: what only looks into a map does without.
         from mapweave.mapserver.map_files import merged_of
 
-        decided = self.source is MapSource.FILE or (
-            len(maps_of(self.content)) < 2 and not ManualConstraints(self.content.constraints).in_force
-        )
-        if decided:
+        if self.decided:
             return merged_of(self.content, settings)
         return self.merged_again(settings, progress)
 
@@ -135,7 +139,7 @@ class OpenedMap:
 
     def file(self, merged: MergedMap) -> MapFile:
         """The content of a map file that holds the whole map, as `merged` returned it."""
-        if self.source is MapSource.FILE or (len(merged.maps) < 2 and not merged.constraints.in_force):
+        if self.decided:
             return self.content
         from mapweave.mapserver.map_files import map_file_of
 

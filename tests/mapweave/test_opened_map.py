@@ -10,7 +10,7 @@ import shutil
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import closing, suppress
 from dataclasses import replace
 from http.client import HTTPConnection
 from pathlib import Path
@@ -23,11 +23,12 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from websockets.sync.client import connect
 
+import mapweave
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
 from mapweave.hybridmap.annotation import Annotation, Place
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
-from mapweave.hybridmap.constraint_subject import Apart
+from mapweave.hybridmap.constraint_subject import Apart, RetiredNodes
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
@@ -107,6 +108,28 @@ def test_what_it_is_shows_the_content(folder: Path) -> None:
     assert [link.pair for link in stored.links] == [link.pair for link in filed.links] != []
     assert content_hash(opened["store"].file(stored)) == content_hash(opened["merged"].content)
     assert content_hash(opened["journal"].content) == content_hash(opened["own"].content)
+
+
+def test_python_and_shell_open_the_same_map(
+    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Of a store with a single map Python showed nodes as in use that a person had retired."""
+    one = annotated_store(tmp_path / "one.sqlite", {R0: LOGS[R0]})
+    corrected = annotated_store(tmp_path / "corrected.sqlite", {R0: LOGS[R0]})
+    gone = NodeId("r0", 1, 3)
+    with closing(SqliteStore(corrected)) as store:
+        store.add_constraint(encode(ManualConstraint(RetiredNodes((gone,)), True, "anna", 7, "it is new")))
+    withdrawn = annotated_store(tmp_path / "withdrawn.sqlite", {R0: LOGS[R0]})
+    with closing(SqliteStore(withdrawn)) as store:
+        store.add_constraint(encode(replace(SAID, holds=False, stamp_ns=8)))
+    for path in (one, corrected, withdrawn, *map(folder.joinpath, ("store", "journal", "own", "merged"))):
+        capsys.readouterr()
+        assert main(["map", "show", str(path), "--json", "--no-picture"]) == 0
+        shown = json.loads(capsys.readouterr().out)
+        room = mapweave.open(path)
+        assert (room.hash, room.content.kind) == (shown["content_hash"], shown["kind"]), path.name
+    assert gone in mapweave.open(corrected).content.retired
+    assert str(gone) not in mapweave.open(corrected).nodes.ids
 
 
 @pytest.mark.slow
