@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
+from mapweave.commands.answer import add_json, print_said
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_network, add_reason, settings_of
@@ -35,7 +36,7 @@ def add_record_options(parser: argparse.ArgumentParser, changes: bool) -> None:
         parser.add_argument(
             "-o", "--out", type=Path, metavar="OUT", help="with --map: write a map file there instead"
         )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     add_network(parser)
 
@@ -89,14 +90,6 @@ def print_entries(arguments: argparse.Namespace, title: str, kind: type[Body], n
     else:
         print("\n".join(entry.words for entry in entries) or none)
     return 0
-
-
-def print_said(arguments: argparse.Namespace, *said: str, **values: object) -> None:
-    """Print what the server or the file has said: lines, or with `--json` one object with these values."""
-    if arguments.json:
-        print(json.dumps({"said": "; ".join(said), **values}))
-    else:
-        print("\n".join(said))
 
 
 def area_fields(arguments: argparse.Namespace) -> dict[str, object]:

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands.answer import add_json, print_said
 from mapweave.commands.usage import UsageError, arguments_read
 
 if TYPE_CHECKING:
@@ -35,6 +36,7 @@ def add_to(actions: Any) -> None:
         metavar="FILE",
         help="the PDF (default: board.pdf)",
     )
+    add_json(parser)
     parser.set_defaults(run=run)
 
 
@@ -100,6 +102,10 @@ def run(arguments: argparse.Namespace) -> int:
     with arguments_read():
         page = target_pdf(target, arguments.paper)
     write_whole(arguments.out, page)
-    print(f"{arguments.out}: {target}, on {arguments.paper}")
-    print("Print it at 100 % (not fitted to the page), hold a ruler to both scales, glue it to a flat board.")
+    print_said(
+        arguments,
+        f"{arguments.out}: {target}, on {arguments.paper}",
+        "Print it at 100 % (not fitted to the page), hold a ruler to both scales, glue it to a flat board.",
+        file=str(arguments.out),
+    )
     return 0

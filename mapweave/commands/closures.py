@@ -16,10 +16,10 @@ from mapweave.commands.annotating import (
     add_plan_option,
     add_record_options,
     area_fields,
-    print_said,
     record_of,
     two_numbers,
 )
+from mapweave.commands.answer import print_said
 from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.errors import InvalidValue
 

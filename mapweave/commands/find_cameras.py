@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
 from typing import Any
 
 from mapweave.commands import values
+from mapweave.commands.answer import add_json, print_note
 
 
 def add_to(commands: Any) -> None:
@@ -31,6 +33,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--height", type=values.count, default=480, help="asked of devices, px (default: 480)"
     )
+    add_json(parser)
     parser.set_defaults(run=run)
 
 
@@ -47,7 +50,9 @@ def run(arguments: argparse.Namespace) -> int:
 
     devices = sorted(Path("/dev").glob("video*"), key=lambda path: (len(path.name), path.name))
     sources = [*map(str, devices), *arguments.source]
-    width, height, found, failed = arguments.width, arguments.height, 0, []
+    width, height = arguments.width, arguments.height
+    found: list[dict[str, object]] = []
+    failed: list[str] = []
     for number, source in enumerate(sources):
         settings = CameraSettings(width, height, width, width, width / 2, height / 2, 0.3, source=source)
         try:
@@ -62,18 +67,26 @@ def run(arguments: argparse.Namespace) -> int:
         if not watched.images:
             failed.append(f"camera {source}: opens and gives no image")
             continue
-        found += 1
         image = watched.images[-1]
         path = arguments.out / f"camera{number}.png"
         arguments.out.mkdir(parents=True, exist_ok=True)
         write_whole(path, cv2.imencode(".png", image)[1].tobytes())
         size = f"{image.shape[1]}x{image.shape[0]} px"
         fault = ImageQuality.of(image).fault
-        print(f"{source}: {size}, {watched.rate:.0f} images/s, frame in {path}{'; ' if fault else ''}{fault}")
+        words = (
+            f"{source}: {size}, {watched.rate:.0f} images/s, frame in {path}{'; ' if fault else ''}{fault}"
+        )
+        print_note(arguments, words)
+        found.append({
+            "source": source, "width": image.shape[1], "height": image.shape[0], "fault": fault or None,
+            "images_per_second": round(watched.rate, 1), "frame": str(path),
+        })  # fmt: skip
     if found:
         # A Raspberry Pi has a dozen video devices that are no cameras.
         for words in failed if arguments.source else ():
-            print(words)
+            print_note(arguments, words)
+        if arguments.json:
+            print(json.dumps({"cameras": found}))
         return 0
     reasons = "".join(f"{words}; " for words in failed)
     raise Refused(f"{reasons}no camera gives an image; for a Raspberry Pi's own camera see docs/robot.md")

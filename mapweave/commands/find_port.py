@@ -5,9 +5,11 @@ from __future__ import annotations
 import argparse
 import sys
 import time
+from dataclasses import asdict
 from typing import Any
 
 from mapweave.commands import values
+from mapweave.commands.answer import add_json, print_note, print_said
 
 POLL = 0.2
 """s between two looks."""
@@ -25,6 +27,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--timeout", type=values.seconds, default=60.0, metavar="S", help="for the cable (default: 60)"
     )
+    add_json(parser)
     parser.set_defaults(run=run)
 
 
@@ -39,17 +42,19 @@ def run(arguments: argparse.Namespace) -> int:
             "there is no serial port, as /dev/ttyUSB0 or /dev/ttyACM0: is the robot connected and switched "
             "on, and its cable one for data?"
         )
-    for port in before:
-        print(port.line)
+    ports = list(map(asdict, before))
+    lines = [port.line for port in before]
     if arguments.list or not sys.stdin.isatty():
+        print_said(arguments, *lines, ports=ports, unplugged=[])
         return 0
-    print("Unplug the robot's cable now ...", flush=True)
+    print_note(arguments, "\n".join((*lines, "Unplug the robot's cable now ...")))
     end = time.monotonic() + arguments.timeout
     while time.monotonic() < end:
         left = gone(before, serial_ports())
         if left:
-            for port in left:
-                print(f"it was {port.stable or port.path}: plug it in, and give [robot.options] port that")
+            names = [port.stable or port.path for port in left]
+            said = [f"it was {name}: plug it in, and give [robot.options] port that" for name in names]
+            print_said(arguments, *said, ports=ports, unplugged=names)
             return 0
         time.sleep(POLL)
     raise Refused(

@@ -6,7 +6,8 @@ import argparse
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_record_options, print_entries, print_said, record_of
+from mapweave.commands.annotating import add_record_options, print_entries, record_of
+from mapweave.commands.answer import print_said
 from mapweave.commands.usage import UsageError
 
 

@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from mapweave.commands.answer import add_json
 from mapweave.commands.replay import add_recording, options_of
 
 if TYPE_CHECKING:
@@ -39,7 +40,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument(
         "--settings", type=Path, metavar="FILE", help="TOML with [recording], the topics of a bag"
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     parser.set_defaults(run=run)
 
 

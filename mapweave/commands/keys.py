@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import argparse
+import json
+import sys
 from pathlib import Path
 from typing import Any
 
 from mapweave.commands import values
+from mapweave.commands.answer import add_json, print_said
 from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.errors import Refused
 
@@ -59,7 +62,6 @@ def add_to(commands: Any) -> None:
     token.set_defaults(run=_token)
 
     listing = _action(actions, "list", "who has a key, and until when")
-    listing.add_argument("--json", action="store_true", help="print one JSON object")
     listing.set_defaults(run=_list)
 
     revoke = _action(actions, "revoke", "admit an identity no more, at once")
@@ -86,6 +88,7 @@ def _action(actions: Any, name: str, words: str) -> argparse.ArgumentParser:
     parser.add_argument(
         "--keys", type=Path, default=Path("keys"), metavar="FOLDER", help="folder of the keys (default: keys)"
     )
+    add_json(parser)
     return parser
 
 
@@ -96,12 +99,25 @@ def _init(arguments: argparse.Namespace) -> int:
     with arguments_read():
         folder = KeyFolder.create(arguments.keys, arguments.fleet, profile, arguments.at, arguments.server)
     where = ", ".join(folder.catalogue.endpoints)
-    print(f"{arguments.keys}: keys of fleet {arguments.fleet}; robots find the server at {where}")
+    said = [f"{arguments.keys}: keys of fleet {arguments.fleet}; robots find the server at {where}"]
     if not arguments.at:
-        print("that is this machine alone: give --at HOST if robots are to reach it (in another folder)")
+        said.append(
+            "that is this machine alone: give --at HOST if robots are to reach it (in another folder)"
+        )
     if profile is Profile.LAB:
-        print("passwords and maps travel unencrypted: use it only in a network that you trust")
-    print(f"next: mapweave keys add r0 --keys {arguments.keys}; mapweave server --keys {arguments.keys}")
+        said.append("passwords and maps travel unencrypted: use it only in a network that you trust")
+    said.append(
+        f"next: mapweave keys add r0 --keys {arguments.keys}; mapweave server --keys {arguments.keys}"
+    )
+    endpoints = list(folder.catalogue.endpoints)
+    print_said(
+        arguments,
+        *said,
+        folder=str(arguments.keys),
+        fleet=arguments.fleet,
+        profile=profile,
+        endpoints=endpoints,
+    )
     return 0
 
 
@@ -125,29 +141,31 @@ def _add(arguments: argparse.Namespace) -> int:
             "--days: passwords of the lab profile do not expire; `mapweave keys revoke` ends one"
         )
     path = folder.add(arguments.name, Role(arguments.role), days, arguments.at)
-    print(f"{path}: copy this file to {arguments.name}, and to no other")
+    said = [f"{path}: copy this file to {arguments.name}, and to no other"]
     ends, identity = validity(read_key_file(path).credentials.certificate), folder.find(arguments.name)
     if ends is not None and identity is not None and time_of(identity.expires) > ends[1]:
         until = identity.expires[:10]
-        print(
+        said.append(
             f"an earlier key of {arguments.name} is good until {until}: if it is to end before, first "
             f"`mapweave keys revoke {arguments.name}`, then add it again"
         )
     if arguments.at:
         where = ", ".join(folder.catalogue.endpoints)
-        print(f"new keys find the servers at {where}; who has an older key needs `endpoints` in its settings")
+        said.append(
+            f"new keys find the servers at {where}; who has an older key needs `endpoints` in its settings"
+        )
+    expires = None if ends is None else ends[1].isoformat()
+    print_said(arguments, *said, file=str(path), name=arguments.name, role=arguments.role, expires=expires)
     return 0
 
 
 def _token(arguments: argparse.Namespace) -> int:
-    import sys
-
     from mapweave.identities.key_folder import KeyFolder
 
     _check_days(arguments.days)
     token = KeyFolder(arguments.keys).token(arguments.name, arguments.days)
     print(f"the token of {arguments.name}, which is shown this once:", file=sys.stderr)
-    print(token)
+    print(json.dumps({"name": arguments.name, "token": token}) if arguments.json else token)
     return 0
 
 
@@ -158,8 +176,6 @@ def _check_days(days: float) -> None:
 
 
 def _list(arguments: argparse.Namespace) -> int:
-    import json
-
     from mapweave.identities.key_folder import KeyFolder
     from mapweave.identities.tokens import read_tokens
 
@@ -195,10 +211,11 @@ def _revoke(arguments: argparse.Namespace) -> int:
     if arguments.tokens:
         if folder.find(arguments.name) is None or not folder.end_tokens(arguments.name):
             raise Refused(f"{arguments.name} has no token; `mapweave keys list` shows who has")
-        print(f"the tokens of {arguments.name} are void, and who logged in with them is logged out")
-        return 0
-    folder.revoke(arguments.name, " ".join(arguments.because.split()), arguments.force)
-    print(f"{arguments.name} is admitted no more; a running server takes note within seconds")
+        said = f"the tokens of {arguments.name} are void, and who logged in with them is logged out"
+    else:
+        folder.revoke(arguments.name, " ".join(arguments.because.split()), arguments.force)
+        said = f"{arguments.name} is admitted no more; a running server takes note within seconds"
+    print_said(arguments, said, name=arguments.name)
     return 0
 
 
@@ -220,5 +237,6 @@ def _bundle(arguments: argparse.Namespace) -> int:
             f"{arguments.name}{role}` makes a new one"
         )
     write_key_file(arguments.out, read_key_file(file))
-    print(f"{arguments.out}: the key of {arguments.name}")
+    said = f"{arguments.out}: the key of {arguments.name}"
+    print_said(arguments, said, file=str(arguments.out), name=arguments.name)
     return 0

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.answer import add_json, print_said
 from mapweave.commands.map_input import map_source
 from mapweave.commands.usage import UsageError
 from mapweave.hybridmap.errors import InvalidFile
@@ -26,6 +27,7 @@ def add_to(actions: Any) -> None:
     )
     parser.add_argument("source", type=map_source, metavar="STORE", help="of the server: NAME.sqlite")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE", help="the copy")
+    add_json(parser)
     parser.set_defaults(run=run)
 
 
@@ -45,5 +47,6 @@ def run(arguments: argparse.Namespace) -> int:
         raise InvalidFile(f"{source}: is a {kind.value.split()[-1]}, not a server's store")
     with Bar(plain_or_terminal(), "copying pages", None, transient=True) as bar:
         back_up(source, out, lambda done, of: bar.update(done, "", of))
-    print(f"{out}: copy of the store, {out.stat().st_size / 1e6:.1f} MB")
+    size = out.stat().st_size
+    print_said(arguments, f"{out}: copy of the store, {size / 1e6:.1f} MB", file=str(out), bytes=size)
     return 0

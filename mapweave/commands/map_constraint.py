@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_plan_option, print_said
+from mapweave.commands.annotating import add_plan_option
+from mapweave.commands.answer import add_json, print_said
 from mapweave.commands.map_input import SOURCES, map_source, merge_progress, merged_with_progress, opened
 from mapweave.commands.network import (
     add_network,
@@ -45,7 +46,7 @@ def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -
     if undo:
         parser.add_argument("--undo", action="store_true", help="take it back")
     parser.add_argument("--check", action="store_true", help="only say what it would do; change nothing")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     parser.add_argument(
         "--map", type=map_source, metavar="FILE", help=f"in {SOURCES}; no server is asked, and only a merged "
         "map file is changed",

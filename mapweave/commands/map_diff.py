@@ -6,6 +6,7 @@ import argparse
 import json
 from typing import Any
 
+from mapweave.commands.answer import add_json
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.exit_status import DONE, NO
 
@@ -23,7 +24,7 @@ def add_to(actions: Any) -> None:
     )
     parser.add_argument("before", type=map_source, metavar="A", help=SOURCES)
     parser.add_argument("after", type=map_source, metavar="B", help="another one")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     parser.set_defaults(run=run)
 
 

@@ -7,6 +7,7 @@ import json
 from typing import Any
 
 from mapweave.commands import values
+from mapweave.commands.answer import add_json
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.commands.network import add_network, add_timeout
 from mapweave.commands.usage import UsageError
@@ -26,7 +27,7 @@ def add_to(actions: Any) -> None:
         "--map", type=map_source, metavar="FILE", help=f"explain {SOURCES}; no server is asked"
     )
     parser.add_argument("--draw", type=values.png, metavar="PNG", help="draw the landmarks of the two nodes")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     add_timeout(parser)
     add_network(parser)
     parser.set_defaults(run=run)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands.annotating import add_plan_option
+from mapweave.commands.answer import add_json, print_said
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.hybridmap.counted import counted
 
@@ -33,6 +34,7 @@ def add_to(actions: Any) -> None:
         help="which part that is one (default: 0, the largest; with --plan that with most pairs)",
     )
     add_plan_option(parser)
+    add_json(parser)
     parser.set_defaults(run=run)
 
 
@@ -50,8 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         plans = placed_plans(Annotations(source.content.annotations), merged)
         placed = plans.plan(arguments.plan).part(arguments.component)
         part = MapPart(merged, placed.component, placed.plan_from_merged)
-    for path in WRITERS[arguments.format](part, arguments.out):
-        print(path)
+    written = list(map(str, WRITERS[arguments.format](part, arguments.out)))
     left = len(merged.poses) - len(part.nodes)
     if left:
         others = f"{counted(left, 'node')} of others {'is' if left == 1 else 'are'} left out"
@@ -59,4 +60,8 @@ def run(arguments: argparse.Namespace) -> int:
         print(
             f"mapweave: {words}; they have frames of their own, choose one with --component", file=sys.stderr
         )
+    nodes = len(part.nodes)
+    print_said(
+        arguments, "\n".join(written), files=written, component=part.component, nodes=nodes, left_out=left
+    )
     return 0

@@ -8,6 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.answer import add_json
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.exit_status import DONE, FAILED, NO
 from mapweave.hybridmap.counted import counted
@@ -28,7 +29,7 @@ def add_to(actions: Any) -> None:
     parser.add_argument(
         "-o", "--out", type=Path, default=Path(), metavar="DIR", help="folder for the files (default: here)"
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     parser.set_defaults(run=run)
 
 

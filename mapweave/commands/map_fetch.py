@@ -7,6 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.answer import add_json
 from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_network
 
@@ -20,7 +21,7 @@ def add_to(actions: Any) -> None:
         "`mapweave map fetch office.mapweave`. The fleet goes on; `mapweave map show` shows the file.",
     )
     parser.add_argument("out", type=Path, metavar="OUT", help="the map file")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 

@@ -8,6 +8,7 @@ import math
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.answer import add_json
 from mapweave.commands.usage import UsageError
 from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile
@@ -26,7 +27,7 @@ def add_to(actions: Any) -> None:
     parser.add_argument(
         "-o", "--out", type=Path, required=True, metavar="OUT", help="the optimised .g2o file"
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     parser.set_defaults(run=run)
 
 

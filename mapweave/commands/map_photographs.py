@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.commands import values
+from mapweave.commands.answer import add_json
 from mapweave.commands.network import add_network, add_timeout, connect, network_of, reach, settings_of
 from mapweave.hybridmap.errors import NotConnected
 
@@ -34,7 +35,7 @@ def add_to(actions: Any) -> None:
     )
     parser.add_argument("--send", action="store_true", help="hand the map over to a running server")
     add_timeout(parser, of="the server")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 

@@ -8,7 +8,8 @@ import math
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_plan_option, add_record_options, print_said, record_of
+from mapweave.commands.annotating import add_plan_option, add_record_options, record_of
+from mapweave.commands.answer import print_said
 from mapweave.commands.plan import plan_place
 from mapweave.commands.usage import UsageError
 from mapweave.hybridmap.errors import InvalidValue

@@ -10,9 +10,9 @@ from mapweave.commands.annotating import (
     add_record_options,
     add_remove,
     print_entries,
-    print_said,
     record_of,
 )
+from mapweave.commands.answer import print_said
 from mapweave.commands.usage import UsageError
 
 KINDS = ("lift", "ramp", "door")

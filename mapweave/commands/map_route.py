@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.annotating import add_plan_option
+from mapweave.commands.answer import add_json
 from mapweave.commands.map_input import SOURCES, map_source, router_of
 from mapweave.commands.network import add_network, add_timeout
 from mapweave.exit_status import DONE, NO
@@ -47,7 +48,7 @@ def add_to(actions: Any) -> None:
     parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     add_plan_option(parser)
     parser.add_argument("--draw", type=values.png, metavar="PNG", help="draw the way on the map")
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     add_timeout(parser)
     add_network(parser)
     parser.set_defaults(run=run)

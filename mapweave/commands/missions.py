@@ -8,6 +8,7 @@ from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
+from mapweave.commands.answer import add_json
 from mapweave.commands.network import add_network, add_reason, network_of, settings_of
 from mapweave.commands.usage import UsageError
 from mapweave.exit_status import DONE, NO
@@ -92,7 +93,7 @@ def add_to(commands: Any) -> None:
         "reason.",
     )
     missions.add_argument("robot", nargs="?", type=values.name, help="of this robot alone, for example r0")
-    missions.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(missions)
     add_network(missions)
     missions.set_defaults(run=run_missions)
 
@@ -105,7 +106,7 @@ def _add_common(parser: argparse.ArgumentParser, patience: float | None) -> None
             help=f"with --wait: at most so long (default: {patience:g})",
         )  # fmt: skip
     add_reason(parser)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     add_network(parser)
 
 

@@ -12,9 +12,9 @@ from mapweave.commands.annotating import (
     add_record_options,
     add_remove,
     area_fields,
-    print_said,
     record_of,
 )
+from mapweave.commands.answer import print_said
 from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.errors import InvalidValue
 

@@ -14,10 +14,10 @@ from mapweave.commands.annotating import (
     add_near,
     add_record_options,
     add_remove,
-    print_said,
     record_of,
     two_numbers,
 )
+from mapweave.commands.answer import print_said
 from mapweave.commands.network import settings_of
 from mapweave.commands.usage import UsageError
 from mapweave.hybridmap.errors import InvalidFile
@@ -172,7 +172,12 @@ def run_export(arguments: argparse.Namespace) -> int:
     with record_of(arguments) as record:
         placed = record.plans().plan(arguments.name)
     part = placed.part(arguments.component)
-    print(WRITERS[arguments.format](placed, part), end="")
+    text: Any = WRITERS[arguments.format](placed, part)
+    if arguments.json:
+        text = json.loads(text) if arguments.format == "json" else text
+        print(json.dumps({"plan": placed.name, "component": part.component, arguments.format: text}))
+    else:
+        print(text, end="")
     for doubt in part.doubts:
         print(f"mapweave: {doubt}", file=sys.stderr)
     return 0

@@ -6,6 +6,7 @@ import argparse
 from typing import Any
 
 from mapweave.commands import values
+from mapweave.commands.answer import add_json, print_said
 from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_author, add_network
 
@@ -27,6 +28,7 @@ def add_to(commands: Any) -> None:
     )
     done.add_argument("robot", type=values.name, help="the robot's name, for example r0")
     add_author(done)
+    add_json(done)
     add_network(done)
     done.set_defaults(run=run_done)
 
@@ -34,5 +36,5 @@ def add_to(commands: Any) -> None:
 def run_done(arguments: argparse.Namespace) -> int:
     """Tell the robot."""
     with fleet_of(arguments) as fleet:
-        print(fleet.portal_done(arguments.robot))
+        print_said(arguments, fleet.portal_done(arguments.robot), robot=arguments.robot)
     return 0

@@ -17,6 +17,7 @@ from mapweave.commands.agent import (
     print_error,
     take_robot_file,
 )
+from mapweave.commands.answer import add_json, print_said
 from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 
 
@@ -32,6 +33,7 @@ def add_to(commands: Any) -> None:
     parser.add_argument("name", type=values.name, help="the robot's name in the fleet, for example r0")
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="DIR", help="new or empty folder")
     parser.add_argument("--lossless", action="store_true", help="images as PNG instead of JPEG")
+    add_json(parser)
     add_robot(parser)
     add_network(parser)
     parser.set_defaults(run=run)
@@ -68,5 +70,12 @@ def run(arguments: argparse.Namespace) -> int:
         bus.close()
     # What came in the last seconds before a disk was full is there in part.
     most = "at most " if recorded.failed else ""
-    print(f"{name}: {most}{recorded.written} observations in {arguments.out}")
+    print_said(
+        arguments,
+        f"{name}: {most}{recorded.written} observations in {arguments.out}",
+        robot=name,
+        folder=str(arguments.out),
+        observations=recorded.written,
+        whole=not recorded.failed,
+    )
     return 1 if recorded.failed else 0

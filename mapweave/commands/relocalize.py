@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.annotating import add_plan_option
+from mapweave.commands.answer import add_json
 from mapweave.commands.map_input import SOURCES, map_source, router_of
 from mapweave.commands.network import (
     add_network,
@@ -33,6 +34,7 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.ids import NodeId
     from mapweave.hybridmap.node import Node
     from mapweave.hybridmap.query import RelocalizeAnswer, View
+    from mapweave.mapserver.routes import Router
     from mapweave.settings import NetworkSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.zenoh_bus import ZenohBus
@@ -61,7 +63,7 @@ def add_to(commands: Any) -> None:
     )  # fmt: skip
     add_plan_option(parser)
     add_timeout(parser, 5.0)
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 
@@ -85,16 +87,14 @@ def run(arguments: argparse.Namespace) -> int:
     grey = read_grey(arguments.image, camera, str(camera_file))
 
     lens = Lens(camera, distortion)
-    plan = plan_of(arguments)
+    router = None if arguments.map is None else router_of(arguments)
+    plan = plan_of(arguments, router)
 
     @cache
     def view() -> View:
         return Sift(lens).extract(grey).view(camera)
 
-    if arguments.map is None:
-        answer, node = _by_server(arguments, view)
-    else:
-        answer, node = _by_map(arguments, view())
+    answer, node = _by_server(arguments, view) if router is None else _by_map(router, view())
     if arguments.json:
         print(json.dumps(_json(answer, plan)))
     else:
@@ -130,12 +130,11 @@ def _by_server(
         bus.close()
 
 
-def _by_map(arguments: argparse.Namespace, view: View) -> tuple[RelocalizeAnswer, Node | None]:
+def _by_map(router: Router, view: View) -> tuple[RelocalizeAnswer, Node | None]:
     """The answer of a map, and the best candidate's node."""
     from mapweave.mapserver.places import PlaceResolver
     from mapweave.offline_relocalization import relocalizer_in
 
-    router = router_of(arguments)
     merged = router.merged
     answer = PlaceResolver(router, router.annotations).named(relocalizer_in(merged).answer(view))
     if not answer.candidates:

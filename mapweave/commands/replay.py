@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import json
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.agent import add_calibration, add_logs, calibration_of
+from mapweave.commands.answer import add_json, print_note
 from mapweave.commands.network import (
     add_network,
     client_settings,
@@ -26,6 +28,7 @@ from mapweave.hybridmap.errors import DeviceError
 if TYPE_CHECKING:
     from mapweave.agent.recordings.options import RecordingOptions
     from mapweave.agent.recordings.recording import Recording
+    from mapweave.hybridmap.ids import MapId
     from mapweave.settings import NetworkSettings
     from mapweave.wire.keys import Keys
     from mapweave.wire.memory import MemoryBus
@@ -60,6 +63,7 @@ def add_to(commands: Any) -> None:
     )
     add_calibration(parser)
     add_logs(parser)
+    add_json(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 
@@ -112,16 +116,19 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.agent.drivers.replay import Replay
     from mapweave.agent.recordings.incomplete import NoOdometry
     from mapweave.doctor.camera_model import recorded_faults
+    from mapweave.hybridmap.ids import MapId
+    from mapweave.processes.agent_files import epochs_of_files
 
     try:
         robot = Replay(arguments.recording, arguments.robot, options=options_of(arguments))
     except NoOdometry as missing:
         return _map_images(arguments, missing.recording)
     for note in (*robot.recording.notes, *recorded_faults(robot.recording)):
-        print(note, flush=True)  # into a pipe as well before what the agent says, on stderr
+        print_note(arguments, note)  # into a pipe as well before what the agent says, on stderr
     name = name_of(arguments)
     settings, calibration = settings_of(arguments), calibration_of(arguments, name)
     network = network_of(arguments, settings)
+    before = epochs_of_files(arguments.data, name)
     bus, keys = _bus(network, name, arguments.offline)
     try:
         # The whole pipeline, while the router is looked for.
@@ -147,7 +154,8 @@ def run(arguments: argparse.Namespace) -> int:
         run_agent(robot, bus, keys, settings.agent, options, stop)
     finally:
         bus.close()
-    status = _report(robot.damage)
+    maps = [MapId(name, epoch) for epoch in epochs_of_files(arguments.data, name) if epoch not in before]
+    status = _report(arguments, name, (robot.played, len(robot)), maps, robot.damage)
     if stop.is_set() and robot.played < len(robot):
         words = f"interrupted after {robot.played} of {len(robot)} images; what is mapped of them is kept"
         print(f"mapweave: {words}", file=sys.stderr)
@@ -181,7 +189,7 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
     network = network_of(arguments, settings_of(arguments))
     first = f"{recording.path}: no odometry, so it is mapped by its images alone: the map has no scale"
     for note in (first, *recording.notes):
-        print(note, flush=True)
+        print_note(arguments, note)
     data.mkdir(parents=True, exist_ok=True)
     path = data / f"{name}.sqlite"
     journal = Journal(path, name)
@@ -215,7 +223,8 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
         )
     finally:
         bus.close()
-    return _report([*recording.damage, *damage])
+    images = (len(taken_images),) * 2
+    return _report(arguments, name, images, [one.id for one in maps], [*recording.damage, *damage])
 
 
 def images_of(recording: Recording, robot: str | None) -> range:
@@ -255,8 +264,25 @@ def name_of(arguments: argparse.Namespace) -> str:
     return check_name(fallback or "recording")
 
 
-def _report(damage: Sequence[str]) -> int:
-    """Say what could not be read; the exit status."""
+def _report(
+    arguments: argparse.Namespace, name: str, images: tuple[int, int], maps: Sequence[MapId],
+    damage: Sequence[str],
+) -> int:  # fmt: skip
+    """Say what could not be read, and with `--json` what came of it; the exit status.
+
+    Args:
+        arguments: of the command line.
+        name: of the robot.
+        images: how many were played, and of how many.
+        maps: that were made.
+        damage: a line each.
+    """
+    from mapweave.processes.agent_files import map_path
+
     for line in damage:
         print(f"mapweave: {line}", file=sys.stderr)
+    if arguments.json:
+        files = [{"map": str(one), "path": str(map_path(arguments.data, one))} for one in maps]
+        played = {"images": images[1], "played": images[0], "maps": files, "damage": list(damage)}
+        print(json.dumps({"robot": name, **played}))
     return 1 if damage else 0

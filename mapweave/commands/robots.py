@@ -6,6 +6,8 @@ import argparse
 import json
 from typing import Any
 
+from mapweave.commands.answer import add_json
+
 
 def add_to(commands: Any) -> None:
     """Declare the command."""
@@ -15,7 +17,7 @@ def add_to(commands: Any) -> None:
         description="List the drivers with their robots and missing libraries. The settings file of a robot "
         'names its driver: [robot] driver = "koala". Your own driver is FILE.py:CLASS.',
     )
-    parser.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(parser)
     parser.set_defaults(run=run)
 
 

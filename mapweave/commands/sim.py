@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
+from mapweave.commands.answer import add_json
 from mapweave.commands.network import (
     add_log_format,
     add_network,
@@ -43,7 +44,7 @@ def add_to(commands: Any) -> None:
         help="the scenarios that come with Mapweave",
         description="Names and summaries. The files are a good start for your own: see docs/scenarios.md.",
     )
-    listing.add_argument("--json", action="store_true", help="print one JSON object")
+    add_json(listing)
     listing.set_defaults(run=run_list)
 
 

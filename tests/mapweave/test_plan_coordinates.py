@@ -203,3 +203,18 @@ def test_a_name_for_a_superseded_node_says_where_robots_go(
     goal = str(mapweave.open(copy).resolve("old").found[0].node)
     assert out.endswith(f"; {node} is superseded by {by}; the nearest active node is {goal}\n")
     assert not room.nodes.superseded[list(room.nodes.ids).index(goal)]
+
+
+@pytest.mark.parametrize("form", ["rmf", "nav2", "tf", "json"])
+def test_an_export_of_a_plan_as_one_object(
+    planned: Path, form: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """`--json` was taken, and the other text was printed all the same."""
+    words = ["plan", "export", "flat", "--format", form, "--map", str(planned)]
+    assert main(words) == 0
+    text = capsys.readouterr().out
+    assert main([*words, "--json"]) == 0
+    out = capsys.readouterr().out
+    values = json.loads(out)
+    assert out.count("\n") == 1 and (values["plan"], values["component"]) == ("flat", 0)
+    assert values[form] == (json.loads(text) if form == "json" else text)
