@@ -18,6 +18,8 @@ from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
+from mapweave.mapserver.merging.merge_adoption import MergeAdoption
+from mapweave.mapserver.merging.merge_sharing import MergeSharing
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import Compare, compare
@@ -37,6 +39,10 @@ SEARCHES_AT_ONCE = 20
 """Nodes whose similar nodes are searched at once, before new changes are taken in."""
 PREPARED_AT_ONCE = 4
 """Nodes whose aliasing is evaluated at once, likewise."""
+SHARE, QUICK = 0.05, 0.05
+"""Of the time that it may take to hand merges over, where one takes longer than so many seconds."""
+LOOK = 1.0
+"""s between two looks for a merge that can be adopted, while there is none."""
 MOST_WORDS = 1000
 """Characters of an event in a status message."""
 
@@ -55,6 +61,7 @@ class MergeWorker:
         compare: Compare = compare,
         observe: Callable[[float], None] = lambda seconds: None,
         pruning: PruningRecord | None = None,
+        sharing: MergeSharing | None = None,
     ) -> None:
         """Start with no map.
 
@@ -68,12 +75,20 @@ class MergeWorker:
             compare: compares nodes.
             observe: called with the time that a merge has taken, s.
             pruning: prunes what has been superseded for long; None: nothing is.
+            sharing: hands merges over to other servers, or from them; None: this one merges for itself.
         """
         self._schedule = schedule
+        self._sharing = sharing
+        # Until it is known which server leads this one follows.
+        self._adoption = MergeAdoption(sharing, pruning, schedule.monotonic) if sharing else None
+        self._following, self._alone = sharing is not None, ""
+        self._own_merges = self._shared_merges = self._term = 0
+        self._share_at = 0.0
+        self._waiting_for: list[threading.Event] = []
         self._keeper, self._pruning = keeper, pruning
         self._history = history or MapHistory()
         self._observe = observe
-        self._share = share
+        self._share_of_time = share
         self._merger = Merger(places, merge, compare, schedule.pause)
         self._fresh: dict[NodeId, Node] = {}
         self._last: dict[MapId, int] = {}
@@ -110,6 +125,16 @@ class MergeWorker:
         """Whether everything that has come is merged, or could not be."""
         return self._done == self._came
 
+    @property
+    def behind(self) -> int:
+        """Changes that wait for the merge of the server that leads."""
+        return self._adoption.behind if self._adoption else 0
+
+    @property
+    def alone(self) -> str:
+        """Why this server merges though another one leads; empty if it does not."""
+        return self._alone
+
     def current(self) -> Answers:
         """Answers that contain all changes before a question (see Schedule.catch_up)."""
         self._schedule.catch_up()
@@ -140,7 +165,8 @@ class MergeWorker:
 
     def queues(self) -> Mapping[str, int]:
         """Changes that wait to be taken in, and nodes to be compared."""
-        return {"merge": len(self._waiting), "comparisons": self._merger.uncompared}
+        compare = 0 if self._following else self._merger.uncompared
+        return {"merge": len(self._waiting) + self.behind, "comparisons": compare}
 
     def unmerged(self, robot: str) -> int:
         """Changes of a robot that wait to be taken in: robots take turns."""
@@ -190,6 +216,10 @@ class MergeWorker:
         if self._pruning and self._pruning.outdated:
             self._post(self._adopt_pruning)
 
+    def follow_merges(self) -> None:
+        """Look which server leads, and whether it has merged. Returns at once; for any thread."""
+        self._schedule.post(self._look)
+
     def settle(self, timeout: float) -> bool:
         """Wait until everything that came before this call is merged; False if the time is over first."""
         merged = threading.Event()
@@ -236,7 +266,7 @@ class MergeWorker:
                 log.warning("%s", error)
 
     def _save(self, last: bool = False) -> None:
-        if self._keeper:
+        if self._keeper and not self._following:
             try:
                 self._keeper.save(self._merger, last)
             except Exception:  # the next start takes longer
@@ -245,23 +275,32 @@ class MergeWorker:
     def _idle(self) -> float | None:
         """A piece of the work that can wait: compare nodes, merge, prepare answers."""
         # What comes in pieces is merged when it is whole.
-        if self._reading or not (self._dirty or self._unprepared):
+        if self._reading:
             return None
+        if self._following:
+            return self._follow()
+        if not (self._dirty or self._unprepared):
+            return self._share()
         if self._merger.uncompared:
             self._search_pairs()
             return 0.0
         began = self._schedule.monotonic()
         if self._dirty:
             self._merge()
+            self._share()
         else:
             self._prepare(PREPARED_AT_ONCE)
         spent = self._schedule.monotonic() - began
         self._save()
-        return spent * (1.0 / self._share - 1.0)
+        return spent * (1.0 / self._share_of_time - 1.0)
 
     def _settle(self, merged: threading.Event) -> None:
+        if self._following:
+            self._waiting_for.append(merged)
+            return
         if self._dirty:
             self._merge()
+            self._share()
         merged.set()
         self._save()
 
@@ -274,7 +313,105 @@ class MergeWorker:
     def _take_next(self) -> None:
         with self._counting:
             _, change = self._waiting.pop()
-        self._take(change)
+        if self._following and self._adoption:
+            self._adoption.hold(change)
+        else:
+            self._take(change)
+
+    def _take_held(self, changes: list[Change]) -> None:
+        """Take in what was held back, without comparing nodes."""
+        if changes:
+            self._read(changes)
+            self._merger.counters.changes += len(changes)
+        for change in changes:
+            if isinstance(change.body, NodePut):
+                self._forget(change.body.node)
+                self._check_pruned(change.body.node.id)
+
+    def _look(self) -> None:
+        """Lead or follow, as the store says."""
+        if self._adoption is None or self._sharing is None:
+            return
+        if self._sharing.leads:
+            if self._term != self._sharing.term:
+                self._term, self._shared_merges = self._sharing.term, -1
+                self._sharing.begin()
+            if self._following:
+                self._go_on()
+            self._alone = ""
+        elif not self._following and (not self._alone or self._adoption.promising(self._merger)):
+            self._following, self._alone = True, ""
+            self._adoption.begin()
+
+    def _follow(self) -> float | None:
+        """A piece of idle work: adopt what the server that leads has merged, or merge after all."""
+        self._adopt()
+        if self._adoption is None or self._adoption.overdue:
+            self._alone = self._adoption.reason if self._adoption else ""
+            log.warning("this server merges itself, though it does not lead: %s", self._alone)
+            self._go_on()
+            return 0.0
+        if self._adoption.in_step(self._merger):
+            self._done = self._applied
+            self._release()
+        if self._unprepared:
+            began = self._schedule.monotonic()
+            self._prepare(PREPARED_AT_ONCE)
+            return (self._schedule.monotonic() - began) * (1.0 / self._share_of_time - 1.0)
+        return LOOK if self._adoption.reason else None
+
+    def _adopt(self) -> None:
+        if self._adoption is None:
+            return
+        try:
+            merged = self._adoption.adopt(self._merger, self._take_held, self._has_merged)
+            if merged is None:
+                return
+            self._own_merges = self._merger.counters.merges
+            self._answers = self._answers_from(merged)
+            self._unprepared, self._begun, self._problem = True, True, ""
+            self._history.follow(merged)
+        except Exception:  # the next merge is the next chance
+            log.exception("a merge could not be adopted")
+
+    @property
+    def _has_merged(self) -> bool:
+        """Whether this server has merged since it began, or since it adopted a merge."""
+        return self._merger.counters.merges != self._own_merges
+
+    def _go_on(self) -> None:
+        """Merge from now on, from where the server that led left off."""
+        self._adopt()
+        if self._adoption:
+            self._take_held(self._adoption.hand_over(self._merger, self._has_merged))
+        self._following, self._dirty = False, True
+        waiting, self._waiting_for = self._waiting_for, []
+        for merged in waiting:
+            self._schedule.post(partial(self._settle, merged))
+
+    def _release(self) -> None:
+        waiting, self._waiting_for = self._waiting_for, []
+        for merged in waiting:
+            merged.set()
+
+    def _share(self) -> float | None:
+        """Hand the newest merge over to the servers that follow, if that takes little of the time."""
+        merges = self._merger.counters.merges
+        if self._sharing is None or not self._sharing.followed or merges == self._shared_merges:
+            return None
+        began = self._schedule.monotonic()
+        if began < self._share_at:
+            return self._share_at - began
+        if not self._dirty:
+            try:
+                self._sharing.write(self._merger, self._last, self._pruning.mark if self._pruning else None)
+            except Exception:  # the others merge for themselves
+                log.exception("a merge is not handed over")
+            self._shared_merges = merges
+            took = self._schedule.monotonic() - began
+            if took > QUICK:
+                self._share_at = self._schedule.monotonic() + took / SHARE
+        return None
 
     def _take(self, change: Change) -> None:
         if isinstance(change.body, NodePut):
@@ -372,5 +509,7 @@ class MergeWorker:
             now_ns = self._schedule.time_ns()
             if self._pruning and self._pruning.prune(self._merger, now_ns, self._last):
                 self._dirty = True
-        except Exception:  # it is tried again the next day
+        except InvalidFile as error:  # it is tried again the next day
+            log.warning("what has been superseded for long is not pruned: %s", error)
+        except Exception:
             log.exception("what has been superseded for long could not be pruned")

@@ -20,6 +20,7 @@ from mapweave.agent.replication.journal import Draft, Journal
 from mapweave.agent.replication.log_state import LogState
 from mapweave.hybridmap.agent_status import FIRST_STATUS_PERIOD
 from mapweave.hybridmap.change import ChangeBody, NodeRetired
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
 from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.wire.bus import Bus, Request, Sample
@@ -124,6 +125,7 @@ class Replicator:
         self._committed = 0
         self._disk_failure = ""
         # Only the thread touches these.
+        self._unnoted = False
         self._pending: list[Draft] = []
         self._retry_at = 0.0
         shortest = self._settings.beacon_interval
@@ -316,8 +318,8 @@ class Replicator:
             self._pending = drafts
             self._retry_at = time.monotonic() + self._settings.retry_interval
             with self._changed:
-                if not self._disk_failure:
-                    log.error("%s; %d changes wait in memory", error, len(drafts))
+                if not self._disk_failure and not self._unnoted:
+                    log.error("%s; %s in memory", error, counted(len(drafts), "change"))
                 self._disk_failure = str(error)
             return
         with self._changed:
@@ -389,10 +391,17 @@ class Replicator:
         try:
             for name in servers:
                 self._journal.acknowledge(name, state.map, ack.watermark, reset=lost and name == server)
+        except InvalidFile as error:
+            # The server sends it again, because the next beacon shows that it was not noted; a full disk is
+            # one line meanwhile.
+            if not self._unnoted and not self._disk_failure:
+                log.error("%s", error)
+            self._unnoted = True
+            return
         except MapweaveError as error:
-            # The server sends it again, because the next beacon shows that it was not noted.
             log.warning("%s", error)
             return
+        self._unnoted = False
         with self._changed:
             state.acknowledged |= {
                 name: ack.watermark

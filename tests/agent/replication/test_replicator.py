@@ -183,6 +183,37 @@ def test_a_full_disk_is_logged_once_and_retried(
     eventually(lambda: [Mark.decode(s.attachment).sequence for s in server.changes] == [1, 2, 3])
 
 
+def test_a_full_disk_that_takes_no_acknowledgement_either_is_one_line(
+    agent: Agent, server: HandServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """A server says again and again what it has, until the robot has noted it."""
+    agent.replicator.submit(bodies(1, 2), 0)
+    assert agent.replicator.flush(30)
+    tries: list[int] = []
+
+    def full(*_: object, **__: object) -> None:
+        tries.append(1)
+        raise InvalidFile("r0.sqlite: agent journal: the disk is full")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(agent.journal, "acknowledge", full)
+        patched.setattr(agent.journal, "write", full)
+        for count in range(1, 4):
+            server.acknowledge(agent.log_id, 2)
+            eventually(lambda count=count: len(tries) == count)
+        agent.replicator.submit(bodies(3, 3), 0)
+        eventually(lambda: "disk is full" in agent.replicator.status().failure)
+    (record,) = caplog.records
+    assert record.getMessage() == "r0.sqlite: agent journal: the disk is full"
+    assert agent.replicator.flush(30)
+    server.acknowledge(agent.log_id, 3)
+    assert agent.replicator.wait_acknowledged(30)
+    with monkeypatch.context() as patched:
+        patched.setattr(agent.journal, "write", full)
+        agent.replicator.submit(bodies(4, 4), 0)
+        eventually(lambda: len(caplog.records) == 2)
+
+
 def test_closing_commits_what_was_submitted(hub: MemoryHub, path: Path) -> None:
     agent = Agent(hub, path)
     agent.replicator.submit(bodies(1, 100), 0)

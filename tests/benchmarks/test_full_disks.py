@@ -1,0 +1,92 @@
+"""Full disks below a server, a PostgreSQL and a robot, as processes: disks that only this test sees."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from synthetic.postgres_server import binaries
+
+pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+
+
+@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
+def said(request: pytest.FixtureRequest) -> Iterator[dict[str, Any]]:
+    """What was seen, with a store in a file and with one in PostgreSQL."""
+    store = str(request.param)
+    if store == "postgresql" and (find_spec("psycopg") is None or binaries() is None):
+        pytest.skip("there is no PostgreSQL, or the extra `postgres` is not installed")
+    if store == "postgresql" and os.geteuid():
+        # It runs as a user of its own, of which a namespace of one user knows nothing.
+        pytest.skip("a PostgreSQL on a disk of its own needs root")
+    own = [] if os.geteuid() == 0 else ["--user", "--map-root-user"]
+    unshare = ["unshare", *own, "--mount"]
+    if not shutil.which("unshare") or subprocess.run([*unshare, "true"], capture_output=True).returncode:
+        pytest.skip("needs mounts of its own (unshare --mount)")
+    # Not below pytest's folder: that is its user's alone, and too long for a socket.
+    folder = Path(tempfile.mkdtemp(prefix="disk-"))
+    try:
+        folder.chmod(0o755)
+        ran = subprocess.run(
+            [*unshare, sys.executable, "-m", "tests.benchmarks.disk_processes", store, str(folder)],
+            capture_output=True, text=True, timeout=800, cwd=Path(__file__).parents[2], env=dict(os.environ),
+        )  # fmt: skip
+        logs = "\n".join(path.read_text(errors="replace")[-3000:] for path in folder.glob("*.log"))
+        assert ran.returncode == 0, ran.stderr + logs
+        yield dict(json.loads(ran.stdout.splitlines()[-1]), store=store)
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+
+
+def test_nothing_is_lost_whichever_disk_is_full(said: dict[str, Any]) -> None:
+    account = said["account"]
+    assert account["sent"] == account["stored"] + account["undone"] > 100
+    assert (account["lost"], account["duplicated"], account["out_of_order"]) == (0, 0, 0)
+    assert account["maps_equal"] is True
+
+
+def test_a_server_on_a_full_disk_acknowledges_nothing_and_says_why(said: dict[str, Any]) -> None:
+    server = said["server"]
+    assert server["runs"] is True and server["acknowledged while full"] == 0
+    why = {"sqlite": "map store: the disk is full", "postgresql": "No space left on device"}[said["store"]]
+    assert why in server["event"] and "\n" not in server["event"]
+
+
+def test_each_thing_that_is_not_written_is_one_line(said: dict[str, Any]) -> None:
+    lines, after = said["server"]["lines"], said["server"]["lines after"]
+    assert lines == after and not any(line.startswith("Traceback") for line in lines)
+    # Behind the time: changes, history, pruning, and what the next start would spare.
+    words = [line.split(" ", 2)[2] for line in lines]
+    assert len(set(words)) == len(words)
+    assert sum(line.startswith(("/", "postgresql://")) and "map store" in line for line in words) == 1
+    assert said["robot"]["lines"] == said["robot"]["lines after"] and len(said["robot"]["lines"]) == 1
+
+
+def test_a_server_that_is_killed_on_a_full_disk_has_what_it_acknowledged(said: dict[str, Any]) -> None:
+    assert said["server"]["missing after kill"] == 0
+    assert said["server"]["started full"] is True
+
+
+def test_a_full_disk_of_the_write_ahead_log_ends_postgresql_and_no_server(said: dict[str, Any]) -> None:
+    if said["store"] == "sqlite":
+        pytest.skip("a file has no such disk")
+    assert said["log"]["runs"] is True and said["log"]["acknowledged while full"] == 0
+    assert "the map store cannot be used" in said["log"]["event"]
+
+
+def test_a_server_does_not_start_on_a_read_only_disk(said: dict[str, Any]) -> None:
+    if said["store"] == "postgresql":
+        pytest.skip("PostgreSQL itself does not start there")
+    (line,) = said["read-only"]["lines"]
+    assert "the disk is read-only" in line
+    assert said["read-only"]["status"] == 1 and said["read-only"]["show"] == 0
