@@ -46,6 +46,8 @@ MOST_RATED = 5000
 with the square. An explanation of a link has it in any case."""
 EXPECTED = 5.0
 """s in which a browser that has asked for the page opens its WebSocket."""
+SAID_AGAIN = 10.0
+"""s after which an unchanged state is sent again: so a viewer knows that the server is there."""
 MOST_VIEWERS = 64
 """More are refused."""
 LOADING = "loading"
@@ -119,7 +121,7 @@ class LiveUpdates:
     async def _show(self, viewer: WebSocket, person: Person) -> None:
         hello = {"kind": "hello", **self._access.described(person, self._server.read_only)}
         await viewer.send_text(json_bytes(hello).decode())
-        version, events, state = 0, 0, ""
+        version, events, state, said = 0, 0, "", 0.0
         if before := self._before:
             await viewer.send_text(before.map)
         while True:
@@ -133,8 +135,8 @@ class LiveUpdates:
             if self._counted > events:
                 text, events = self._events_since(events)
                 await viewer.send_text(text)
-            if self._state != state:
-                state = self._state
+            if self._state != state or (state and time.monotonic() >= said + SAID_AGAIN):
+                state, said = self._state, time.monotonic()
                 await viewer.send_text(state)
             await looked.wait()
 

@@ -26,6 +26,7 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.superseded import Superseded
+from mapweave.mapserver.http import live
 from mapweave.mapserver.http.live import MOST_VIEWERS, LiveUpdates
 from mapweave.mapserver.http.login import RequestAuthorization
 from mapweave.mapserver.http.row_table import RowTable
@@ -37,6 +38,10 @@ from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from tests.mapserver.stub_services import StubServices, two_maps
 from tests.waiting import eventually
 
+HANDSHAKE = (
+    b"GET /live HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
+    b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
+)
 TYPES = {
     "rows": "<u4", "map": "<u4", "number": "<f8", "x": "<f4", "y": "<f4", "heading": "<f4",
     "component": "<u4", "state": "u1", "a": "<u4", "b": "<u4", "kind": "u1", "probability": "<f4",
@@ -226,10 +231,7 @@ def test_who_takes_nothing_or_says_too_much_is_dropped(services: StubServices) -
         with socket.socket() as slow:
             slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
             slow.connect(("127.0.0.1", served.port))
-            slow.sendall(
-                b"GET /live HTTP/1.1\r\nHost: localhost\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-                b"Sec-WebSocket-Key: dGhlIHNhbXBsZSBub25jZQ==\r\nSec-WebSocket-Version: 13\r\n\r\n"
-            )
+            slow.sendall(HANDSHAKE)
             eventually(lambda: served.connections == 1)
             eventually(lambda: served.connections == 0)
         services.holds["summary"] = "short"
@@ -241,6 +243,34 @@ def test_who_takes_nothing_or_says_too_much_is_dropped(services: StubServices) -
             watching.connection.send("x" * 5000)
             with pytest.raises(ConnectionClosed):
                 watching.until("nothing")
+
+
+def test_viewers_that_are_closed_or_asleep_leave_nothing(services: StubServices) -> None:
+    """So many each day as may watch at once, and nobody could watch any more."""
+    limits = ConnectionTimeouts(head=5.0, whole=5.0, stall=0.5)
+    with Web(("127.0.0.1", 0), services, limits=limits) as served:
+        for _ in range(2 * MOST_VIEWERS):
+            with viewer(served) as closed:
+                closed.until("hello")
+        with ExitStack() as stack:
+            for _ in range(MOST_VIEWERS):
+                # What a phone leaves whose network is gone: it takes what comes, and answers no ping.
+                asleep = stack.enter_context(socket.create_connection(("127.0.0.1", served.port)))
+                asleep.sendall(HANDSHAKE)
+                assert asleep.recv(4)
+            eventually(lambda: served.connections == 0)
+            with viewer(served) as watching:
+                assert watching.until("state")
+
+
+def test_an_unchanged_state_is_said_again(
+    services: StubServices, served: Web, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By it a page knows that its server is there."""
+    monkeypatch.setattr(live, "SAID_AGAIN", 0.6)
+    with viewer(served) as watching:
+        first = watching.until("state")
+        assert watching.until("state") == first
 
 
 def test_only_so_many_watch(served: Web) -> None:
