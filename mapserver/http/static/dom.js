@@ -50,14 +50,28 @@ export function listed(list, items) {
   for (const one of [...list.children]) if (!kept.includes(one)) one.remove();
   kept.forEach((one, k) => { if (list.children[k] !== one) list.insertBefore(one, list.children[k] || null); });
 }
+const known = rows => rows.filter(([, value]) => value !== null && value !== undefined && value !== "");
 export function facts(parent, rows) {
   const list = add(parent, "dl");
-  for (const [name, value, kind] of rows) {
-    if (value === null || value === undefined || value === "") continue;
+  for (const [name, value, kind] of known(rows)) {
     add(list, "dt", name);
     add(list, "dd", String(value), kind);
   }
   return list;
+}
+// The same again: what stays is the same element, so that its text can be marked, copied and read while the rest changes.
+export function updateFacts(parent, rows) {
+  const list = parent.querySelector("dl"), shown = known(rows), names = [...list?.querySelectorAll("dt") || []];
+  if (!list || names.length !== shown.length || names.some((one, k) => one.textContent !== shown[k][0])) {
+    parent.textContent = "";
+    facts(parent, rows);
+    return;
+  }
+  shown.forEach(([, value, kind = ""], k) => {
+    const there = names[k].nextSibling;
+    if (there.className !== kind) there.className = kind;
+    say(there, String(value));
+  });
 }
 // No -0.
 export const degrees = rad => `${Math.round(rad * 180 / Math.PI) + 0}\u00b0`;

@@ -25,6 +25,8 @@ import { Viewport } from "./viewport.js";
 import { watch } from "./live.js";
 
 const PICK = 14;              // px about what is pressed
+const EDGE = 30;              // px from the edge of the map, at which the selected robot is moved to its middle
+const NEAR = 0.25;            // of the extent of the map, within which robots beside it are shown too
 const MOST_NAMES = 500;       // in the list that helps searching
 const SAID_EVERY = 10000;       // ms, between two looks at annotations and plans
 
@@ -71,7 +73,7 @@ function addToEdited(name) {
   if (panel.kind === "plan") panel.show("link");
   selection.toggle(name);
 }
-function selectRobot(name, goal = page.node) {
+function selectRobot(name, goal = page.node, move = true) {
   page.robot = painter.robot = name;
   forget();
   openTab("selected");
@@ -79,8 +81,13 @@ function selectRobot(name, goal = page.node) {
   showRobot(name, page.whyNot, goal);
   updateRobot(page.robots);
   const robot = painter.robots.find(one => one.name === name);
-  if (robot) viewport.show(robot.x, robot.y);
+  if (robot && move) viewport.show(robot.x, robot.y);
   painter.ask();
+}
+// The selected robot is followed while it is in view: a person who has looked elsewhere goes on to see that.
+function follow(before, now) {
+  const [was, is] = [before, now].map(robots => robots.find(one => one.name === page.robot));
+  if (was && is && viewport.holds(was.x, was.y, 0) && !viewport.holds(is.x, is.y, EDGE)) viewport.show(is.x, is.y, 0);
 }
 function showWhy(question) {
   openTab("why");
@@ -91,11 +98,7 @@ function markWays({ a, b, standing, hops = [], gaps = [] }) {
   painter.ways = a?.id ? [{ a: a.id, b: b.id, dashed: !["linked", "own"].includes(standing) }]
     : [...hops, ...gaps.map(gap => ({ ...gap, dashed: true }))];
   const rows = painter.ways.flatMap(way => [way.a, way.b]).map(name => model.rowOf(name)).filter(row => row !== undefined);
-  const seen = row => {
-    const [u, v] = viewport.toScreen(model.x[row], model.y[row]);
-    return u >= 0 && v >= 0 && u <= viewport.width && v <= viewport.height;
-  };
-  if (!rows.every(seen)) {
+  if (!rows.every(row => viewport.holds(model.x[row], model.y[row], 0))) {
     const xs = rows.map(row => model.x[row]), ys = rows.map(row => model.y[row]);
     viewport.fit([Math.min(...xs), Math.min(...ys), Math.max(...xs), Math.max(...ys)]);
     viewport.touched = true;
@@ -113,7 +116,7 @@ function chosen(u, v, shift) {
     return;
   }
   const robot = painter.robots.find(one => Math.hypot(one.x - x, one.y - y) < reach);
-  if (robot) { selectRobot(robot.name); return; }
+  if (robot) { selectRobot(robot.name, page.node, false); return; }
   const row = model.nearest(x, y, reach);
   if (row >= 0) { selectNode(model.name(row), false); return; }
   const link = model.nearestLink(x, y, reach / 2);
@@ -140,7 +143,18 @@ function find(text) {
   byId("query").setCustomValidity(byId("query").title);
   byId("query").reportValidity();
 }
-function fit() { viewport.fit(model.bounds()); viewport.touched = false; painter.ask(); }
+// Of all nodes, and of the robots that are not far from them.
+function extent() {
+  const box = model.bounds(), reach = box && NEAR * Math.max(box[2] - box[0], box[3] - box[1], 4);
+  const grown = box?.slice();
+  for (const { x, y } of painter.robots) {
+    if (!box || x < box[0] - reach || y < box[1] - reach || x > box[2] + reach || y > box[3] + reach) continue;
+    grown[0] = Math.min(grown[0], x); grown[1] = Math.min(grown[1], y);
+    grown[2] = Math.max(grown[2], x); grown[3] = Math.max(grown[3], y);
+  }
+  return grown;
+}
+function fit() { viewport.fit(extent()); viewport.touched = false; painter.ask(); }
 
 function listComponents() {
   listed(byId("components"), model.components.map(({ anchor, nodes, maps, floor }, k) => {
@@ -206,6 +220,7 @@ watch({
     if (name) panel.sign(name);
     page.readOnly = read_only;
     page.loading = true;
+    page.heard = false;
     permit(commands, why_not);
     say(byId("connection"), read_only ? "map file" : "live");
     clearEvents();
@@ -215,7 +230,7 @@ watch({
     page.bytes = bytes;
     model.apply(message);
     byId("empty").hidden = model.order.length > 0;
-    if (!viewport.touched) viewport.fit(model.bounds());
+    if (!viewport.touched) viewport.fit(extent());
     if (selected) painter.selected = model.rowOf(selected) ?? -1;
     panel.counts();
     listComponents();
@@ -240,16 +255,20 @@ watch({
     if (history.some(({ kind }) => kind === "annotated")) loadSaid();
     if (!page.loading) listCorrections();
   },
-}, up => {
-  if (!up) permit(false, "The map server does not answer: nothing can be changed until it does. What you have typed stays.");
+}, (up, why) => {
+  if (!up) permit(false, `The map server ${why ? `shows nothing: ${why}` : "does not answer"}. Nothing can be changed until it does. `
+    + "What you have typed stays.");
   byId("connection").className = up ? "" : "lost";
-  say(byId("connection"), up ? "live" : "no server, trying again");
+  say(byId("connection"), up ? "live" : `${why || "no server"}, trying again`);
   // Nothing is known of them any more.
   if (!up && !page.readOnly) showRobots(page.robots.map(robot => ({ ...robot, alive: false, lost: true })));
 }, admitted);
 function showRobots(robots) {
   page.robots = robots;
+  const before = painter.robots;
   painter.robots = robots.map(robot => poseOf(robot, model)).filter(Boolean);
+  follow(before, painter.robots);
+  if (!viewport.touched && painter.robots.some(({ x, y }) => !viewport.holds(x, y, EDGE))) viewport.fit(extent());
   listRobots(robots, name => selectRobot(name), page.readOnly ? "A map file has none." : "None has been heard of.");
   updateRobot(robots);
   painter.ask();

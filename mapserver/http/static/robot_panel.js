@@ -1,9 +1,10 @@
 // Robots: the list of all, and one with its missions. POST /robots/...
-import { add, ask, button, byId, counted, degrees, facts, listed, made, percent, retitled, seconds } from "./dom.js";
+import { add, ask, button, byId, counted, degrees, listed, made, percent, retitled, say, seconds, updateFacts } from "./dom.js";
 import { wordsOf } from "./names.js";
 import { onPlans } from "./plans.js";
 
 const QUIET = 5; // s without a status
+const KINDS = { sent: "good", running: "good", done: "good", failed: "bad", refused: "bad", replaced: "warn" }; // of missions
 let panel = null;
 
 export function poseOf(robot, model) {
@@ -20,10 +21,10 @@ function ellipseOf(covariance) {
     angle: Math.atan2(2 * xy, xx - yy) / 2 };
 }
 const life = robot => robot.before || robot.lost ? ["as last shown", "soft"] : !robot.alive ? ["gone", "bad"] : robot.age > QUIET ? ["silent", "warn"] : ["alive", "good"];
-function missionWords(mission) {
+function missionWords(mission, shares = true) {
   if (!mission) return "";
   const { order, state, progress, reason } = mission, goal = order.goal || order.node || "";
-  const share = state === "running" && progress ? ` ${percent(progress)}` : "", why = reason ? `: ${reason}` : "";
+  const share = shares && state === "running" && progress ? ` ${percent(progress)}` : "", why = reason ? `: ${reason}` : "";
   return `${order.kind}${goal ? " to " + goal : ""}, ${state}${share}${why} (by ${order.by})`;
 }
 export function listRobots(robots, select, none) {
@@ -42,7 +43,7 @@ export function listRobots(robots, select, none) {
 export function showRobot(name, whyNot, goal) {
   const box = byId("selected");
   retitled(box, `Robot ${name}`);
-  panel = { name, facts: document.createElement("div"), portal: null };
+  panel = { name, facts: document.createElement("div"), portal: null, words: null, given: "" };
   if (whyNot) { add(box, "p", whyNot, "soft"); box.append(panel.facts); return; }
   const form = add(box, "form", "", "actions"), input = add(form, "input"), via = add(form, "input");
   input.id = "goal"; input.value = goal; input.placeholder = "node, x,y, place or home"; input.setAttribute("list", "names");
@@ -55,12 +56,15 @@ export function showRobot(name, whyNot, goal) {
   add(form, "button", "Send");
   const actions = add(box, "div", "", "actions"), words = add(box, "p");
   words.setAttribute("role", "status");
+  panel.words = words;
+  const mine = panel;
   const give = async path => {
     words.className = ""; words.textContent = "Asking ...";
     const said = why.value.trim() ? "&" + new URLSearchParams([["because", why.value.trim()]]) : "";
     const answer = await ask(`robots/${encodeURIComponent(name)}/${path}${said}`, { method: "POST" });
-    words.className = answer.error ? "bad" : "good";
-    words.textContent = answer.error || answer.said || missionWords(answer);
+    words.className = answer.error ? "bad" : KINDS[answer.state] || "good";
+    words.textContent = answer.error || answer.said || missionWords(answer, false);
+    mine.given = answer.order?.id || "";
   };
   form.addEventListener("submit", event => {
     event.preventDefault();
@@ -77,14 +81,19 @@ export const leaveRobot = () => { panel = null; };
 export function updateRobot(robots) {
   if (!panel) return;
   const robot = robots.find(one => one.robot === panel.name);
-  panel.facts.textContent = "";
-  if (!robot) { add(panel.facts, "p", "It is not known to the server any more.", "warn"); return; }
+  if (!robot) { panel.facts.textContent = "It is not known to the server any more."; return; }
   const portal = robot.status?.status.portal;
   if (panel.portal) panel.portal.hidden = !portal || portal.done;
+  // What was said of a mission given here holds until it is over.
+  const mission = robot.status?.mission;
+  if (panel.given && mission?.order.id === panel.given) {
+    panel.words.className = KINDS[mission.state] || "";
+    say(panel.words, missionWords(mission, false));
+  }
   const status = robot.status, [word, kind] = life(robot), pose = robot.merged_from_robot;
   const [xx = 0, , yy = 0, hh = 0] = (status?.status.covariance || []).map(Math.sqrt);
   const spread = xx + yy > 0 ? ` (sigma ${xx.toFixed(3)}, ${yy.toFixed(3)} m, ${degrees(hh)})` : "";
-  facts(panel.facts, [
+  updateFacts(panel.facts, [
     ["state", word, kind],
     ["held against it", robot.accusation, "bad"],
     ["last heard", robot.lost ? "before the map server was gone" : robot.before ? "before the server began" : `${seconds(robot.age)} ago`],

@@ -7,6 +7,11 @@ export class Viewport {
   constructor() { this.x = this.y = 0; this.scale = 30; this.width = this.height = 1; this.touched = false; }
   toScreen(x, y) { return [(x - this.x) * this.scale + this.width / 2, this.height / 2 - (y - this.y) * this.scale]; }
   toPlane(u, v) { return [(u - this.width / 2) / this.scale + this.x, (this.height / 2 - v) / this.scale + this.y]; }
+  // Whether a point is in view, so many px from the edge or more.
+  holds(x, y, edge) {
+    const [u, v] = this.toScreen(x, y);
+    return u >= edge && v >= edge && u <= this.width - edge && v <= this.height - edge;
+  }
   pan(du, dv) { this.x -= du / this.scale; this.y += dv / this.scale; this.touched = true; }
   zoom(factor, u = this.width / 2, v = this.height / 2) {
     const [x, y] = this.toPlane(u, v);

@@ -1,0 +1,182 @@
+"""Robots on the page in a real browser: where they drive, their missions, and what is known of them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import pytest
+
+from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.http.web import Web
+from tests.browser import PROGRAMS, Browser, there_is_none
+from tests.mapserver.http.person import Person
+from tests.mapserver.stub_services import StubServices
+from tests.waiting import eventually
+
+pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+GOAL = NodeId("r0", 1, 3)
+VIEW = "const v = mapweave.viewport; return [v.x, v.y, v.scale]"
+IN_VIEW = (
+    "const robot = mapweave.painter.robots.find(one => one.name === 'r0');"
+    "return Boolean(robot) && mapweave.viewport.holds(robot.x, robot.y, 20)"
+)
+SENT = "return document.querySelector('#selected p[role=status]').{}"
+
+
+class DrivenServices(StubServices):
+    """A robot that takes each mission."""
+
+    def give(self, robot: str, *_: Any) -> MissionReport:
+        return report(MissionState.RUNNING)
+
+
+def report(state: MissionState, progress: float = 0.0, reason: str = "") -> MissionReport:
+    order = MissionOrder("m1", "r0", MissionKind.GO, 1, "page", GOAL, goal="hall")
+    return MissionReport(order, state, progress, reason)
+
+
+def robot_at(x: float, y: float, mission: MissionReport | None = None, **more: Any) -> FleetStatus:
+    """Its status, and where it is in the frame of component 0, m."""
+    doing = Status("driving", "3 nodes further", 3, 40, Pose2(), False, covariance=(0.04, 0.0, 0.01, 0.001))
+    status = AgentStatus(doing, 5, "r0", 1, mission=mission, **more)
+    return FleetStatus((RobotEntry("r0", True, 0.2, status, Pose2(x, y, 0.3), 0, lag=90.0 if more else 0.0),))
+
+
+@pytest.fixture
+def services() -> DrivenServices:
+    return DrivenServices()
+
+
+@pytest.fixture
+def person(browser: Browser, services: DrivenServices) -> Iterator[Person]:
+    services.fleet = robot_at(0.0, 0.0)
+    with Web(("127.0.0.1", 0), services) as served:
+        browser.look(1000, 700)
+        browser.open(f"http://127.0.0.1:{served.port}/")
+        eventually(lambda: browser.run("return window.mapweave?.painter.robots.length") == 1)
+        yield Person(browser)
+
+
+def select(person: Person) -> None:
+    person.page.run("document.querySelector('#robots button').click()")
+    eventually(lambda: "Robot r0" in person.text("selected"))
+
+
+def test_what_became_of_a_mission_replaces_what_was_said_when_it_was_given(
+    person: Person, services: DrivenServices
+) -> None:
+    """Beside "done" the panel went on saying that it was running."""
+    select(person)
+    person.page.type("#goal", "hall\n")
+    eventually(lambda: person.page.run(SENT.format("textContent")) == "go to hall, running (by page)")
+    services.fleet = robot_at(0.5, 0.0, report(MissionState.RUNNING, 0.25))
+    eventually(lambda: "go to hall, running 25 % (by page)" in person.text("selected"))
+    # A share that grows is not read out.
+    assert person.page.run(SENT.format("textContent")) == "go to hall, running (by page)"
+    services.fleet = robot_at(0.5, 0.0, report(MissionState.FAILED, 0.25, "a door is shut"))
+    failed = "go to hall, failed: a door is shut (by page)"
+    eventually(lambda: person.page.run(SENT.format("textContent")) == failed)
+    assert person.page.run(SENT.format("className")) == "bad"
+
+
+def test_the_selected_robot_stays_in_view(person: Person, services: DrivenServices) -> None:
+    select(person)
+    before = person.page.run(VIEW)
+    services.fleet = robot_at(0.2, 0.0)
+    eventually(lambda: person.page.run("return mapweave.painter.robots[0].x") == 0.2)
+    assert person.page.run(VIEW) == before, "it is in view still"
+    for x in (30.0, 60.0):
+        services.fleet = robot_at(x, 0.0)
+        eventually(lambda x=x: person.page.run("return mapweave.painter.robots[0].x") == x)
+        assert person.page.run(IN_VIEW)
+    # A person who looks elsewhere is not taken along.
+    person.page.run("mapweave.viewport.show(0, 0)")
+    before = person.page.run(VIEW)
+    services.fleet = robot_at(80.0, 0.0)
+    eventually(lambda: person.page.run("return mapweave.painter.robots[0].x") == 80.0)
+    assert person.page.run(VIEW) == before
+
+
+def test_a_click_on_a_robot_moves_no_map(person: Person) -> None:
+    before = person.page.run(VIEW)
+    at = person.page.run(
+        "const box = mapweave.painter.canvas.getBoundingClientRect(), robot = mapweave.painter.robots[0];"
+        "const [u, v] = mapweave.viewport.toScreen(robot.x, robot.y); return [box.left + u, box.top + v]"
+    )
+    person.mouse(tuple(at))
+    eventually(lambda: "Robot r0" in person.text("selected"))
+    assert person.page.run(VIEW) == before
+
+
+def test_the_whole_map_is_shown_with_the_robots_that_are_near(
+    person: Person, services: DrivenServices
+) -> None:
+    """One that mapped at the edge was drawn at the edge of the window, or beyond it."""
+    person.page.look(320, 600)
+    left, bottom, right, top = person.page.run("return mapweave.model.bounds()")
+    wide = max(right - left, top - bottom)
+    services.fleet = robot_at(left - 0.24 * max(wide, 4.0), bottom)
+    eventually(lambda: person.page.run("return mapweave.painter.robots[0].x") < left)
+    eventually(lambda: person.page.run(IN_VIEW))
+    person.press("fit")
+    assert person.page.run(IN_VIEW)
+    # One that believes to be far away makes nothing small.
+    services.fleet = robot_at(right + 100.0, bottom)
+    eventually(lambda: person.page.run("return mapweave.painter.robots[0].x") > 90.0)
+    person.press("fit")
+    scale = person.page.run("return mapweave.viewport.scale")
+    services.fleet = robot_at(0.5 * (left + right), bottom)
+    eventually(lambda: person.page.run("return mapweave.painter.robots[0].x") < 90.0)
+    person.press("fit")
+    assert person.page.run("return mapweave.viewport.scale") == scale
+
+
+def test_the_facts_of_a_robot_can_be_marked_while_statuses_come(
+    person: Person, services: DrivenServices
+) -> None:
+    """Twice a second they were made anew, and what was marked was lost."""
+    select(person)
+    person.page.run(
+        "const facts = [...document.querySelectorAll('#selected dt')];"
+        "const fact = facts.find(one => one.textContent === 'doing');"
+        "getSelection().selectAllChildren(fact.nextSibling)"
+    )
+    services.fleet = robot_at(0.7, 0.0)
+    eventually(lambda: "0.70, 0.00 m" in person.text("selected"))
+    assert person.page.run("return getSelection().toString()") == "driving: 3 nodes further"
+
+
+def test_battery_queue_lag_and_trouble_are_shown(person: Person, services: DrivenServices) -> None:
+    select(person)
+    services.fleet = robot_at(
+        0.0, 0.0, battery=0.62, unsent=17, last_error="the disk is full", error_age=200.0
+    )
+    eventually(lambda: "the disk is full (for 3 min)" in person.text("selected"))
+    facts = dict(
+        person.page.run(
+            "return [...document.querySelectorAll('#selected dt')]"
+            ".map(one => [one.textContent, one.nextSibling.textContent])"
+        )
+    )
+    assert facts["battery"] == "62 %" and facts["not yet on the server"] == "17 changes, one for 2 min"
+    assert facts["state"] == "alive" and facts["last heard"] == "0.2 s ago"
+    services.fleet = robot_at(0.0, 0.0)
+    eventually(lambda: "the disk is full" not in person.text("selected"))
+    assert "battery" not in person.text("selected")
+
+
+def test_words_that_say_what_to_type_are_not_cut_off(person: Person) -> None:
+    select(person)
+    cut = person.page.run("""
+        const c = document.createElement('canvas').getContext('2d');
+        return [...document.querySelectorAll('#selected input')].filter(one => {
+          const style = getComputedStyle(one);
+          c.font = style.font;
+          return c.measureText(one.placeholder).width > one.clientWidth - 2 * parseFloat(style.paddingLeft);
+        }).map(one => one.placeholder)
+    """)
+    assert cut == []
