@@ -12,7 +12,7 @@ export function watch(handlers, connected, admitted) {
   }
   function lost(why) {
     clearTimeout(silent);
-    // Closing takes long where nobody answers.
+    // Closing takes long where no one answers.
     socket.onclose = socket.onmessage = socket.onopen = null;
     socket.close();
     socket = null;

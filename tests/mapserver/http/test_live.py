@@ -246,7 +246,7 @@ def test_who_takes_nothing_or_says_too_much_is_dropped(services: StubServices) -
 
 
 def test_viewers_that_are_closed_or_asleep_leave_nothing(services: StubServices) -> None:
-    """So many each day as may watch at once, and nobody could watch any more."""
+    """So many each day as may watch at once, and no one could watch any more."""
     limits = ConnectionTimeouts(head=5.0, whole=5.0, stall=0.5)
     with Web(("127.0.0.1", 0), services, limits=limits) as served:
         for _ in range(2 * MOST_VIEWERS):

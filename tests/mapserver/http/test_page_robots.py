@@ -138,7 +138,7 @@ def test_the_whole_map_is_shown_with_the_robots_that_are_near(
 def test_the_facts_of_a_robot_can_be_marked_while_statuses_come(
     person: Person, services: DrivenServices
 ) -> None:
-    """Twice a second they were made anew, and what was marked was lost."""
+    """They were made again twice a second, and what was marked was lost."""
     select(person)
     person.page.run(
         "const facts = [...document.querySelectorAll('#selected dt')];"
