@@ -1,17 +1,25 @@
-// What people type for a node: its id, the name of a place, or a position x,y of the largest component.
+// What people type for a node: its id, the name of a place, a position x,y of the largest component, or one on a floor plan, with
+// the plan's name before it.
 import { nodeOf, placeNamed, placeNames } from "./annotations.js";
+import { fromPlan, planNames } from "./plans.js";
 import { within } from "./selection.js";
 
-const POSITION = /^[-+]?(\d+\.?\d*|\.\d+),[-+]?(\d+\.?\d*|\.\d+)$/;
+const NUMBER = "[-+]?(?:\\d+\\.?\\d*|\\.\\d+)";
+const POSITION = new RegExp(`^${NUMBER},${NUMBER}$`), AFTER_NAME = new RegExp(`^\\s+(${NUMBER}),\\s*(${NUMBER})(?=[\\s,]|$)`);
 const REACH = 2; // m from a position to its node, as on the server
 
-// The words of a text, between blanks or commas. Names of places may have blanks, positions have a comma.
+const longestFirst = names => names.sort((a, b) => b.length - a.length);
+// The words of a text, between blanks or commas. Names of places may have blanks, positions have a comma, and one on a plan has
+// the plan's name before it.
 export function wordsOf(text) {
-  const places = placeNames().sort((a, b) => b.length - a.length), words = [];
+  const places = longestFirst(placeNames()), words = [];
+  const plans = longestFirst(planNames());
+  const onPlan = name => text.startsWith(name) && AFTER_NAME.exec(text.slice(name.length));
   const begins = name => text.startsWith(name) && /^([\s,]|$)/.test(text.slice(name.length));
   while ((text = text.replace(/^[\s,]+/, ""))) {
     const plain = /^\S+/.exec(text)[0].replace(/,+$/, "");
-    const word = places.find(begins) || (POSITION.test(plain) ? plain : /^[^\s,]+/.exec(text)[0]);
+    const plan = plans.find(onPlan), word = plan ? plan + onPlan(plan)[0]
+      : places.find(begins) || (POSITION.test(plain) ? plain : /^[^\s,]+/.exec(text)[0]);
     words.push(word);
     text = text.slice(word.length);
   }
@@ -27,9 +35,32 @@ function nodeInArea({ anchor, corners }, model) {
   const nearest = model.nearest(x, y, Infinity, inside);
   return nearest < 0 ? "" : model.name(nearest);
 }
+// The node nearest to a position on a plan.
+function nodeOnPlan(word, name, [, x, y], model) {
+  const parts = fromPlan(name, Number(x), Number(y)).filter(([component]) => model.members?.[component]);
+  if (!parts.length) return { lacks: `Plan ${name} lies under no part of the map now.` };
+  const rows = parts.map(([component, x, y]) =>
+    model.nearest(...model.placed([x, y, 0], component).slice(0, 2), REACH, model.members[component]));
+  const row = rows.find(one => one >= 0);
+  return row === undefined ? { lacks: `Nothing is mapped within ${REACH} m of ${word}.` } : { node: model.name(row) };
+}
+// The plan of which a word is a position, and what comes after its name: [name, match]; else nothing.
+function planOf(word) {
+  for (const name of longestFirst(planNames())) {
+    const after = word.startsWith(name) && AFTER_NAME.exec(word.slice(name.length));
+    if (after && name.length + after[0].length === word.length) return [name, after];
+  }
+  return null;
+}
+// As a goal for the server, which knows no plans by these words: a position on a plan is the nearest node.
+export function goalOf(word, model) {
+  return planOf(word) ? nodeNamed(word, model) : { node: word };
+}
 // The node that a word means, or why it means none: `{ node }` or `{ lacks }`.
 export function nodeNamed(word, model) {
   if (model.rowOf(word) !== undefined) return { node: word };
+  const plan = planOf(word);
+  if (plan) return nodeOnPlan(word, ...plan, model);
   const place = placeNamed(word);
   if (place) {
     const node = place.body.area ? nodeInArea(place.body.area, model) : nodeOf(place);

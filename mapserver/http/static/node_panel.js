@@ -1,5 +1,6 @@
 // One node: GET /nodes/NODE.
 import { add, ask, button, byId, counted, draw, facts, retitled, when } from "./dom.js";
+import { onPlans } from "./plans.js";
 import { drawView } from "./views.js";
 
 const box = byId("selected");
@@ -35,6 +36,7 @@ export async function showNode(name, { select, why, send, edit }) {
     ["map", node.map],
     ["floor", node.floor],
     ["in the merged map", node.merged_from_robot ? pose(node.merged_from_robot) : "nowhere"],
+    ["on the plan", onPlans(node.merged_from_robot?.mean, node.component)],
     ["in its own map", pose(node.map_from_robot)],
     ["landmarks", `${node.landmarks}, ${node.with_depth} with a depth, ${node.faded.length} faded`],
     ["on the wire", `${node.bytes} bytes`],

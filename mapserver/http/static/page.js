@@ -78,7 +78,7 @@ function selectRobot(name, goal = page.node, move = true) {
   forget();
   openTab("selected");
   announce(`Robot ${name}`);
-  showRobot(name, page.whyNot, goal);
+  showRobot(name, page.whyNot, goal, model);
   updateRobot(page.robots);
   const robot = painter.robots.find(one => one.name === name);
   if (robot && move) viewport.show(robot.x, robot.y);

@@ -23,6 +23,13 @@ export function onPlans(pose, component) {
   }
   return words.join("; ");
 }
+// Where a position on a plan is in the frames of the components under which the plan lies: [[component, x, y], ...].
+export function fromPlan(name, x, y) {
+  return planNamed(name).parts.map(({ component, plan_from_merged: [px, py, turn] }) => {
+    const c = Math.cos(turn), s = Math.sin(turn), dx = x - px, dy = y - py;
+    return [component, c * dx + s * dy, c * dy - s * dx];
+  });
+}
 export async function loadPlans(loaded) {
   if (!offered) return;
   const answer = await ask("plans");

@@ -1,6 +1,6 @@
 // Robots: the list of all, and one with its missions. POST /robots/...
 import { add, ask, button, byId, counted, degrees, listed, made, percent, retitled, say, seconds, updateFacts } from "./dom.js";
-import { wordsOf } from "./names.js";
+import { goalOf, wordsOf } from "./names.js";
 import { onPlans } from "./plans.js";
 
 const QUIET = 5; // s without a status
@@ -40,7 +40,7 @@ export function listRobots(robots, select, none) {
 }
 // The frame of the panel is made once, so that a goal can be typed while statuses come. Stop is above all that changes
 // its height, and in view on a phone.
-export function showRobot(name, whyNot, goal) {
+export function showRobot(name, whyNot, goal, model) {
   const box = byId("selected");
   retitled(box, `Robot ${name}`);
   panel = { name, facts: document.createElement("div"), portal: null, words: null, given: "" };
@@ -68,8 +68,10 @@ export function showRobot(name, whyNot, goal) {
   };
   form.addEventListener("submit", event => {
     event.preventDefault();
-    const passed = wordsOf(via.value).map(word => ["via", word]);
-    give("go?" + new URLSearchParams([["goal", input.value.trim()], ["by", "page"], ...passed]));
+    const named = [input.value.trim(), ...wordsOf(via.value)].map(word => goalOf(word, model));
+    const unknown = named.find(({ lacks }) => lacks), [goal, ...passed] = named.map(({ node }) => node);
+    if (unknown) { words.className = "bad"; words.textContent = unknown.lacks; return; }
+    give("go?" + new URLSearchParams([["goal", goal], ["by", "page"], ...passed.map(word => ["via", word])]));
   });
   button(actions, "Explore", () => give("explore?by=page"));
   button(actions, "Stop", () => give("stop?by=page"));

@@ -136,6 +136,39 @@ def test_robots_and_photos_are_named_in_coordinates_of_a_plan(
     assert [row[0] for row in page.run(ROWS)[1:]] == ["r0.1.7on plan office 9.00, 7.00 m, 90°", "r0.1.7"]
 
 
+def test_nodes_are_named_and_found_in_coordinates_of_a_plan(
+    page: Browser, services: StubServices, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As robots and photos are: what the panel shows can be typed, in the search and for missions."""
+    placed = replace(PLAN, name="ground floor", parts=(replace(PLAN.parts[0], component=0),))
+    monkeypatch.setattr(services, "plans", lambda: PlacedPlans((placed,)), raising=False)
+    services.fleet = FleetStatus((RobotEntry("r0", True),))
+    page.run("document.dispatchEvent(new Event('mapchanged'))")
+    node = NodeId("r0", 1, 5)
+    (at,) = (pose.mean for id_, (_, pose) in two_maps().poses.items() if id_ == node)
+    words = f"ground floor {10.0 - at.y:.2f}, {5.0 + at.x:.2f}"
+    search = "document.getElementById('query').value = '{}';document.getElementById('search').requestSubmit()"
+    shown = "return document.querySelector('#selected h2')?.textContent"
+    eventually(lambda: page.run("return import('/static/plans.js').then(one => one.planNames().length)"))
+    for typed in (words, words.replace(", ", ",")):
+        page.run(search.format("r0.1.1"))
+        eventually(lambda: page.run(shown) == "Node r0.1.1")
+        page.run(search.format(typed))
+        eventually(lambda: page.run(shown) == f"Node {node}")
+    assert dict(page.run(FACTS))["on the plan"].startswith(f"{words} m, ")
+    page.run(search.format("ground floor 500,500"))
+    says = page.run("return document.getElementById('query').validationMessage")
+    assert says == "Nothing is mapped within 2 m of ground floor 500,500."
+    page.run("document.querySelector('#robots button').click(); document.getElementById('goal').value = ''")
+    page.type("#via", f"r0.1.1, {words}, r0.1.7")
+    page.type("#goal", f"{words}\n")
+    eventually(lambda: services.ways == [(str(node), ("r0.1.1", str(node), "r0.1.7"))])
+    page.run("document.getElementById('goal').value = 'ground floor 500,500'")
+    page.type("#goal", "\n")
+    eventually(lambda: "Nothing is mapped within 2 m of ground floor" in page.run(text_of("selected")))
+    assert len(services.ways) == 1
+
+
 def test_what_is_no_image_is_not_sent(page: Browser, services: StubServices, tmp_path: Path) -> None:
     (tmp_path / "notes.log").write_text("no image")
     page.type("#image", str(tmp_path / "notes.log"))
