@@ -5,6 +5,7 @@ import { drawView } from "./views.js";
 const BAD_PX = 10;
 const COLOURS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
 const SHOWN = 12;
+const MAP = /^[a-z0-9][a-z0-9_-]*\.\d+$/;
 const result = byId("result");
 
 function colour(px) {
@@ -93,9 +94,18 @@ function showOthers(box, links) {
     item.append(`: ${w.agrees ? "agrees" : "contradicts"}, ${deviations(w.distance2)}, ${w.kept ? "stands" : "refused"}`);
   }
 }
+// The maps over which two are one where no link joins them, as the reason names them.
+const overMaps = ({ joined, links, reason }) =>
+  joined && !links ? (/ by way of (.+?);/.exec(reason)?.[1].split(", ") || []).filter(name => MAP.test(name)) : [];
 function showTwo(one) {
   const box = add(result, "section", "", one.joined ? "box good" : "box");
   add(box, "p", one.reason);
+  const over = overMaps(one);
+  if (over.length) {
+    add(box, "p", "By way of:");
+    const steps = add(box, "ol"), way = [one.first, ...over, one.second];
+    way.slice(1).forEach((name, k) => to(add(steps, "li"), way[k], name, `${way[k]} - ${name}`));
+  }
   if (!one.joined)
     add(box, "p", `${counted(one.refused, "link")} refused, ${counted(one.unverified, "candidate pair")} without a common pose.`);
   if (one.nearest.length) add(box, "p", one.joined ? "Weakest links:" : "Nearest to a link:");
@@ -152,8 +162,10 @@ export async function explain({ a = "", b = "", route = false }, keep = true) {
   if (answer.error) add(result, "section", answer.error, "box failed");
   else if (answer.hops) showRoute(answer);
   else if (!answer.maps) showPair(answer);
-  else if (answer.maps.length) answer.maps.forEach(showTwo);
-  else add(result, "section", "There are no two maps.", "box");
+  else if (answer.maps.length) {
+    for (const words of answer.accusations || []) add(result, "section", words, "box failed");
+    answer.maps.forEach(showTwo);
+  } else add(result, "section", "There are no two maps.", "box");
   explanation.shown(answer);
 }
 export function explainAddress() {

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from concurrent.futures import Future
+from dataclasses import replace
 from itertools import pairwise
 from urllib.error import HTTPError
 from urllib.request import urlopen
@@ -11,14 +13,17 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.errors import Busy
-from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.explanation import Explanation, FleetExplanation
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
+from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.http.json_values import json_values
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
-from mapweave.merge.explanation.map_explanation import explain_fleet
+from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
 from mapweave.merge.explanation.node_explanation import explain_nodes
+from synthetic.maps import looked_around, merger_of
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.stub_services import StubServices, two_maps
 from tests.waiting import eventually
@@ -196,3 +201,33 @@ def test_a_way_leads_from_node_to_node(served: Web) -> None:
     for query, words in (("", "write /route?a="), ("?a=r0.1&b=r1.1", "from node to node")):
         status, result = ask(served, query, "route")
         assert status == 400 and words in result["error"]
+
+
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+def test_maps_that_are_one_by_way_of_others_show_the_way_on_the_page(
+    served: Web, services: StubServices, browser: Browser, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And what is held against maps, which the shell says too."""
+    ids = tuple(MapId(name, 1) for name in ("r0", "r1", "r2"))
+    merged = merger_of(looked_around(ids, seed=6)).merged()
+    far = {ids[0], ids[2]}
+    links = tuple(link for link in merged.links if {link.a.map, link.b.map} != far)
+    assert 0 < len(links) < len(merged.links)
+    merged = replace(merged, links=links)
+
+    def explain(request: ExplainRequest) -> Future[Explanation]:
+        done: Future[Explanation] = Future()
+        pair = (ids[0], ids[2]) if request.ends is None else tuple(MapId(*end[:2]) for end in request.ends)
+        explanation = explain_maps(merged, *pair)
+        done.set_result(FleetExplanation((explanation,), () if request.ends else ("r2.1 is bent",)))
+        return done
+
+    monkeypatch.setattr(services, "explain", explain)
+    browser.open(f"http://127.0.0.1:{served.port}/why")
+    eventually(lambda: "by way of r1.1; no link joins the two directly" in browser.run(RESULT))
+    assert browser.run(LINKS) == ["r0.1 - r1.1", "r1.1 - r2.1"]
+    assert "r2.1 is bent" in browser.run(RESULT)
+    browser.run("document.querySelectorAll('#result a')[1].click()")
+    eventually(lambda: "r1.1 and r2.1 are one map: " in browser.run(RESULT))
+    assert browser.run("return location.search") == "?a=r1.1&b=r2.1"
+    assert "By way of" not in browser.run(RESULT)
