@@ -40,7 +40,7 @@ MEASUREMENTS: dict[str, str] = {
     "geometry": "python -m benchmarks.geometry --recording DATA/kitti03 --seed 737 --json",
     "fleet": "python -m benchmarks.fleet --agents 10 50 200 1000 --seconds 30 --seed 733 --json",
     "fleet_disturbed": "python -m benchmarks.fleet --agents 1000 --disturb --seconds 30 --seed 739 --json",
-    "shards": "python -m benchmarks.shards --shards 1 2 4 --seed 736 --json",
+    "shards": "python -m benchmarks.shards --shards 1 2 4 --store sqlite --seed 736 --json",
     "shards_postgresql": "python -m benchmarks.shards --shards 1 2 4 --store postgresql --seed 736 --json",
     "life": "python -m benchmarks.life --drives 6 --stops 4 --seed 713 --json",
     "life_year": "python -m benchmarks.life --drives 100 --seed 735 --json",

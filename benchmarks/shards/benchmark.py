@@ -18,10 +18,12 @@ an answer; `wrong`, answers "found" further than 0.5 m from the truth, with or w
 stays unacknowledged behind a kill, no more is killed. It ends with 1 if anything is lost, wrong, or linked
 otherwise than without Ray, or a node is missing.
 
-With `--store postgresql` two front servers, each with its gateway and shards, share a PostgreSQL, which is a
-primary with a synchronous standby, and robots reach them by a router. `server` is then the first of them. The
-second one (`front`) is killed as well, and the primary: the standby is promoted at once, so in a real set-up
-the time in which a primary is taken for dead is added. The server without Ray is alone, with SQLite.
+With `--store postgresql`, which is the default where a PostgreSQL is installed that can have standbys, two
+front servers, each with its gateway and shards, share it: a primary with a synchronous standby, both started
+here. Robots reach the servers by a router. `server` is then the first of them. The second one (`front`) is
+killed as well, and the primary: the standby is promoted at once, so in a real set-up the time in which a
+primary is taken for dead is added. The server without Ray is alone, with SQLite. `store` says which it was,
+and `not_killed` what was not killed, and why.
 """
 
 from __future__ import annotations
@@ -50,7 +52,7 @@ from benchmarks.shards.askers import PATIENCE, Askers
 from benchmarks.shards.fleet import BuildingFleet, MappingRobot
 from benchmarks.shards.ray_nodes import RayNodes
 from benchmarks.shards.servers import MapServers
-from benchmarks.shards.shared_store import SharedStore
+from benchmarks.shards.shared_store import SharedStore, can_be_shared
 from mapweave.hybridmap.change import EdgePut
 from mapweave.scenarios.children import ChildFailed
 from mapweave.storage.map_file import MapFile
@@ -59,6 +61,8 @@ KILLS = ("worker", "shard", "gateway", "server", "head")
 SHARED_KILLS = ("front", "primary")
 """With PostgreSQL also these."""
 SQLITE, POSTGRESQL = "sqlite", "postgresql"
+ASKED, NO_SECOND = "not in --kills", f"a store in a file has one server and no primary (--store {POSTGRESQL})"
+"""Why something is not killed."""
 LATE = 2
 """Robots that join later."""
 AFTER = 4.0
@@ -268,6 +272,12 @@ def good(report: dict[str, Any]) -> bool:
     return whole and not report["lost"] and not report["wrong"]
 
 
+def not_killed(kills: Sequence[str], store: str) -> dict[str, str]:
+    """Kinds of processes that are not killed, with the reason."""
+    without = {kind: NO_SECOND for kind in SHARED_KILLS if store == SQLITE}
+    return {kind: ASKED for kind in KILLS + SHARED_KILLS if kind not in kills} | without
+
+
 def in_json(report: dict[str, Any]) -> str:
     """A report in JSON, which has no infinity: null instead."""
     return json.dumps(json.loads(json.dumps(report), parse_constant=lambda word: None))
@@ -282,7 +292,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser.add_argument("--askers", type=int, default=4, help="lost robots that ask at once")
     parser.add_argument("--seconds", type=float, default=5.0, help="of asking")
     parser.add_argument("--ray-nodes", type=int, default=3, help="of the cluster")
-    parser.add_argument("--store", choices=(SQLITE, POSTGRESQL), default=SQLITE)
+    parser.add_argument(
+        "--store", choices=(SQLITE, POSTGRESQL), default=POSTGRESQL if can_be_shared() else SQLITE,
+        help="default: postgresql where it is installed, with standbys; else sqlite",
+    )  # fmt: skip
     parser.add_argument("--kills", nargs="*", choices=KILLS + SHARED_KILLS, help="default: all of the store")
     o = parser.parse_args(arguments)
     of_store = KILLS + (SHARED_KILLS if o.store == POSTGRESQL else ())
@@ -321,6 +334,6 @@ def main(arguments: Sequence[str] | None = None) -> None:
     if o.json:
         print(in_json({
             "robots": o.robots, "nodes": len(fleet.nodes), "seed": o.seed, "cores": os.cpu_count(),
-            "store": o.store, **report, "sizes": rows,
+            "store": o.store, "not_killed": not_killed(o.kills, o.store), **report, "sizes": rows,
         }))  # fmt: skip
     sys.exit(0 if good(report) else 1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from importlib.util import find_spec
 from pathlib import Path
 
 from mapweave.scenarios.children import ChildFailed
@@ -14,6 +15,12 @@ PATIENCE = 60.0
 """Longest wait for the standby, s."""
 
 
+def can_be_shared() -> bool:
+    """Whether there is a PostgreSQL that can have standbys, and the library for it."""
+    found = binaries()
+    return bool(find_spec("psycopg") and found and all((found / name).exists() for name in NEEDED))
+
+
 class SharedStore:
     """A primary and its standby, whose commits are on both disks when they return. A context manager."""
 
@@ -23,9 +30,10 @@ class SharedStore:
         Raises:
             ChildFailed: there is no PostgreSQL, or one without standbys.
         """
-        found = binaries()
-        if found is None or not all((found / name).exists() for name in NEEDED):
-            raise ChildFailed("needs PostgreSQL with pg_basebackup and pg_ctl: Debian's package postgresql")
+        if not can_be_shared():
+            raise ChildFailed(
+                "needs PostgreSQL with pg_basebackup and pg_ctl, Debian's package postgresql, and psycopg"
+            )
         self._folders = [folder / "pg0", folder / "pg1"]
         folder.chmod(0o755)
         for one in self._folders:

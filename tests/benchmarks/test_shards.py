@@ -15,19 +15,22 @@ import pytest
 
 from benchmarks.shards import benchmark
 from benchmarks.shards.askers import IN_A_ROW, AnswerLog
-from benchmarks.shards.benchmark import all_compared, good, in_json, main, summary, unacknowledged
+from benchmarks.shards.benchmark import (
+    KILLS,
+    SHARED_KILLS,
+    all_compared,
+    good,
+    in_json,
+    main,
+    not_killed,
+    summary,
+    unacknowledged,
+)
 from benchmarks.shards.fleet import BuildingFleet
-from benchmarks.shards.shared_store import NEEDED, SharedStore
+from benchmarks.shards.shared_store import SharedStore, can_be_shared
 from mapweave.mapserver.log.opening import open_store
-from synthetic.postgres_server import binaries
 
 WITHOUT = "needs the extra `postgres` and Debian's package postgresql"
-
-
-def standbys() -> bool:
-    """Whether there is a PostgreSQL that can have standbys."""
-    found = binaries()
-    return bool(find_spec("psycopg") and found and all((found / name).exists() for name in NEEDED))
 
 
 def test_recovery_by_hand() -> None:
@@ -40,8 +43,18 @@ def test_recovery_by_hand() -> None:
 @pytest.mark.parametrize("kind", ["primary", "front"])
 def test_a_file_has_no_second_server_and_no_primary(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit):
-        main(["--kills", "shard", kind])
+        main(["--store", "sqlite", "--kills", "shard", kind])
     assert "with --store postgresql alone" in capsys.readouterr().err
+
+
+def test_what_is_not_killed_is_said_with_the_reason() -> None:
+    assert not_killed([*KILLS, *SHARED_KILLS], "postgresql") == {}
+    assert not_killed(["worker", "primary"], "postgresql") == dict.fromkeys(
+        ("shard", "gateway", "server", "head", "front"), "not in --kills"
+    )
+    for_want = not_killed(KILLS, "sqlite")
+    assert {*for_want} == {"front", "primary"}
+    assert all("a store in a file has one server and no primary" in why for why in for_want.values())
 
 
 def test_maps_of_two_servers_are_as_good_as_the_worse(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -88,7 +101,7 @@ def test_robots_that_stay_unacknowledged_are_named() -> None:
 @pytest.mark.slow
 def test_a_lost_primary_has_a_standby_with_all_that_was_stored(tmp_path: Path) -> None:
     """The address names both machines: the standby is found by it."""
-    if not standbys():
+    if not can_be_shared():
         pytest.skip(WITHOUT)
     fleet = BuildingFleet(2, 4, 8963)
     # A socket's path is short.
@@ -107,7 +120,7 @@ def test_a_lost_primary_has_a_standby_with_all_that_was_stored(tmp_path: Path) -
 @pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra cluster: Ray")
 @pytest.mark.parametrize(("store", "kind"), [("sqlite", "shard"), ("postgresql", "primary")])
 def test_a_small_run(store: str, kind: str) -> None:
-    if store == "postgresql" and not standbys():
+    if store == "postgresql" and not can_be_shared():
         pytest.skip(WITHOUT)
     sizes = "--shards 2 --robots 4 --nodes 12 --seconds 1 --ray-nodes 2"
     arguments = f"{sizes} --store {store} --kills {kind} --seed 1 --json"
@@ -117,6 +130,7 @@ def test_a_small_run(store: str, kind: str) -> None:
     )  # fmt: skip
     assert run.returncode == 0, run.stderr[-3000:]
     figures = json.loads(run.stdout)
+    assert figures["store"] == store and {*figures["not_killed"]} == {*KILLS, *SHARED_KILLS} - {kind}
     assert figures["same_links"] and figures["max_pose_difference_m"] <= 0.001
     assert (figures["lost"], figures["wrong"]) == (0, 0)
     assert figures["sizes"]["2 shards"]["links"] > 20 and figures["sizes"]["2 shards"]["found"] > 10
