@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
@@ -132,3 +134,27 @@ def test_it_ends_with_1_unless_it_is_good_and_prints_json(
     report = json.loads(capsys.readouterr().out, parse_constant=no_json)
     assert report["good"] is (status == 0)
     assert report["agents"]["9"]["burst_p99_ms"] is None
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(400)
+def test_a_small_fleet_is_measured_as_a_whole() -> None:
+    """Not how fast it is: that is a matter of the machine and of what else it does."""
+    arguments = "--agents 4 --seconds 12 --burst 40 --disturb --seed 5 --json"
+    ran = subprocess.run(
+        [sys.executable, "-m", "benchmarks.fleet", *arguments.split()],
+        capture_output=True, text=True, timeout=380,
+    )  # fmt: skip
+    assert ran.stdout, ran.stderr[-2000:]
+    report = json.loads(ran.stdout.splitlines()[-1])
+    assert ran.returncode == (not report["good"])
+    row = report["agents"]["4"]
+    assert 0.0 < report["floor_p50_ms"] <= report["floor_p99_ms"]
+    # All that was sent is acknowledged: a node and its edge every 10 s of each, and the burst.
+    assert row["unacked"] == row["disturbers_unacked"] == 0
+    assert row["burst"] == 40 and row["burst_s"] > 0.0
+    assert 4 <= row["acked_per_s"] * 12 <= 4 * 2 * 2
+    assert 0.0 < row["ack_p50_ms"] <= row["ack_p99_ms"] and row["relocalize_p95_ms"] > 0.0
+    for name in ("connected_s", "server_cpu", "router_cpu", "generator_cpu", "server_rss_mb"):
+        assert row[name] > 0.0, name
+    assert {*report["said"]["4"]} == {"slow", "frozen", "flooding"}
