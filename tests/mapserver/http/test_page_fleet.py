@@ -1,0 +1,164 @@
+"""The page in a real browser with robots that drive: server, simulator and two agents as processes."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from mapweave.evaluation.map_score import pose_error
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.pose import Pose2
+from mapweave.scenarios.children import Children
+from mapweave.sim.ground_truth_client import SimControl
+from mapweave.storage.map_file import unpack_map_file
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.zenoh_bus import ZenohBus
+from tests.browser import PROGRAMS, Browser, there_is_none
+from tests.mapserver.http.person import Person
+from tests.simulator import needs_simulator
+from tests.waiting import eventually, free_port
+
+PATIENCE = 120.0
+"""s, on a machine that does other things."""
+FLEET = "watched"
+ROBOTS = ("r0", "r1")
+SEEN = """
+window.seen = {};
+setInterval(() => {
+  for (const { name, x, y, heading, ellipse, doing } of mapweave.painter.robots) {
+    const one = window.seen[name] ||= { poses: [], doing: [], sigmas: [] }, pose = [x, y, heading].join();
+    if (one.poses.at(-1) !== pose) one.poses.push(pose);
+    if (one.doing.at(-1) !== doing) one.doing.push(doing);
+    if (ellipse) one.sigmas.push(ellipse.major);
+  }
+}, 100)
+"""
+WHERE = """
+const robot = mapweave.painter.robots.find(one => one.name === 'r0'), m = mapweave.model, row = m.rowOf('{}');
+return [[m.x[row], m.y[row], m.nodes.heading[row]], [robot.x, robot.y, robot.heading]]
+"""
+
+
+class Fleet:
+    """The processes, and what the simulator knows.
+
+    Attributes:
+        children: the processes.
+        http: port of the page.
+    """
+
+    def __init__(self, folder: Path, children: Children, bus: ZenohBus, endpoint: str) -> None:
+        self.children, self.http, self._bus = children, free_port(), bus
+        self._server = ["server", "--fleet", FLEET, "--listen", endpoint, "--data", str(folder / "server")]
+        self._server += ["--http", str(self.http)]
+        self.start_server()
+        eventually(bus.connected, PATIENCE)
+        network = ["--fleet", FLEET, "--connect", endpoint]
+        children.start("sim", ["sim", "serve", "passing", "--seed", "3", *network])
+        for name in ROBOTS:
+            agent = ["agent", name, "--data", str(folder), "--epoch", "1", "--lockstep", *network]
+            children.start(name, agent)
+        self._control = SimControl(bus, FLEET)
+
+    def start_server(self) -> None:
+        self.children.start("server", self._server)
+
+    def truth(self, goal: NodeId) -> tuple[Pose2, Pose2]:
+        """Where a node of r0 was made, and where r0 is."""
+        packed = self._bus.ask(Keys(FLEET).server_map("s0"), b"", 20)[0].payload
+        changes = unpack_map_file(packed).changes
+        (node,) = (one.node for one in changes if getattr(getattr(one, "node", None), "id", None) == goal)
+        (made,) = self._control.truth_at("r0", [node.stamp_ns])
+        return made, self._control.status().robots["r0"].world_from_robot
+
+
+@pytest.fixture
+def fleet(tmp_path: Path) -> Iterator[Fleet]:
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
+    try:
+        with Children(tmp_path / "logs") as children:
+            yield Fleet(tmp_path, children, bus, endpoint)
+    finally:
+        bus.close()
+
+
+def facts(page: Browser) -> dict[str, Any]:
+    return dict(
+        page.run(
+            "return [...document.querySelectorAll('#selected dt')]"
+            ".map(one => [one.textContent, one.nextSibling.textContent])"
+        )
+    )
+
+
+@pytest.mark.slow
+@needs_simulator
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+@pytest.mark.timeout(600)
+def test_robots_that_drive_are_watched_and_sent(fleet: Fleet, browser: Browser) -> None:
+    """They map, and move on the page; one is sent to a node, and parks there; the server starts again."""
+    person, goal = Person(browser), NodeId("r0", 1, 1)
+    eventually(lambda: fleet.children.check() or serves(browser, fleet.http), PATIENCE)
+    browser.look(1280, 800)
+    browser.errors()
+    browser.run(SEEN)
+    drawn = "return mapweave.model.order.length >= 8 && mapweave.painter.robots.length === 2"
+    eventually(lambda: fleet.children.check() or browser.run(drawn), PATIENCE)
+    moving = "return Object.values(window.seen).every(one => one.poses.length > 10 && one.doing.length > 2)"
+    eventually(lambda: browser.run(moving), PATIENCE)
+    seen = browser.run("return window.seen")
+    for name in ROBOTS:
+        poses = np.array([[float(number) for number in pose.split(",")] for pose in seen[name]["poses"]])
+        assert np.ptp(poses[:, :2], axis=0).max() > 0.05 and np.ptp(poses[:, 2]) > 0.2, name
+        assert 0.0 < max(seen[name]["sigmas"]) < 2.0
+        assert f"{name} alive {browser.run('return window.seen')[name]['doing'][-1][:8]}" in person.text(
+            "robots"
+        )
+    assert browser.run(
+        "return mapweave.painter.robots.every(({ x, y }) => mapweave.viewport.holds(x, y, 10))"
+    )
+
+    browser.run("document.querySelector('#robots button').click()")
+    eventually(lambda: facts(browser)["state"] == "alive")
+    assert facts(browser)["sees the server"] == "yes" and "explore" in facts(browser)["mission"]
+    browser.type("#goal", f"{goal}\n")
+    eventually(lambda: facts(browser)["mission"].startswith(f"go to {goal}, running"))
+    eventually(lambda: facts(browser)["mission"].startswith(f"go to {goal}, done: at the goal"), PATIENCE)
+    eventually(
+        lambda: (
+            f"go to {goal}, done" in browser.run("return document.querySelector('#selected p').textContent")
+        )
+    )
+    shown = [Pose2(*pose) for pose in browser.run(WHERE.format(goal))]
+    made, stands = fleet.truth(goal)
+    distance, angle = pose_error(shown[0].inverse() @ shown[1], made.inverse() @ stands)
+    assert distance < 0.03 and np.degrees(angle) < 2.0
+    assert pose_error(stands, made)[0] < 0.05
+    person.press("tab-events")
+    eventually(lambda: f"commanded: r0: go to {goal}, by page" in person.text("events"))
+
+    nodes = browser.run("return mapweave.model.order.length")
+    fleet.children.end("server")
+    eventually(lambda: person.text("connection") == "no server, trying again")
+    assert "alive" not in person.text("robots")
+    fleet.start_server()
+    eventually(lambda: person.text("connection") == "live", PATIENCE)
+    eventually(
+        lambda: [name for name in ROBOTS if f"{name} alive" in person.text("robots")] == list(ROBOTS),
+        PATIENCE,
+    )
+    assert browser.run("return mapweave.model.order.length") >= nodes
+    # What failed while there was no server is no error of the page.
+    assert not [line for line in browser.errors() if "ERR_CONNECTION" not in line and "WebSocket" not in line]
+
+
+def serves(browser: Browser, port: int) -> bool:
+    """Opens the page, if it is there."""
+    browser.open(f"http://127.0.0.1:{port}/")
+    return bool(browser.run("return Boolean(window.mapweave)"))
