@@ -263,7 +263,7 @@ def test_what_a_robot_retired_after_a_backup_goes_when_that_is_restored(
 def test_a_restored_backup_has_the_map_and_robots_add_what_is_newer(
     postgres: PostgresServer, tmp_path: Path
 ) -> None:
-    """The drill of docs/operations.md, by its own commands."""
+    """Into a database of the same name; `test_restore_drills` runs the commands of the page."""
     need_programs("pg_dump", "pg_restore")
     address, hub = postgres.database(), MemoryHub()
     database = str(psycopg.conninfo.conninfo_to_dict(address)["dbname"])
