@@ -79,23 +79,26 @@ export class MapModel {
     for (let row = 0; row < this.edges.count; row++)
       if (kinds[row] && this.kinds[kinds[row]] === "merged") this.links.push(row);
   }
-  // The largest component stays where its frame is, the others stand in rows below. A component keeps its place as
-  // long as it fits there.
+  // The first component stays where its frame is, the others stand in rows below: those that were there before in their order,
+  // then the larger ones. A component keeps its place as long as it fits there.
   place(boxes) {
+    const anchors = this.components.map(({ anchor }) => anchor), before = [...this.slots.keys()];
     const fits = boxes.every((box, k) => {
-      const slot = this.slots.get(this.components[k].anchor);
+      const slot = this.slots.get(anchors[k]);
       return slot && box[0] >= slot[0] && box[1] >= slot[1] && box[2] <= slot[2] && box[3] <= slot[3];
     });
     if (fits && boxes.length === this.slots.size) return;
     this.slots.clear(); this.offsets.clear();
-    let left = 0, top = 0, deepest = 0, width = 0;
-    boxes.forEach((box, k) => {
-      const anchor = this.components[k].anchor, room = 0.15 * Math.max(box[2] - box[0], box[3] - box[1], 4);
+    const rank = k => before.includes(anchors[k]) ? before.indexOf(anchors[k]) : before.length + k;
+    const order = [...boxes.keys()].sort((a, b) => rank(a) - rank(b));
+    const width = Math.max(10, ...boxes.map(box => box[2] - box[0]));
+    let left = 0, top = 0, deepest = 0;
+    order.forEach((k, n) => {
+      const box = boxes[k], anchor = anchors[k], room = 0.15 * Math.max(box[2] - box[0], box[3] - box[1], 4);
       this.slots.set(anchor, [box[0] - room, box[1] - room, box[2] + room, box[3] + room]);
-      if (!k) {
+      if (!n) {
         this.offsets.set(anchor, [0, 0]);
-        left = box[0]; top = box[1] - GAP; width = Math.max(box[2] - box[0], 10);
-        this.left = left;
+        left = this.left = box[0]; top = box[1] - GAP;
         return;
       }
       const wide = box[2] - box[0], high = box[3] - box[1];

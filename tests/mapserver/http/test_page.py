@@ -312,6 +312,32 @@ def test_no_button_touches_another_one(page: Browser, width: int) -> None:
     assert near == []
 
 
+def test_components_that_grow_keep_their_order(page: Browser) -> None:
+    """Of two robots that map, the one with more nodes was drawn above the other, and they changed places."""
+    above = page.run("""
+        return import('/static/map_model.js').then(({ MapModel }) => {
+          const model = new MapModel(), above = [];
+          // Components by number of nodes: whose they are, and their nodes, 1 m apart.
+          const grown = [[["r0.1.1", 2]], [["r0.1.1", 2], ["r1.1.1", 1]], [["r1.1.1", 9], ["r0.1.1", 3]],
+            [["r2.1.1", 40], ["r0.1.1", 30], ["r1.1.1", 20]]];
+          for (const sizes of grown) {
+            const count = sizes.reduce((sum, [, nodes]) => sum + nodes, 0);
+            const all = n => new Array(count).fill(n);
+            const component = sizes.flatMap(([, nodes], k) => new Array(nodes).fill(k));
+            const x = sizes.flatMap(([, nodes]) => [...new Array(nodes).keys()]);
+            Object.assign(model, { components: sizes.map(([anchor]) => ({ anchor })),
+              nodes: { count, x, y: all(0), component, state: all(1), map: all(0), number: all(0) } });
+            model.arrange();
+            const placed = sizes.map(([anchor], k) => [anchor, ...model.offset(k)]);
+            placed.sort((a, b) => b[2] - a[2] || a[1] - b[1]);
+            above.push(placed.map(([anchor]) => anchor).join(" "));
+          }
+          return above;
+        })
+    """)
+    assert above == ["r0.1.1", "r0.1.1 r1.1.1", "r0.1.1 r1.1.1", "r0.1.1 r1.1.1 r2.1.1"]
+
+
 def test_a_map_without_room_is_drawn_when_it_has_some(page: Browser) -> None:
     """As on a phone, where the keyboard may leave none."""
     eventually(lambda: page.run("return mapweave.painter.bitmap !== null"))
