@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterable, Mapping
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from mapweave.annotation_methods import AnnotationMethods
 from mapweave.hybridmap.annotation import Annotation, Annotations
@@ -34,6 +35,10 @@ from mapweave.refusals import refusals
 from mapweave.storage.atomic_file import check_place
 from mapweave.storage.map_file import MapFile
 from mapweave.storage.plan_image import check_plan_png
+
+if TYPE_CHECKING:
+    # It needs an extra, and what only looks does not.
+    from mapweave.offline_merge import Progress
 
 
 def checked_annotation(
@@ -73,6 +78,10 @@ def with_annotation(content: MapFile, annotation: Annotation, images: Mapping[st
     return replace(content, annotations=said.made, images=kept)
 
 
+def _unseen() -> AbstractContextManager[Progress]:
+    return nullcontext(lambda done, of: None)
+
+
 class OfflineAnnotations(AnnotationMethods):
     """The annotations of one map. Map files are written; a store is only read, since it is its server's."""
 
@@ -82,6 +91,7 @@ class OfflineAnnotations(AnnotationMethods):
         out: Path | None = None,
         by: str = "a person",
         settings: MergeSettings | None = None,
+        progress: Callable[[], AbstractContextManager[Progress]] = _unseen,
     ) -> None:
         """Read a map.
 
@@ -90,11 +100,12 @@ class OfflineAnnotations(AnnotationMethods):
             out: where the file with new annotations is written; over the old file by default.
             by: says so.
             settings: with which the file was merged.
+            progress: within it the map is merged; shows how far that is.
 
         Raises:
             InvalidFile: it cannot be read.
         """
-        self._by, self._settings = by, settings
+        self._by, self._settings, self._progress = by, settings, progress
         self._opened = open_map(path)
         self._out = Path(path) if out is None and self._opened.source is MapSource.FILE else out
         self._images = dict(self._opened.content.images)
@@ -154,7 +165,8 @@ class OfflineAnnotations(AnnotationMethods):
 
     @cached_property
     def _router(self) -> Router:
-        return Router(self._opened.merged(self._settings))
+        with self._progress() as report:
+            return Router(self._opened.merged(self._settings, report))
 
     def _annotate(
         self, name: str, fields: Mapping[str, Any], removed: bool, because: str, check: bool

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -68,6 +68,7 @@ def map_of_photographs(
     distortion: Distortion,
     spacing: float,
     map_id: MapId,
+    progress: Callable[[int, int], None] = lambda done, of: None,
 ) -> list[ChangeBody]:
     """Make a map.
 
@@ -77,6 +78,7 @@ def map_of_photographs(
         distortion: of its lens.
         spacing: how far apart they were taken, on average, m; 30 % more or less does not matter.
         map_id: whose nodes they become; the k-th photograph is node k.
+        progress: called with how many of how many images are read.
 
     Raises:
         DeviceError: an image cannot be read.
@@ -85,7 +87,10 @@ def map_of_photographs(
     if not (math.isfinite(spacing) and spacing > 0.0):
         raise InvalidValue(f"spacing {spacing:g}: give the metres between photographs")
     sift = Sift(Lens(camera, distortion))
-    features = [sift.extract(read_grey(image, camera)) for image in images]
+    features = []
+    for k, image in enumerate(images, 1):
+        features.append(sift.extract(read_grey(image, camera)))
+        progress(k, len(images))
     stretch = stretch_of([extracted.view(camera) for extracted in features], spacing)
     for image, landmarks in zip(images, stretch.landmarks, strict=True):
         if len(landmarks) < LEAST_LANDMARKS:

@@ -170,6 +170,11 @@ class Bar:
             self._said, self._said_at = line, self._clock()
 
 
+def working(words: str) -> Bar:
+    """Show that work goes on of which no steps are known yet."""
+    return Bar(plain_or_terminal(), words, None, transient=True)
+
+
 def tracked(
     items: Iterable[_T], words: str, total: int | None = None, console: Console | None = None
 ) -> Iterator[_T]:

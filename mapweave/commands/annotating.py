@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.answer import add_json, print_said
-from mapweave.commands.map_input import SOURCES, map_source
+from mapweave.commands.map_input import SOURCES, map_source, merge_progress
 from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_network, add_reason, settings_of
 from mapweave.commands.usage import UsageError
@@ -146,6 +146,10 @@ def record_of(arguments: argparse.Namespace) -> Iterator[Fleet | OfflineAnnotati
             yield fleet
     else:
         from mapweave.offline_annotations import OfflineAnnotations
+        from mapweave.terminal import working
 
         by, out = getattr(arguments, "by", "") or login(), getattr(arguments, "out", None)
-        yield OfflineAnnotations(arguments.map, out, by, settings_of(arguments).merge)
+        settings = settings_of(arguments).merge
+        with working("reading the map"):
+            record = OfflineAnnotations(arguments.map, out, by, settings, merge_progress)
+        yield record

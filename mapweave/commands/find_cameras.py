@@ -47,6 +47,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.doctor.camera import SECONDS, watch
     from mapweave.hybridmap.errors import DeviceError, Refused
     from mapweave.storage.atomic_file import write_whole
+    from mapweave.terminal import working
 
     devices = sorted(Path("/dev").glob("video*"), key=lambda path: (len(path.name), path.name))
     sources = [*map(str, devices), *arguments.source]
@@ -61,7 +62,8 @@ def run(arguments: argparse.Namespace) -> int:
             failed.append(str(error))
             continue
         try:
-            watched = watch(camera, SECONDS)
+            with working(f"looking through {source}"):
+                watched = watch(camera, SECONDS)
         finally:
             camera.close()
         if not watched.images:

@@ -48,11 +48,13 @@ def run(arguments: argparse.Namespace) -> int:
     """Open and describe."""
     from mapweave.agent.recordings.incomplete import Incomplete
     from mapweave.agent.recordings.opening import open_recording
+    from mapweave.terminal import working
 
     lacks: tuple[str, ...] = ()
     odometry = True
     try:
-        whole = open_recording(arguments.recording, options_of(arguments))
+        with working("reading the recording"):
+            whole = open_recording(arguments.recording, options_of(arguments))
         recording: Recording | None = whole
         bag = whole.bag
     except Incomplete as error:

@@ -36,7 +36,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.mapserver.store_backup import back_up
     from mapweave.opened_map import MapSource, source_of
     from mapweave.storage.database_copy import check_new
-    from mapweave.terminal import Bar, plain_or_terminal
+    from mapweave.terminal import working
 
     source, out = arguments.source, arguments.out
     if isinstance(source, str):
@@ -45,7 +45,7 @@ def run(arguments: argparse.Namespace) -> int:
     if (kind := source_of(source, live=True)) is not MapSource.STORE:
         # A robot that went on from an old journal would give numbers to changes that others have.
         raise InvalidFile(f"{source}: is a {kind.value.split()[-1]}, not a server's store")
-    with Bar(plain_or_terminal(), "copying pages", None, transient=True) as bar:
+    with working("copying pages") as bar:
         back_up(source, out, lambda done, of: bar.update(done, "", of))
     size = out.stat().st_size
     print_said(arguments, f"{out}: copy of the store, {size / 1e6:.1f} MB", file=str(out), bytes=size)

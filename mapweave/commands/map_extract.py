@@ -39,8 +39,10 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.mapserver.own_maps import maps_of
     from mapweave.opened_map import open_map
     from mapweave.storage.map_file import MapFile, write_map_file
+    from mapweave.terminal import working
 
-    opened = open_map(arguments.source)
+    with working("reading the map"):
+        opened = open_map(arguments.source)
     maps, lost = maps_of(opened.content), opened.complaints.get(None, "")
     paths = {map_id: arguments.out / f"{map_id}.mapweave" for map_id in opened.maps}
     for path in paths.values():

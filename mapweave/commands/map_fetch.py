@@ -29,11 +29,11 @@ def add_to(actions: Any) -> None:
 def run(arguments: argparse.Namespace) -> int:
     """Fetch and write."""
     from mapweave.storage.atomic_file import check_place, write_whole
-    from mapweave.terminal import Bar, plain_or_terminal
+    from mapweave.terminal import working
 
     check_place(arguments.out)
     # A server takes seconds to pack 1000 nodes.
-    with fleet_of(arguments) as fleet, Bar(plain_or_terminal(), "fetching the map", None, transient=True):
+    with fleet_of(arguments) as fleet, working("fetching the map"):
         content, data = fleet.map_and_bytes()
     write_whole(arguments.out, data)
     if arguments.json:

@@ -40,17 +40,20 @@ def run(arguments: argparse.Namespace) -> int:
 
     from mapweave.formats.g2o import read_g2o, write_g2o
     from mapweave.formats.g2o_optimum import optimum_of
+    from mapweave.terminal import working
 
     if arguments.out.suffix == ".mapweave":
         raise UsageError(f"{arguments.out}: what is written is a pose graph, no map; end its name with .g2o")
-    graph = read_g2o(arguments.file)
+    with working(f"reading {arguments.file.name}"):
+        graph = read_g2o(arguments.file)
     with np.errstate(all="ignore"):
         before = graph.chi2()
     if not math.isfinite(before):
         raise InvalidFile(
             f"{arguments.file}: its numbers are too large to be added up: give metres and radians"
         )
-    poses = optimum_of(graph)
+    with working(f"optimising {counted(len(graph.edges), 'edge')}"):
+        poses = optimum_of(graph)
     write_g2o(arguments.out, replace(graph, poses=poses))
     outcome = {
         "out": str(arguments.out),

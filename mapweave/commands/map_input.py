@@ -39,8 +39,10 @@ def opened(path: Path | str) -> OpenedMap:
         InvalidFile: it is none, or cannot be read.
     """
     from mapweave.opened_map import open_map
+    from mapweave.terminal import working
 
-    one = open_map(path)
+    with working("reading the map"):
+        one = open_map(path)
     for complaint in one.complaints.values():
         print(f"mapweave: {complaint}", file=sys.stderr)
     return one
@@ -67,13 +69,18 @@ def router_of(arguments: argparse.Namespace) -> Router:
 
 
 @contextmanager
-def merge_progress() -> Iterator[Progress]:
-    """A bar on stderr for people."""
-    from mapweave.terminal import Bar, plain_or_terminal
+def merge_progress(words: str = "reading nodes", then: str = "comparing and joining") -> Iterator[Progress]:
+    """A bar on stderr for people.
 
-    with Bar(plain_or_terminal(), "reading nodes", None, transient=True) as bar:
+    Args:
+        words: what is counted.
+        then: what is done with all of it.
+    """
+    from mapweave.terminal import working
+
+    with working(words) as bar:
 
         def report(done: int, of: int) -> None:
-            bar.update(done, "comparing and joining" if done == of else "", of)
+            bar.update(done, then if done == of else "", of)
 
         yield report

@@ -10,6 +10,7 @@ from typing import Any
 
 from mapweave.commands import values
 from mapweave.commands.answer import add_json
+from mapweave.commands.map_input import merge_progress
 from mapweave.commands.network import add_network, add_timeout, connect, network_of, reach, settings_of
 from mapweave.hybridmap.errors import NotConnected
 
@@ -59,7 +60,8 @@ def run(arguments: argparse.Namespace) -> int:
         # A server that is not there is better said before the work than after it.
         bus, keys = reach(network, "leave out --send")
         bus.close()
-    changes = map_of_photographs(images, camera, distortion, arguments.spacing, map_id)
+    with merge_progress("reading photographs", "finding where they were taken") as report:
+        changes = map_of_photographs(images, camera, distortion, arguments.spacing, map_id, report)
     title = f"{map_id}, of {len(images)} photographs"
     write_map_file(arguments.out, MapFile("agent", title, tuple(changes), {}))
     landmarks = [len(change.node.landmarks) for change in changes if isinstance(change, NodePut)]

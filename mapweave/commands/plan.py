@@ -244,9 +244,9 @@ def _draw(record: Fleet | OfflineAnnotations, placed: PlacedPlan, arguments: arg
 def _merged(record: Fleet | OfflineAnnotations, arguments: argparse.Namespace) -> MergedMap:
     from mapweave.fleet import Fleet
     from mapweave.mapserver.map_files import merged_of
-    from mapweave.terminal import Bar, plain_or_terminal
+    from mapweave.terminal import working
 
     if isinstance(record, Fleet):
-        with Bar(plain_or_terminal(), "fetching the map", None, transient=True):
+        with working("fetching the map"):
             return merged_of(record.map(), settings_of(arguments).merge)
     return record.merged

@@ -74,6 +74,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.drawing.match_picture import draw_matches
     from mapweave.hybridmap.query import Certainty
     from mapweave.storage.image_file import read_grey
+    from mapweave.terminal import working
     from mapweave.vision.lens import Lens
     from mapweave.vision.sift import Sift
 
@@ -94,7 +95,8 @@ def run(arguments: argparse.Namespace) -> int:
     def view() -> View:
         return Sift(lens).extract(grey).view(camera)
 
-    answer, node = _by_server(arguments, view) if router is None else _by_map(router, view())
+    with working("looking for the place"):
+        answer, node = _by_server(arguments, view) if router is None else _by_map(router, view())
     if arguments.json:
         print(json.dumps(_json(answer, plan)))
     else:

@@ -173,7 +173,7 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
     from mapweave.processes.agent import FIRST_PATIENCE
     from mapweave.processes.agent_files import epochs_of_files, map_path, trajectory_path
     from mapweave.storage.map_file import MapFile, write_map_file
-    from mapweave.terminal import EventLog, plain_or_terminal, tracked
+    from mapweave.terminal import EventLog, plain_or_terminal, tracked, working
     from mapweave.visual_mapping import keyframes, nothing_mapped, visual_maps
     from mapweave.visual_trajectory import tum_lines
 
@@ -203,7 +203,8 @@ def _map_images(arguments: argparse.Namespace, recording: Recording) -> int:
         epoch = max(arguments.epoch or 0, *(used + 1 for used in taken), (stored or 0) + 1)
         frames = tracked(taken_images, name, console=console)
         walk, damage = keyframes(recording, frames)
-        maps = visual_maps(walk, recording.camera, name, epoch)
+        with working("finding where the images were taken"):
+            maps = visual_maps(walk, recording.camera, name, epoch)
         if not maps:
             raise DeviceError(nothing_mapped(recording.path, walk, damage))
         for one in maps:

@@ -9,6 +9,7 @@ import os
 import shutil
 import sys
 import threading
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import replace
 from pathlib import Path
@@ -144,25 +145,32 @@ def run(arguments: argparse.Namespace) -> int:
             stack.enter_context(web)
             print(stamped(f"for people: {people.url}"), flush=True)
 
-        # The page is there: a browser can open it while all else is loaded.
-        from mapweave.mapserver.base_map import BaseMap
-        from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
-        from mapweave.mapserver.server import MapServer, ServerSettings
+        # The page is there: a browser can open it while all else is loaded. Whether another server has this
+        # name takes a third of a second to find out, and what is loaded meanwhile takes longer.
         from mapweave.processes.server_name import NameWatch, refuse_second
-        from mapweave.processes.service_manager import ServiceManager
         from mapweave.wire.keys import Keys
         from mapweave.wire.zenoh_bus import ZenohBus
         from mapweave.wire.zenoh_log import ZenohLog
 
-        gc.freeze()
-        gc.enable()
         if folder is not None:
             stack.enter_context(ZenohLog())
         keys, bus = Keys(router.fleet), ZenohBus(router)
         stack.callback(bus.close)
-        if router.mode == "client" or router.routers:
-            bus.wait_connected(SOON)
-            refuse_second(bus, keys, name)
+
+        def look_for_another() -> None:
+            if router.mode == "client" or router.routers:
+                bus.wait_connected(SOON)
+                refuse_second(bus, keys, name)
+
+        looking = stack.enter_context(ThreadPoolExecutor(1, "server name")).submit(look_for_another)
+        from mapweave.mapserver.base_map import BaseMap
+        from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
+        from mapweave.mapserver.server import MapServer, ServerSettings
+        from mapweave.processes.service_manager import ServiceManager
+
+        gc.freeze()
+        gc.enable()
+        looking.result()
         how = ServerSettings(settings.admission_control, settings.merge, settings.quotas, cluster)
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
         if arguments.demo:

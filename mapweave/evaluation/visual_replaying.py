@@ -17,6 +17,7 @@ from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array
 from mapweave.storage.map_file import MapFile, pack_map_file
+from mapweave.terminal import working
 from mapweave.visual_mapping import VisualMap, keyframes, nothing_mapped, visual_maps
 from mapweave.visual_trajectory import ImagePose, tum_lines
 
@@ -103,7 +104,8 @@ def evaluate_images(recording: Recording, frames: Iterable[int], truth: Path | N
             yield frame
 
     walk, damage = keyframes(recording, noted())
-    maps = visual_maps(walk, recording.camera, "replay", 1)
+    with working("finding where the images were taken"):
+        maps = visual_maps(walk, recording.camera, "replay", 1)
     if not maps:
         raise DeviceError(nothing_mapped(recording.path, walk, damage))
     stamps = recording.stamps_ns[numbers]

@@ -30,7 +30,7 @@ from mapweave.hybridmap.ids import MapId
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.storage.os_errors import NO_ROOM
 from mapweave.terminal import EVERY, PLAIN_WIDTH, Bar, EventLog, tracked
-from synthetic.maps import looked_around
+from synthetic.maps import looked_around, write_store
 from tests.mapweave.command_line import parsers
 from tests.waiting import eventually
 
@@ -218,6 +218,37 @@ def test_an_option_that_is_none_names_the_help_of_its_command(capfd: pytest.Capt
     assert (
         complaint == "mapweave map show: unrecognized arguments: --colour; see `mapweave map show --help`\n"
     )
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("map import {graph} -o {tmp}/optimum.g2o", "optimising 1 edge"),
+        ("map from-photos {tmp}/walk/images --camera {tmp}/walk/camera.toml --spacing 1 -o {tmp}/p.mapweave",
+         "reading photographs"),
+        ("map extract {store} -o {tmp}/maps", "reading the map"),
+        ("map show {store} --no-picture", "reading nodes"),
+        ("place add sink r0.1.1 --map {store} -o {tmp}/a.mapweave", "reading nodes"),
+        ("plan show --map {store}", "reading nodes"),
+        ("relocalize {tmp}/walk/images/0.png --map {store}", "looking for the place"),
+        ("info {tmp}/walk", "reading the recording"),
+        ("replay {tmp}/walk --offline --data {tmp}/replayed", "finding where the images were taken"),
+    ],
+)  # fmt: skip
+def test_work_that_may_take_long_is_shown(
+    arguments: str, words: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """With thousands of nodes, vertices or images each is silent for longer than a person waits."""
+    graph = tmp_path / "in.g2o"
+    graph.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
+    store = write_store(tmp_path / "s0.sqlite", looked_around((MapId("r0", 1), MapId("r1", 1)), seed=8))
+    if arguments.startswith("replay"):
+        (recording / "odometry.csv").unlink()
+    shown: list[str] = []
+    enter = Bar.__enter__
+    monkeypatch.setattr(Bar, "__enter__", lambda bar: (shown.append(bar._words), enter(bar))[1])
+    main(arguments.format(graph=graph, store=store, tmp=tmp_path).split())
+    assert words in shown
 
 
 @pytest.mark.parametrize("module", ["mapweave.cli", "argcomplete"])
