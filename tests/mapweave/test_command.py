@@ -5,6 +5,8 @@ from __future__ import annotations
 import io
 import json
 import socket
+import subprocess
+import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing, nullcontext
@@ -18,7 +20,7 @@ from rich.console import Console
 from mapweave.cli import main
 from mapweave.commands import status as status_command
 from mapweave.commands.status import COLUMNS, SPARE, cells, table
-from mapweave.exit_status import INTERRUPTED, NO, USAGE
+from mapweave.exit_status import FAILED, INTERRUPTED, NO, USAGE
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
 from mapweave.hybridmap.errors import NotConnected
@@ -34,6 +36,7 @@ from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import serve_senders
 from mapweave.wire.zenoh_bus import ZenohBus
+from tests.core_time import CoreTime
 from tests.mapweave.command_line import complaint, parsers
 from tests.mapweave.test_kept_maps import PATIENCE, Body
 from tests.waiting import eventually
@@ -175,6 +178,42 @@ def test_without_a_router_one_line_says_so_and_what_to_do(
             f"no router at {where}: what listens there does not let this in; if the fleet has keys" in output
         )
         assert time.monotonic() - began < 5.0, "Zenoh's own patience is 10 s, that for an answer 20 s"
+
+
+def told(words: str, *arguments: str, folder: Path) -> tuple[float, int, str]:
+    """How long a command of its own process takes, s, its exit status and what it says on stderr."""
+    command = [sys.executable, "-m", "mapweave", *words.split(), *ASKING[words], *arguments]
+    process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    try:
+        clock = CoreTime(process)
+        while process.poll() is None:
+            took = clock.look()
+            time.sleep(0.01)
+    finally:
+        process.kill()
+        _, err = process.communicate()
+    return took, process.returncode, err.decode()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("words", ASKING)
+def test_every_command_says_within_2_s_that_there_is_no_router(
+    words: str, recording: Path, closed: str
+) -> None:
+    took, status, err = told(words, "--connect", closed, folder=recording.parent)
+    assert status == FAILED and "no router at" in err, err
+    assert took <= 2.0
+
+
+@pytest.mark.slow
+def test_a_command_says_within_2_s_that_there_is_no_server(recording: Path) -> None:
+    """A router is up."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    with closing(ZenohBus(BusSettings(mode="router", listen=(endpoint,)))):
+        for words in ("status", "map fetch", "map explain", "place list", "missions", "relocalize"):
+            took, status, err = told(words, "--connect", endpoint, folder=recording.parent)
+            assert status == FAILED and "no map server of fleet demo answers" in err, (words, err)
+            assert took <= 2.0, words
 
 
 @pytest.mark.slow

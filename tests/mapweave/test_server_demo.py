@@ -32,6 +32,7 @@ from mapweave.wire.codec import encode_body
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from tests.browser import PROGRAMS, Browser, there_is_none
+from tests.core_time import CoreTime
 from tests.waiting import eventually, free_port
 
 ROBOT = "const r = mapweave.painter.robots.find(one => one.name === '{}'); return r ? [r.x, r.y] : null"
@@ -282,6 +283,31 @@ def test_robots_events_and_links_are_there_before_the_server_is_loaded() -> None
         eventually(lambda: get(http, "status").get("merged") is True, 90)
         history = get(http, "history")["history"]
         assert history == messages["events"]["history"]
+
+
+@pytest.mark.slow
+def test_the_page_is_filled_within_a_second_from_when_the_server_runs() -> None:
+    """A person sees its nodes, robots and events at once, and the server has them once it is loaded."""
+    http = free_port()
+    with demo(http, free_port()) as server:
+        eventually(lambda: get(http, "status") != {}, 90)
+        clock, seen = CoreTime(server), set[str]()
+        with connect(f"ws://127.0.0.1:{http}/live", proxy=None) as socket:
+            while not {"map", "state", "events"} <= seen:
+                message = json.loads(socket.recv(timeout=20))
+                seen.add(message["kind"])
+                match message["kind"]:
+                    case "map":
+                        assert message["nodes"]["count"] == 87 and message["edges"]["count"] > 87
+                    case "state":
+                        assert [robot["robot"] for robot in message["robots"]] == ["ada", "bo", "cy", "dee"]
+                    case "events":
+                        assert message["history"]
+        assert clock.look() <= 1.0
+        eventually(lambda: not get(http, "status").get("loading"), 90)
+        clock = CoreTime(server)
+        eventually(lambda: get(http, "status").get("nodes") == 87, 30)
+        assert clock.look() <= 1.0
 
 
 @pytest.mark.slow
