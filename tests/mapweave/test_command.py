@@ -180,7 +180,7 @@ def test_without_a_router_one_line_says_so_and_what_to_do(
         assert time.monotonic() - began < 5.0, "Zenoh's own patience is 10 s, that for an answer 20 s"
 
 
-def told(words: str, *arguments: str, folder: Path) -> tuple[float, int, str]:
+def timed(words: str, *arguments: str, folder: Path) -> tuple[float, int, str]:
     """How long a command of its own process takes, s, its exit status and what it says on stderr."""
     command = [sys.executable, "-m", "mapweave", *words.split(), *ASKING[words], *arguments]
     process = subprocess.Popen(command, cwd=folder, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
@@ -200,7 +200,7 @@ def told(words: str, *arguments: str, folder: Path) -> tuple[float, int, str]:
 def test_every_command_says_within_2_s_that_there_is_no_router(
     words: str, recording: Path, closed: str
 ) -> None:
-    took, status, err = told(words, "--connect", closed, folder=recording.parent)
+    took, status, err = timed(words, "--connect", closed, folder=recording.parent)
     assert status == FAILED and "no router at" in err, err
     assert took <= 2.0
 
@@ -211,7 +211,7 @@ def test_a_command_says_within_2_s_that_there_is_no_server(recording: Path) -> N
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with closing(ZenohBus(BusSettings(mode="router", listen=(endpoint,)))):
         for words in ("status", "map fetch", "map explain", "place list", "missions", "relocalize"):
-            took, status, err = told(words, "--connect", endpoint, folder=recording.parent)
+            took, status, err = timed(words, "--connect", endpoint, folder=recording.parent)
             assert status == FAILED and "no map server of fleet demo answers" in err, (words, err)
             assert took <= 2.0, words
 
