@@ -294,5 +294,5 @@ def test_nothing_is_lost_in_a_short_chaos() -> None:
     assert (report["lost"], report["duplicated"], report["out_of_order"]) == (0, 0, 0)
     assert report["unacknowledged"] == 0
     assert report["maps_equal"] is True
-    # A question that a stopped server held up would take 3 s.
-    assert report["relocalize_gap_s"] < 3.0
+    # One of two servers, or the robot's router, is killed, or a server stopped.
+    assert report["relocalize_gap_s"] < 1.0

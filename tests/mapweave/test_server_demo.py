@@ -90,7 +90,7 @@ def test_the_port_is_open_before_large_libraries_are_loaded() -> None:
         "import sys\n"
         "class Stop:\n"
         "    def find_spec(self, name, path=None, target=None):\n"
-        "        if name == 'mapweave.mapserver.base_map':\n"
+        "        if name == 'mapweave.processes.server_name':\n"
         "            sys.exit(' '.join(sorted({'cv2', 'networkx', 'rich', 'scipy', 'zenoh', 'faiss'} "
         "& {*sys.modules})) or 0)\n"
         "sys.meta_path.insert(0, Stop())\n"

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -80,3 +82,19 @@ def test_the_command_ends_before_it_serves_under_the_name(
     finally:
         bus.close()
     assert not (tmp_path / "data").exists()
+
+
+def test_a_server_looks_for_another_one_while_it_loads_its_libraries(tmp_path: Path) -> None:
+    """The look takes a third of a second, and the libraries take longer; it was a third of a restart."""
+    code = (
+        "import sys, threading\n"
+        "class Look:\n"
+        "    def find_spec(self, name, path=None, target=None):\n"
+        "        if name == 'mapweave.mapserver.base_map':\n"
+        "            sys.exit(sum(one.name.startswith('server name') for one in threading.enumerate()))\n"
+        "sys.meta_path.insert(0, Look())\n"
+        "from mapweave.cli import main\n"
+        f"main(['server', '--data', {str(tmp_path)!r}, '--connect', 'tcp/127.0.0.1:{free_port()}'])\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 1, done.stderr
