@@ -21,11 +21,14 @@ from mapweave.agent.calibration.camera_motions import (
     counted,
     motions_over,
     predict,
+    robot_from_camera,
     slip_steps,
 )
 from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate, Lengths
+from mapweave.agent.calibration.floor_path import DrivenStep, follow, heights_over
 from mapweave.agent.calibration.floor_scale import floor_scale
 from mapweave.agent.calibration.pair_information import (
+    FARTHEST_FLOOR,
     FloorMatches,
     ImagePair,
     PairInformation,
@@ -47,8 +50,6 @@ NOISE_STEPS = 4
 STALE_PITCH = 0.02
 """Pairs that were reduced with another pitch than the present, rad, tell nothing of the floor: its tiles were
 looked for elsewhere."""
-FLOOR_BELOW = 0.2
-"""How far below the horizon floor is seen, rad: a wrong pitch moves it away by its share of this."""
 DELAY_SMOOTH_S = 0.5
 """Over which the wheels' speed is averaged where it serves as an instrument for the delay."""
 STUDENT = 5.0
@@ -102,6 +103,7 @@ class Estimator:
         self._depth = (0.3, 0.5)
         self.reduced_at: list[Array] = []
         self._reduced_sigmas: list[float] = []
+        self._ways: list[list[DrivenStep]] = []
         self._floor: tuple[float, float] | None = None
         self.floor_tracks = 0
         self.ranged: RangedScale | None = None
@@ -115,6 +117,7 @@ class Estimator:
         self.informations.append(self._reduced(pair, wheels))
         self.reduced_at.append(self.vector.copy())
         self._reduced_sigmas.append(self._sigma)
+        follow(self._ways, pair.first_s, pair.last_s, self.informations[-1].at)
         return self.informations[-1]
 
     def add_floor(self, floor: FloorMatches) -> None:
@@ -125,6 +128,7 @@ class Estimator:
     def drop(self, index: int) -> None:
         """Forget a pair."""
         del self.pairs[index], self.informations[index], self.reduced_at[index], self._reduced_sigmas[index]
+        del self._ways[index]
 
     def stale(self, index: int) -> bool:
         """Whether a pair was reduced with parameters, or a sigma of tracks, that differ from the present."""
@@ -134,6 +138,7 @@ class Estimator:
     def refresh(self, index: int, wheels: WheelTrack) -> None:
         """Reduce a pair again at the present parameters."""
         self.informations[index] = self._reduced(self.pairs[index], wheels)
+        self._ways[index][0].at = self.informations[index].at
         self.reduced_at[index] = self.vector.copy()
         self._reduced_sigmas[index] = self._sigma
 
@@ -206,7 +211,7 @@ class Estimator:
     def batch(self, pairs: Sequence[ImagePair], wheels: WheelTrack) -> Estimate:
         """Estimate from many pairs at once, all reduced again in each round."""
         self.pairs, self.informations, self.reduced_at, self._floor = [], [], [], None
-        self._reduced_sigmas = []
+        self._reduced_sigmas, self._ways = [], []
         for pair in pairs:
             self.add(pair, wheels)
         estimate = self.solve(wheels)
@@ -222,23 +227,29 @@ class Estimator:
 
         Nothing else is learnt from the floor: a pavement or a carpet must not bend the rest.
         """
-        used = self.vector[P.WHEEL_SCALE] - self.vector[P.HEIGHT]
-        logs, sigmas, flatness, numbers = list[Array](), list[Array](), list[Array](), list[int]()
-        for k, (at, information) in enumerate(zip(self.reduced_at, self.informations, strict=True)):
-            tilt, floor = self.vector[P.PITCH] - at[P.PITCH], information.floor
-            if abs(tilt) < STALE_PITCH:
-                reduced = at[P.WHEEL_SCALE] - at[P.HEIGHT]
-                logs.append(floor.logs + (reduced - used) - tilt * floor.flatness)
-                sigmas.append(floor.sigmas)
-                flatness.append(floor.flatness)
-                numbers += [k] * len(floor.logs)
-        found = None
-        if logs:
-            joined = [np.concatenate(part) for part in (logs, sigmas, flatness)]
-            found = floor_scale(joined[0], joined[1], joined[2], np.array(numbers, np.int64), BLOCK)
-        pitch = math.sqrt(self._covariance[P.PITCH, P.PITCH]) / FLOOR_BELOW
-        self._floor = None if found is None else (float(used + found.log), math.hypot(found.sigma, pitch))
-        self.floor_tracks = 0 if found is None else found.tracks
+        self._floor, self.floor_tracks = None, 0
+        tilts = np.array([abs(self.vector[P.PITCH] - at[P.PITCH]) for at in self.reduced_at])
+        kept = np.flatnonzero(tilts < STALE_PITCH)
+        if not len(kept):
+            return
+        floors = [self.informations[k].floor for k in kept]
+        points = [floor.points for floor in floors]
+        down = -robot_from_camera(*self.vector[[P.HEADING, P.PITCH, P.ROLL]].tolist())[2]
+        heights, off = heights_over(points, [self._ways[k] for k in kept], down)
+        numbers = np.repeat(kept, [len(some) for some in points])
+        # A way that was assumed shorter makes all of the scene smaller.
+        height = math.exp(self.vector[P.HEIGHT])
+        assumed = np.array([at[P.WHEEL_SCALE] for at in self.reduced_at])[numbers]
+        logs = assumed - np.log(np.clip(heights / height, 1.0 / FARTHEST_FLOOR, FARTHEST_FLOOR))
+        logs -= self.vector[P.WHEEL_SCALE]
+        sigmas = np.concatenate([floor.sigmas for floor in floors])
+        found = floor_scale(logs, sigmas, off / height, numbers, BLOCK)
+        if found is None:
+            return
+        pitch = math.sqrt(self._covariance[P.PITCH, P.PITCH]) * found.flatness
+        log = self.vector[P.WHEEL_SCALE] - self.vector[P.HEIGHT] + found.log
+        self._floor = float(log), math.hypot(found.sigma, pitch)
+        self.floor_tracks = found.tracks
 
     def _lengths(self) -> Lengths:
         """What besides the wheels shows how far the robot has gone."""

@@ -1,7 +1,8 @@
 """The floor among points below the horizon: the scale of the way, by the height of the camera.
 
-A vehicle pitches on its springs, and a road curves: in each pair the floor has a slope of its own. Without,
-the floor of a street (KITTI 03) seems 9 % further off over 10 s of a crest than over the drive; with it 2 %.
+Points are held against the place of the camera that is nearest to them on its way (`floor_path.py`). From
+there to where they lie the floor has a slope, one in each pair: of a road ahead that was not driven yet, of
+what lies aside in a curve, of a vehicle that pitches on its springs.
 """
 
 from __future__ import annotations
@@ -51,11 +52,13 @@ class FloorScale:
         log: logarithm of true over assumed way, for the height that was assumed.
         sigma: its standard deviation.
         tracks: how many points are on the floor.
+        flatness: by how much `log` changes with a slope that all pairs have in common, 1/rad.
     """
 
     log: float
     sigma: float
     tracks: int
+    flatness: float
 
 
 def floor_scale(
@@ -67,9 +70,10 @@ def floor_scale(
     expectation maximisation, begun where the density rises: things stand on the floor, nothing is below it.
 
     Args:
-        logs: (N,) logarithms of depth ratios (`pair_information.FloorRatios`).
+        logs: (N,) logarithms of the declared over the measured height of the camera.
         sigmas: (N,) standard deviations of them by their tracks.
-        flatness: (N,) by how much they change with the floor's slope, 1/rad.
+        flatness: (N,) by how much they change with the floor's slope, 1/rad: distances from the camera's
+            nearest place, along the floor, over its height.
         pairs: (N,) number of the pair of images that each belongs to, ascending.
         block: pairs in a row whose errors may go together.
 
@@ -117,7 +121,8 @@ def floor_scale(
     densest = floor / (math.sqrt(math.tau) * float(np.median(spread)))
     if tracks < LEAST_FLOOR or stiffness <= 0.0 or densest < FLOOR_CONTRAST * (1.0 - floor) / FLOOR_RANGE:
         return None
-    return FloorScale(mode, max(float(np.linalg.norm(blocks)) / stiffness, FLOOR_SIGMA), tracks)
+    common = float((cross / steep).sum()) / (slope**2 * max(float(stiff.sum()), 1e-9))
+    return FloorScale(mode, max(float(np.linalg.norm(blocks)) / stiffness, FLOOR_SIGMA), tracks, common)
 
 
 def _density(logs: Array, sigmas: Array, centres: Array) -> Array:

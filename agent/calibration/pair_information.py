@@ -26,6 +26,8 @@ FLOOR_STEEPNESS = 0.12
 """Rays less below the horizon than this, rad, meet the floor too far off to tell it from other things."""
 LEAST_FLOOR_SHARE = 0.08
 """Sigma of a floor point's depth as a share of it; with less parallax it shows nothing."""
+FARTHEST_FLOOR = 20.0
+"""Points below the horizon are no further off than so many times the floor there."""
 FREE_DEPTH = 3.0
 """Spreads of the scene's inverse depths within which a track's is free. One spread draws near floor and far
 walls together, which shows as pitch and as a way 0.7 % too long (rendered room); three do not. What is
@@ -88,20 +90,16 @@ class ImagePair:
 
 
 @dataclass(frozen=True, eq=False)
-class FloorRatios:
-    """How far points below the horizon are, by the depth of the floor there.
+class FloorPoints:
+    """Points below the horizon: most of what is seen there is floor.
 
     Attributes:
-        logs: (K,) logarithms of depth over the floor's, negated. Most of what is seen there is floor, so the
-            mode is the logarithm of true over assumed way.
-        sigmas: (K,) their standard deviations by the matches.
-        flatness: (K,) by how much they change with the slope of the floor, 1/rad: cotangents of the angles
-            below the horizon.
+        points: (K, 3) m in the first camera.
+        sigmas: (K,) standard deviations of the logarithms of their depths, by the matches.
     """
 
-    logs: Array
+    points: Array
     sigmas: Array
-    flatness: Array
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +122,7 @@ class PairInformation:
     tracks: int
     inverse_depths: tuple[float, float]
     scatter: float
-    floor: FloorRatios
+    floor: FloorPoints
 
 
 def reduce_pair(
@@ -155,7 +153,7 @@ def reduce_pair(
     seen = _linearised(rays, after, at, sigma, depth, shapes)
     depths = seen.inverse_depths[seen.agreeing]
     typical = (median(depths), float(depths.std())) if len(depths) > 5 else depth
-    floor = floor_ratios(pair, at, floor_sigma)
+    floor = floor_points(pair, at, floor_sigma)
     return PairInformation(
         at, seen.matrix, seen.vector, len(depths), typical, 1.4826 * median(seen.across), floor
     )
@@ -226,11 +224,11 @@ def _linearised(
 
 def with_floor(information: PairInformation, pair: ImagePair, floor_sigma: float) -> PairInformation:
     """What a reduced pair says with the points of its floor."""
-    return replace(information, floor=floor_ratios(pair, information.at, floor_sigma))
+    return replace(information, floor=floor_points(pair, information.at, floor_sigma))
 
 
-def floor_ratios(pair: ImagePair, at: CameraMotions, track_sigma: float) -> FloorRatios:
-    """Depths of tracks and matches below the horizon.
+def floor_points(pair: ImagePair, at: CameraMotions, track_sigma: float) -> FloorPoints:
+    """Tracks and matches below the horizon, as points.
 
     Args:
         pair: the points.
@@ -241,7 +239,7 @@ def floor_ratios(pair: ImagePair, at: CameraMotions, track_sigma: float) -> Floo
     floor_depth = at.floor @ rays
     steepness = floor_depth / math.sqrt(at.floor @ at.floor)
     steep = np.flatnonzero(steepness > FLOOR_STEEPNESS)
-    steepness, floor_depth = steepness[steep], floor_depth[steep]
+    floor_depth = floor_depth[steep]
     rays, after = rays.take(steep, axis=1), after.take(steep, axis=1)
     sigma = np.concatenate([np.full(len(pair.before), track_sigma), pair.floor.sigmas])[steep]
     turned = at.rotation @ rays
@@ -252,9 +250,8 @@ def floor_ratios(pair: ImagePair, at: CameraMotions, track_sigma: float) -> Floo
     slope = _projected(at.translation, y[:2] / z, z)
     parallax = np.sqrt(slope[0] * slope[0] + slope[1] * slope[1]) * floor_depth
     precise = sigma < LEAST_FLOOR_SHARE * parallax
-    nearness = inverse_depth[precise] / floor_depth[precise]
-    logs = np.log(np.minimum(np.maximum(nearness, 0.05), 20.0))
-    return FloorRatios(logs, sigma[precise] / parallax[precise], 1.0 / steepness[precise])
+    nearness = np.maximum(inverse_depth[precise], floor_depth[precise] / FARTHEST_FLOOR)
+    return FloorPoints((rays[:, precise] / nearness).T, sigma[precise] / parallax[precise])
 
 
 def _rays(coordinates: Array) -> Array:

@@ -13,7 +13,7 @@ from mapweave.agent.calibration.camera_motions import CameraMotions, rotations
 from mapweave.agent.calibration.floor_scale import floor_scale
 from mapweave.agent.calibration.floor_tiles import FloorTiles
 from mapweave.agent.calibration.online import OnlineCalibration
-from mapweave.agent.calibration.pair_information import ImagePair, floor_ratios
+from mapweave.agent.calibration.pair_information import ImagePair, floor_points
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import NO_DISTORTION, Distortion, Lens
@@ -50,7 +50,7 @@ def seen(pattern: Array, rotation: Array, centre: Array, lens: Lens, gain: float
 def ratios(
     pattern: Array, assumed: float = HEIGHT, distortion: Distortion = NO_DISTORTION, gain: float = 1.0
 ) -> Array:
-    """Logarithms of depth ratios of the tiles of one pair, for a height that is assumed."""
+    """Logarithms of an assumed over the measured height, by the tiles of one pair."""
     lens = Lens(CAMERA, distortion)
     turned = rotations(TURN)
     tiles = FloorTiles(CAMERA, lens)
@@ -59,7 +59,7 @@ def ratios(
     at = CameraMotions(turned.T, -turned.T @ WAY, DOWN / assumed)
     nothing = np.zeros((0, 2))
     pair = ImagePair(0.0, 1.0, nothing, nothing, tiles.match(before, after, at))
-    return floor_ratios(pair, at, 0.5 / CAMERA.fx).logs
+    return np.log(assumed / (floor_points(pair, at, 0.5 / CAMERA.fx).points @ DOWN))
 
 
 def carpet(contrast: float) -> Array:
@@ -120,5 +120,5 @@ def test_a_robot_that_maps_sees_how_far_it_goes():
     floors = [information.floor for information in online._estimator.informations]
     assert len(floors) >= 3
     for floor in floors:
-        assert len(floor.logs) >= 10
-        assert float(np.median(floor.logs)) == pytest.approx(-math.log(1.04), abs=0.01)
+        assert len(floor.points) >= 10
+        assert float(np.median(floor.points @ DOWN)) == pytest.approx(1.04 * HEIGHT, rel=0.01)
