@@ -20,7 +20,7 @@ from mapweave.merge.outlier_rejection.link_probability import link_probabilities
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.links import Link, RefusedLink, link_of
-from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
+from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.pose_graph.pinned_frames import PinnedFrames
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.map_file import MapFile, RefusedPair
@@ -86,11 +86,8 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
         # The solver raises RuntimeError if a system is singular.
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InvalidFile(f"the poses of this map cannot be solved ({reason})") from None
-    poses = {
-        node: Placement(number, pose)
-        for number, graph in enumerate(solved)
-        for node, pose in graph.poses().items()
-    }
+    # Covariances are solved for where they are asked for: of a large map, all take minutes.
+    poses = NodePoses(solved)
     refused = tuple(_refused(pair) for pair in content.refused)
     components = tuple(frozenset(graph.nodes) for graph in solved)
     superseded = {node: fate for node, fate in content.superseded.items() if node in poses}
