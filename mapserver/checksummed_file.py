@@ -1,4 +1,4 @@
-"""Files of arrays with a digest at the end: read whole and undamaged, or not at all.
+"""Files, and results of a store, of arrays with a digest at the end: read whole and undamaged, or not at all.
 
 a line with its kind, arrays in NumPy's format ..., SHA-256 of all before
 """
@@ -35,42 +35,52 @@ def seal(path: Path, magic: bytes, parts: Iterable[NDArray[Any]]) -> None:
     Raises:
         InvalidFile: the disk does not take it.
     """
+    write_whole(path, sealed(magic, parts))
+
+
+def sealed(magic: bytes, parts: Iterable[NDArray[Any]]) -> memoryview:
+    """The bytes of such a file; see `seal`."""
     out = io.BytesIO()
     out.write(magic)
     for part in parts:
         np.lib.format.write_array(out, np.ascontiguousarray(part), allow_pickle=False)
     digest = hashlib.sha256(out.getbuffer()).digest()
     out.write(digest)
-    write_whole(path, out.getbuffer())
+    return out.getbuffer()
 
 
-def unseal(path: Path, magic: bytes) -> Iterator[NDArray[Any]]:
-    """The arrays of a file, in their order.
+def unseal(source: Path | bytes, magic: bytes) -> Iterator[NDArray[Any]]:
+    """The arrays of a file, or of its bytes, in their order.
 
     Raises:
         InvalidFile: there is none, it is another one, or it is damaged.
     """
+    words = f"{source}: " if isinstance(source, Path) else ""
     try:
-        data = path.read_bytes()
+        data = source.read_bytes() if isinstance(source, Path) else source
     except FileNotFoundError:
-        raise InvalidFile(f"{path}: there is none yet") from None
+        raise InvalidFile(f"{words}there is none yet") from None
     except OSError as error:
-        raise InvalidFile(f"{path}: cannot be read ({error.strerror or error})") from None
+        raise InvalidFile(f"{words}cannot be read ({error.strerror or error})") from None
     if not data.startswith(magic):
-        raise InvalidFile(f"{path}: is something else")
+        raise InvalidFile(f"{words}is something else")
     content = memoryview(data)[:-DIGEST]
     if len(data) < len(magic) + DIGEST or hashlib.sha256(content).digest() != data[-DIGEST:]:
-        raise InvalidFile(f"{path}: is damaged or cut off")
+        raise InvalidFile(f"{words}is damaged or cut off")
     return _arrays(io.BytesIO(content[len(magic) :]), len(content) - len(magic))
 
 
 def read_sealed(
-    path: Path, magic: bytes, header: Any, read: Callable[[Iterator[NDArray[Any]]], Value], lack: str
+    source: Path | bytes,
+    magic: bytes,
+    header: Any,
+    read: Callable[[Iterator[NDArray[Any]]], Value],
+    lack: str,
 ) -> Value:
-    """What a file has behind a header.
+    """What a file, or its bytes, have behind a header.
 
     Args:
-        path: of the file.
+        source: the file.
         magic: its first line.
         header: what `json_part` has made its first array of.
         read: makes the value of the other arrays.
@@ -79,13 +89,13 @@ def read_sealed(
     Raises:
         InvalidFile: there is none, it is damaged, it has another header, or it is no such value.
     """
-    parts = unseal(path, magic)
+    parts, words = unseal(source, magic), f"{source}: " if isinstance(source, Path) else ""
     try:
         if read_json(next(parts)) != header:
-            raise InvalidFile(f"{path}: of another version of this program, or with other settings")
+            raise InvalidFile(f"{words}of another version of this program, or with other settings")
         return read(parts)
     except (ValueError, KeyError, TypeError, IndexError, EOFError, StopIteration, InvalidValue) as error:
-        raise InvalidFile(f"{path}: {lack} ({error})") from None
+        raise InvalidFile(f"{words}{lack} ({error})") from None
 
 
 def json_part(words: Any) -> NDArray[np.uint8]:

@@ -34,9 +34,10 @@ from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.libraries import library_jobs
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.opening import open_store
-from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, HISTORY, PRUNING_MARK, News
+from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, HISTORY, MERGE_MARK, PRUNING_MARK, News
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
+from mapweave.mapserver.merging.merge_sharing import MergeSharing
 from mapweave.mapserver.merging.pruning_record import PruningRecord
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.metrics import Metrics, Sources
@@ -51,7 +52,7 @@ from mapweave.mapserver.prompt_reading import PromptReading
 from mapweave.mapserver.quotas import Quotas, QuotaSettings
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.roster import Roster
-from mapweave.mapserver.schedule import LiveSchedule, Schedule
+from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule, Schedule
 from mapweave.mapserver.services import Services
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
@@ -141,9 +142,11 @@ class MapServer:
         pruning = PruningRecord(
             self._store, s.merge.keep_superseded_days, self._said, base.maps if base else ()
         )
+        # In lock-step nothing may depend on when another process has merged.
+        shares = self._store.shared and not isinstance(clock, LockstepSchedule)
         self._worker = MergeWorker(
             clock, MERGE_SHARE, places, s.merge, findings, self._history, self._cluster.compare,
-            self._metrics.merged, pruning,
+            self._metrics.merged, pruning, MergeSharing(self._store, name) if shares else None,
         )  # fmt: skip
         self._constraints = ConstraintRecord(self._store, self._base)
         self._annotations = AnnotationRecord(self._store, self._base.annotations)
@@ -287,7 +290,7 @@ class MapServer:
         (traffic, damaged), unread = self._counts.newest()
         return {
             **merged.counts(),
-            **({"leads": self._store.leads} if self._store.shared else {}),
+            **(self._merging() if self._store.shared else {}),
             "over_quota": ", ".join(self._quotas.over())[:1000],
             "damaged": damaged,
             "event": self._ingest.failure or unread or self._worker.event,
@@ -300,6 +303,15 @@ class MapServer:
             "version": VERSION,
             "cluster": self._cluster.status,
             **self._admission.counters(),
+        }
+
+    def _merging(self) -> dict[str, Scalar]:
+        """Which of the servers that share the store leads, and how this one comes by its merged map."""
+        return {
+            "leads": self._store.leads,
+            "leader": self._store.leader,
+            "behind": self._worker.behind,
+            "merges_itself": self._worker.alone,
         }
 
     def explain(self, request: ExplainRequest) -> Future[Explanation]:
@@ -356,6 +368,8 @@ class MapServer:
             self._history.reload()
         if news.names(PRUNING_MARK):
             self._worker.follow_pruning()
+        if news.names(MERGE_MARK):
+            self._worker.follow_merges()
 
     def _damaged(self) -> int:
         """Changes that are damaged on the disk."""

@@ -5,13 +5,13 @@ from __future__ import annotations
 import logging
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 
 import psycopg
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.ids import MapId
-from mapweave.mapserver.log.store import EVERYTHING, News
+from mapweave.mapserver.log.store import EVERYTHING, LEADS, MERGE_MARK, News
 from mapweave.storage.postgres_session import RETRY, PostgresAddress, PostgresSession
 from mapweave.storage.postgres_watchdog import PostgresWatchdog
 
@@ -23,8 +23,21 @@ MOST_NOTIFIED = 7000
 """Bytes; PostgreSQL takes less than 8000 (https://www.postgresql.org/docs/15/sql-notify.html)."""
 LEADER_LOCK = 0x4D575355
 """Advisory lock of the server that leads: 'MWSU'. Locks are of one database."""
+FOLLOW_LOCK = 0x4D575356
+"""Shared by all servers that follow, or lead: 'MWSV'."""
+SERVERS = (
+    "SELECT objid, application_name FROM pg_locks LEFT JOIN pg_stat_activity USING (pid) "
+    "WHERE locktype = 'advisory' AND classid = 0 AND objid IN (%s, %s) AND objsubid = 1 AND granted "
+    "AND database = (SELECT oid FROM pg_database WHERE datname = current_database())"
+)
+"""Which locks are held, by which sessions."""
+PUBLISH = (
+    "INSERT INTO result (name, value) VALUES (%s, %s) ON CONFLICT (name) DO UPDATE SET value = EXCLUDED.value"
+)
 LOG, RECORD = "log", "record"
 """With which the words of a notification begin: before the name of a map, and of a record."""
+PREFIX, SUFFIX = "mapweave ", " follows"
+"""Around the name of a server in the name of its session."""
 BEAT = 0.5
 """s between two signs of life; so often a server tries to lead."""
 FROZEN = "5s"
@@ -65,9 +78,13 @@ class PostgresFollower:
         """
         self._own_session, self._changed = own_session, changed
         ends = dict.fromkeys(("idle_session_timeout", "idle_in_transaction_session_timeout"), FROZEN)
-        self._session = PostgresSession(address, f"mapweave {name} follows", ends, prepare=self._listen)
+        self._session = PostgresSession(address, f"{PREFIX}{name}{SUFFIX}", ends, prepare=self._listen)
         watchdog.add(self._session)
-        self._leads = False
+        self._leads, self._leader, self._servers = False, "", 0
+        self._term, self._reported = 0, (False, False, -1)
+        self._results: dict[str, bytes] = {}
+        self._unpublished = ""
+        self._publishing = threading.Lock()
         self._failure = ""
         self._polled_at = 0.0
         self._stopping = threading.Event()
@@ -79,6 +96,26 @@ class PostgresFollower:
         """Whether this server holds the lock, as far as it knows."""
         return self._leads
 
+    @property
+    def term(self) -> int:
+        """How often this server has begun to lead."""
+        return self._term
+
+    @property
+    def leader(self) -> str:
+        """The server that holds the lock; empty if that is not known."""
+        return self._leader
+
+    @property
+    def followed(self) -> bool:
+        """Whether this server leads others, as far as it knows."""
+        return self._leads and self._servers > 1
+
+    def publish(self, results: Mapping[str, bytes]) -> None:
+        """Have results stored, and the others notified, if this server leads then; see `Store.publish`."""
+        with self._publishing:
+            self._results |= results
+
     def close(self) -> None:
         """Stop; another server may lead at once. Idempotent."""
         self._stopping.set()
@@ -87,6 +124,7 @@ class PostgresFollower:
 
     def _listen(self, connection: psycopg.Connection) -> None:
         connection.execute(f"LISTEN {CHANNEL}")
+        connection.execute("SELECT pg_advisory_lock_shared(%s)", (FOLLOW_LOCK,))
         # What was written before is not notified.
         self._polled_at = 0.0
 
@@ -97,7 +135,7 @@ class PostgresFollower:
                     self._follow()
                 self._failure = ""
             except InvalidFile as error:
-                self._leads = False
+                self._lose()
                 if str(error) != self._failure:
                     log.warning("%s", error)
                 self._failure = str(error)
@@ -111,18 +149,61 @@ class PostgresFollower:
         # Also while it is held, which changes nothing: it is the sign of life.
         with self._session.transaction() as connection:
             row = connection.execute("SELECT pg_try_advisory_lock(%s)", (LEADER_LOCK,)).fetchone()
+            held = connection.execute(SERVERS, (LEADER_LOCK, FOLLOW_LOCK)).fetchall()
         holds = bool(row and row[0])
+        self._servers = sum(lock == FOLLOW_LOCK for lock, _ in held)
+        names = [str(name) for lock, name in held if lock == LEADER_LOCK and name]
+        self._leader = names[0].removeprefix(PREFIX).removesuffix(SUFFIX) if names else ""
         if holds and not self._leads:
             self._look_at_everything()
+            self._term += 1
             log.info("%s: this server leads", self._session.address.words)
         self._leads = holds
+        if (now := (holds, self.followed, self._term)) != self._reported:
+            self._reported = now
+            self._changed(LEADS)
+        self._publish()
         if time.monotonic() >= self._polled_at + POLL:
             self._end_stuck(connection)
             self._look_at_everything()
         notified = [*connection.notifies(timeout=BEAT, stop_after=1)]
-        words = [one.payload for one in notified if one.pid != self._own_session()]
+        own = self._own_session(), connection.info.backend_pid
+        words = [one.payload for one in notified if one.pid not in own]
         if words:
             self._changed(_news(words))
+
+    def _publish(self) -> None:
+        """Store what the leader publishes. Only this session holds the lock: no leader of before writes."""
+        if not self._leads:
+            self._lose()
+        with self._publishing:
+            results = self._results
+        if not results:
+            return
+        try:
+            with self._session.transaction() as connection:
+                # It follows from the logs: nothing waits for a disk or a standby.
+                connection.execute("SET LOCAL synchronous_commit = off")
+                for name, value in results.items():
+                    connection.execute(PUBLISH, (name, value))
+                connection.execute("SELECT pg_notify(%s, %s)", (CHANNEL, f"{RECORD}:{MERGE_MARK}"))
+        except psycopg.Error as error:
+            if not self._session.is_open:
+                raise
+            # It leads all the same, and tries it again.
+            if str(error) != self._unpublished:
+                log.warning("a merge is not handed over: %s", " ".join(str(error).split()))
+            self._unpublished = str(error)
+            return
+        self._unpublished = ""
+        with self._publishing:
+            self._results = {n: v for n, v in self._results.items() if results.get(n) is not v}
+
+    def _lose(self) -> None:
+        """This server leads no longer, and what it has not stored it never will."""
+        self._leads = False
+        with self._publishing:
+            self._results = {}
 
     def _end_stuck(self, connection: psycopg.Connection) -> None:
         for name, _ in connection.execute(END_STUCK, (self._own_session(), "mapweave %", STUCK)):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 
@@ -125,6 +125,26 @@ class PostgresStore(Store):
     def leads(self) -> bool:
         """Whether this server writes the results of merging; see `Store`."""
         return self._follower is not None and self._follower.leads
+
+    @property
+    def leader(self) -> str:
+        """The server that leads; see `Store`."""
+        return "" if self._follower is None else self._follower.leader
+
+    @property
+    def term(self) -> int:
+        """How often this server has begun to lead; see `Store`."""
+        return 0 if self._follower is None else self._follower.term
+
+    @property
+    def followed(self) -> bool:
+        """Whether this server leads others; see `Store`."""
+        return self._follower is not None and self._follower.followed
+
+    def publish(self, results: Mapping[str, bytes]) -> None:
+        """Have results stored soon, by the session that holds the leader's lock; see `Store`."""
+        if self._follower is not None:
+            self._follower.publish(results)
 
     @property
     def displaced(self) -> str:

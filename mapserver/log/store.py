@@ -33,6 +33,9 @@ PRUNING = "pruning"
 """Likewise: see mapweave.mapserver.merging.pruning."""
 PRUNING_MARK = "pruning_mark"
 """A random number that is drawn with each change of that record."""
+MERGE, MERGE_MARK = "merge", "merge_mark"
+"""The newest merge, for servers that do not merge themselves, and a digest of it; see
+mapweave.mapserver.merging.merge_sharing."""
 MOST_REFUSED_KEPT = 100
 """Refused changes of a map of which the bytes are kept; of further ones only the reason."""
 MOST_REFUSALS = 1000
@@ -90,6 +93,8 @@ class News:
 
 
 EVERYTHING = News(None, None)
+LEADS = News(frozenset(), frozenset({MERGE_MARK}))
+"""Whether this server leads, or is followed, may have changed."""
 CONSTRAINTS, ANNOTATIONS = "manual_constraint", "annotation"
 """Records, by the names of their tables."""
 
@@ -111,6 +116,27 @@ class Store(SqlSizes):
     @abstractmethod
     def leads(self) -> bool:
         """Whether this server writes the results of merging: one of those that share a store does."""
+
+    @property
+    def leader(self) -> str:
+        """The server that leads; empty if that is not known."""
+        return ""
+
+    @property
+    def term(self) -> int:
+        """How often this server has begun to lead: what it wrote before then others may have written over."""
+        return 0
+
+    @property
+    def followed(self) -> bool:
+        """Whether this server leads others."""
+        return False
+
+    def publish(self, results: Mapping[str, bytes]) -> None:
+        """Have results stored soon, if this server then leads, all at once. Returns at once.
+
+        No commit of changes waits for it. What was not stored yet of earlier calls is stored with it.
+        """
 
     @property
     @abstractmethod

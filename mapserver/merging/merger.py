@@ -77,28 +77,32 @@ class Merger:
         self.counters = MergerCounters()
         self.reaches = ReachabilityCache()
         self.settings = settings or MergeSettings()
-        self._pause = pause
-        self._comparisons = NodeComparisons(self.places, self.node, self.counters, compare, pause)
-        self._verdicts = Verdicts()
+        self._compare, self._pause = compare, pause
         self.pruning = Pruning()
-        self._record: RestartRecord | None = None
-        self._resumed: Superseding | None = None
-        self._pipeline = self._new_pipeline()
-        self._isolation = Isolation()
         self._suspects: frozenset[MapId] = frozenset()
-        self._copies, self._copied = Copies(), dict[MapId, str]()
         self._implausible = ImplausibleMaps()
-        self._contradictions = WrongGeometrySearch(self.settings.consistency)
-        self._wrong: dict[MapId, WrongGeometry] = {}
-        self._unlinked: dict[MapPair, str] = {}
-        self._stale: set[MapPair] = set()
         self._kept: dict[MapId, HybridMap] = {}
-        self._touched: set[MapId] = set()
-        self._changed: set[MapId] = set()
+        self._uncopied: set[MapId] = set()
+        self._begin()
         self._constraints = ManualConstraints()
         self._pins: tuple[Pin, ...] = ()
         self._merged = MergedMap.empty()
         self._dirty = False
+
+    def _begin(self) -> None:
+        """Nothing is compared or merged."""
+        self._comparisons = NodeComparisons(self.places, self.node, self.counters, self._compare, self._pause)
+        self._verdicts = Verdicts()
+        self._record: RestartRecord | None = None
+        self._resumed: Superseding | None = None
+        self._pipeline = self._new_pipeline()
+        self._isolation = Isolation()
+        self._copies, self._copied = Copies(), dict[MapId, str]()
+        self._contradictions = WrongGeometrySearch(self.settings.consistency)
+        self._wrong: dict[MapId, WrongGeometry] = {}
+        self._unlinked: dict[MapPair, str] = {}
+        self._stale: set[MapPair] = set()
+        self._touched, self._changed = set(self.maps), set(self.maps)
 
     @property
     def uncompared(self) -> int:
@@ -110,6 +114,16 @@ class Merger:
         """Nodes that were compared with all others, and pairs of them on which there is a verdict."""
         nodes = sum(len(hybrid_map.nodes) for hybrid_map in self.maps.values())
         return nodes - self.uncompared, len(self._comparisons)
+
+    @property
+    def constraints(self) -> ManualConstraints:
+        """Manual constraints that are to be applied."""
+        return self._constraints
+
+    @property
+    def pins(self) -> tuple[Pin, ...]:
+        """Pins that are to be applied."""
+        return self._pins
 
     @property
     def recollecting(self) -> bool:
@@ -134,9 +148,23 @@ class Merger:
         """Take note that the findings are on the disk."""
         self._comparisons.kept()
 
+    @property
+    def superseding(self) -> Superseding:
+        """What is superseded after the newest merge, and what that was judged from."""
+        return self._pipeline.superseding
+
+    @property
+    def kept(self) -> Mapping[MapId, HybridMap]:
+        """The maps as they were when they were merged last, or copied."""
+        return self._kept
+
+    def prints(self) -> dict[NodeId, bytes]:
+        """Fingerprints of all nodes."""
+        return self._comparisons.prints(self._nodes())
+
     def record(self) -> RestartRecord:
         """What another process needs to go on from the last merge, besides the findings on the disk."""
-        return RestartRecord.of(self._pipeline.superseding, self._comparisons.recent(self._nodes()))
+        return RestartRecord.of(self.superseding, self._comparisons.recent(self._nodes()))
 
     def _nodes(self) -> Iterator[Node]:
         return (node for hybrid_map in self.maps.values() for node in hybrid_map.nodes.values())
@@ -192,6 +220,38 @@ class Merger:
             self._comparisons.put_overlaps(a, {b: value})
         for pair, link in (links or {}).items():
             self._comparisons.judge(pair, link)
+
+    def copy_maps(self) -> None:
+        """Keep the maps as they are now, for a merge of them that another server has made."""
+        for map_id in self._uncopied:
+            # A merged map stays as it was when later changes come. What did not change is not copied: all
+            # that a merge remembers of a map it remembers of this very copy.
+            self._kept[map_id] = HybridMap(self.maps[map_id].contents())
+        self._uncopied = set()
+
+    def adopt(self, merged: MergedMap, has_merged: bool) -> None:
+        """Have another server's merge of the maps as they are kept in the place of one of its own.
+
+        If this merger shall merge later, it is as if it had only read the maps: see `recollect`.
+
+        Args:
+            merged: by the other server.
+            has_merged: this merger has merged itself since it began, or since it adopted a merge.
+        """
+        if has_merged:
+            self._begin()
+            for hybrid_map in self.maps.values():
+                self._comparisons.postpone(hybrid_map.nodes.values())
+                for node in hybrid_map.nodes.values():
+                    self._copies.came(node, None)
+                for edge in hybrid_map.edges.values():
+                    self._comparisons.connect(edge)
+        before, self._merged = self._merged, merged
+        if before.implausible.keys() - merged.implausible.keys() or before.wrong.keys() - merged.wrong.keys():
+            self.alike.forget()
+        self.places.leave_out(merged.superseded, self.node)
+        self._suspects = frozenset(merged.set_apart)
+        self._dirty = True
 
     def constrain(self, constraints: ManualConstraints) -> None:
         """Apply exactly these manual constraints from now on."""
@@ -253,10 +313,8 @@ class Merger:
                 self._verdicts.drop(pair)
             else:
                 self._verdicts.put(pair, self._counted(verdict))
+        self.copy_maps()
         for map_id in self._changed:
-            # Copies: a merged map stays as it was when later changes come. What did not change is not
-            # copied: all that a merge remembers of a map it remembers of this very copy.
-            self._kept[map_id] = HybridMap(self.maps[map_id].contents())
             self._implausible.changed(map_id, self._kept[map_id])
         self._isolation.changed(self._changed)
         before = self._copied.keys()
@@ -442,6 +500,7 @@ class Merger:
             if not (hybrid_map.nodes or hybrid_map.edges):
                 del self.maps[map_id]
                 self._changed.discard(map_id)
+                self._uncopied.discard(map_id)
                 self._kept.pop(map_id, None)
         self.alike.remove(nodes)
         self.reaches.remove(nodes)
@@ -451,6 +510,7 @@ class Merger:
         hybrid_map = self.maps.setdefault(map_id, HybridMap())
         self._touched.add(map_id)
         self._changed.add(map_id)
+        self._uncopied.add(map_id)
         self._dirty = True
         removed = hybrid_map.nodes.get(change.id) if isinstance(change, NodeRetired) else None
         before = hybrid_map.nodes.get(change.node.id) if isinstance(change, NodePut) else None

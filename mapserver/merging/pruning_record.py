@@ -51,6 +51,11 @@ class PruningRecord:
         """
         return self._store.result(PRUNING_MARK) != self._mark
 
+    @property
+    def mark(self) -> bytes | None:
+        """Of the record that was read or written last."""
+        return self._mark
+
     def restore(self, merger: Merger) -> None:
         """Go on with what was pruned before."""
         self._mark, pruning = self._read()

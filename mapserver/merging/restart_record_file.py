@@ -19,7 +19,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.hybridmap.limits import MAX_LANDMARKS, MAX_NUMBER, MAX_POSITION
 from mapweave.hybridmap.superseded import Superseded
-from mapweave.mapserver.checksummed_file import json_part, read_json, read_sealed, seal
+from mapweave.mapserver.checksummed_file import json_part, read_json, read_sealed, seal, sealed
 from mapweave.mapserver.merging.restart_record import RestartRecord
 from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, RecentComparisons
 from mapweave.merge.pose_graph.candidates import Pair
@@ -44,17 +44,22 @@ def save(path: Path, record: RestartRecord, made_by: str) -> None:
     seal(path, MAGIC, _parts(record, made_by))
 
 
-def load(path: Path, made_by: str) -> RestartRecord:
+def packed(record: RestartRecord, made_by: str) -> memoryview:
+    """The bytes of the file; see `save`."""
+    return sealed(MAGIC, _parts(record, made_by))
+
+
+def load(source: Path | bytes, made_by: str) -> RestartRecord:
     """Read the file.
 
     Args:
-        path: of the file.
+        source: the file, or its bytes.
         made_by: as it was saved; what other versions had superseded is not used.
 
     Raises:
         InvalidFile: there is none, it is damaged, or it was made otherwise; with the reason.
     """
-    return read_sealed(path, MAGIC, _header(made_by), _read, "is no record of this version")
+    return read_sealed(source, MAGIC, _header(made_by), _read, "is no record of this version")
 
 
 def _header(made_by: str) -> dict[str, Any]:

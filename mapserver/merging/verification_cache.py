@@ -37,6 +37,19 @@ class VerificationCache:
         """How many pairs were compared."""
         return len(self.verdicts)
 
+    def joined(self, later: VerificationCache) -> VerificationCache:
+        """These results and later ones, which count where both have any."""
+        known = self.extended(RecentComparisons(later.prints, later.prints.keys(), later.overlaps))
+        return VerificationCache(known.prints, known.overlaps, {**known.verdicts, **later.verdicts})
+
+    def besides(self, earlier: VerificationCache) -> VerificationCache:
+        """What of these results is not in earlier ones just so; both together are these."""
+        overlaps = {pair: v for pair, v in self.overlaps.items() if earlier.overlaps.get(pair) != v}
+        verdicts = {pair: v for pair, v in self.verdicts.items() if earlier.verdicts.get(pair) is not v}
+        nodes = {node for node, print_ in self.prints.items() if earlier.prints.get(node) != print_}
+        nodes |= {node for pair in (*overlaps, *verdicts) for node in pair}
+        return VerificationCache({n: self.prints[n] for n in nodes & self.prints.keys()}, overlaps, verdicts)
+
     def extended(self, recent: RecentComparisons) -> VerificationCache:
         """These results and later ones. What was found of nodes that were others since is left out."""
         prints = {n: p for n, p in self.prints.items() if recent.prints.get(n, p) == p}

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.landmark_tables import VERSION as TABLES
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.mapserver.checksummed_file import json_part, read_json, read_sealed, seal
+from mapweave.mapserver.checksummed_file import json_part, read_json, read_sealed, seal, sealed
 from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, VerificationCache
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink
@@ -41,17 +41,22 @@ def save(path: Path, findings: VerificationCache, made_by: str) -> None:
     seal(path, MAGIC, _parts(findings, made_by))
 
 
-def load(path: Path, made_by: str) -> VerificationCache:
+def packed(findings: VerificationCache, made_by: str) -> memoryview:
+    """The bytes of the file; see `save`."""
+    return sealed(MAGIC, _parts(findings, made_by))
+
+
+def load(source: Path | bytes, made_by: str) -> VerificationCache:
     """Read the file.
 
     Args:
-        path: of the file.
+        source: the file, or its bytes.
         made_by: as it was saved; results of other versions are not used.
 
     Raises:
         InvalidFile: there is none, it is damaged, or it was made otherwise; with the reason.
     """
-    return read_sealed(path, MAGIC, _header(made_by), _read, "are no verdicts of this version")
+    return read_sealed(source, MAGIC, _header(made_by), _read, "are no verdicts of this version")
 
 
 def _header(made_by: str) -> dict[str, Any]:
@@ -78,15 +83,20 @@ def _parts(findings: VerificationCache, made_by: str) -> Iterator[NDArray[Any]]:
     yield _rows([pair for pair, _ in refused], row)
     yield np.array([reasons[reason] for _, reason in refused], np.int64)
     yield _rows([pair for pair, _ in links], row)
-    yield np.array([link.a_from_b.mean.vector for _, link in links], np.float64).reshape(-1, 3)
-    yield np.array([link.a_from_b.covariance for _, link in links], np.float64).reshape(-1, 3, 3)
-    yield np.cumsum([0, *(len(link.shared) for _, link in links)])
-    yield np.concatenate([np.zeros((0, 2), np.int64), *(link.shared for _, link in links)])
-    kinds = {kind: k for k, kind in enumerate(sorted({tuple(link.evidence) for _, link in links}))}
+    yield from link_parts([link for _, link in links])
+
+
+def link_parts(links: Sequence[Link]) -> Iterator[NDArray[Any]]:
+    """What links say of their two nodes."""
+    yield np.array([link.a_from_b.mean.vector for link in links], np.float64).reshape(-1, 3)
+    yield np.array([link.a_from_b.covariance for link in links], np.float64).reshape(-1, 3, 3)
+    yield np.cumsum([0, *(len(link.shared) for link in links)])
+    yield np.concatenate([np.zeros((0, 2), np.int64), *(link.shared for link in links)])
+    kinds = {kind: k for k, kind in enumerate(sorted({tuple(link.evidence) for link in links}))}
     yield json_part([list(kind) for kind in kinds])
-    yield np.array([kinds[tuple(link.evidence)] for _, link in links], np.int64)
-    yield np.cumsum([0, *(len(link.evidence) for _, link in links)])
-    yield np.array([value for _, link in links for value in link.evidence.values()], np.float64)
+    yield np.array([kinds[tuple(link.evidence)] for link in links], np.int64)
+    yield np.cumsum([0, *(len(link.evidence) for link in links)])
+    yield np.array([value for link in links for value in link.evidence.values()], np.float64)
 
 
 def _read(parts: Iterator[NDArray[Any]]) -> VerificationCache:
@@ -97,18 +107,27 @@ def _read(parts: Iterator[NDArray[Any]]) -> VerificationCache:
     reasons = read_json(next(parts))
     refused = zip(_pairs(next(parts), nodes), next(parts).tolist(), strict=True)
     verdicts: dict[Pair, Verdict] = {pair: RefusedLink(*pair, reasons[k]) for pair, k in refused}
-    pairs = _pairs(next(parts), nodes)
+    links = read_links(parts, _pairs(next(parts), nodes))
+    return VerificationCache(prints, overlaps, verdicts | {link.pair: link for link in links})
+
+
+def read_links(parts: Iterator[NDArray[Any]], pairs: Sequence[Pair]) -> list[Link]:
+    """Links of these nodes, of what `link_parts` yields."""
     means, covariances = next(parts).tolist(), next(parts)
     shared_at, shared = next(parts).tolist(), next(parts)
     kinds, kind = read_json(next(parts)), next(parts).tolist()
     evidence_at, evidence = next(parts).tolist(), next(parts).tolist()
-    for k, (pair, (i, j), (m, n)) in enumerate(
-        zip(pairs, pairwise(shared_at), pairwise(evidence_at), strict=True)
-    ):
-        numbers = dict(zip(kinds[kind[k]], evidence[m:n], strict=True))
-        pose = PoseGaussian(Pose2(*means[k]), covariances[k])
-        verdicts[pair] = Link(*pair, pose, shared[i:j], numbers)
-    return VerificationCache(prints, overlaps, verdicts)
+    return [
+        Link(
+            *pair,
+            PoseGaussian(Pose2(*means[k]), covariances[k]),
+            shared[i:j],
+            dict(zip(kinds[kind[k]], evidence[m:n], strict=True)),
+        )
+        for k, (pair, (i, j), (m, n)) in enumerate(
+            zip(pairs, pairwise(shared_at), pairwise(evidence_at), strict=True)
+        )
+    ]
 
 
 def _with_rows(results: Iterable[tuple[Pair, Any]], row: dict[NodeId, int]) -> list[tuple[Pair, Any]]:

@@ -58,7 +58,7 @@ class VerificationCacheKeeper:
         """Load the results for a new merger, if the file is there and valid."""
         began = self._clock()
         try:
-            findings = load(self._path, _made_by(merger))
+            findings = load(self._path, made_by(merger))
         except InvalidFile as error:
             if self._path.exists() or not self._fresh:
                 log.info("nodes are compared again: %s", error)
@@ -69,7 +69,7 @@ class VerificationCacheKeeper:
                 len(findings.prints), len(findings), self._clock() - began,
             )  # fmt: skip
         try:
-            self._record = restart_record_file.load(self._record_path, _made_by(merger))
+            self._record = restart_record_file.load(self._record_path, made_by(merger))
         except InvalidFile as error:
             # Files of another version are reported once.
             if self._record_path.exists() and findings.prints:
@@ -97,7 +97,7 @@ class VerificationCacheKeeper:
         if not new or new < least * max(now) or (self._clock() < self._rest_until and not last):
             return
         began, words = self._clock(), "the next start takes longer"
-        if self._tried(lambda: save(self._path, merger.findings(), _made_by(merger)), words, last):
+        if self._tried(lambda: save(self._path, merger.findings(), made_by(merger)), words, last):
             merger.findings_kept()
             self._saved = now
             self._rest_until = self._clock() + (self._clock() - began) / SHARE
@@ -106,7 +106,7 @@ class VerificationCacheKeeper:
         began, words = self._clock(), "the next start may supersede other nodes"
         record = merger.record()
         if record == self._record or self._tried(
-            lambda: restart_record_file.save(self._record_path, record, _made_by(merger)), words, last
+            lambda: restart_record_file.save(self._record_path, record, made_by(merger)), words, last
         ):
             self._record, self._merges = record, merger.counters.merges
             if (took := self._clock() - began) > QUICK:
@@ -128,5 +128,6 @@ class VerificationCacheKeeper:
         return True
 
 
-def _made_by(merger: Merger) -> str:
+def made_by(merger: Merger) -> str:
+    """Settings and version of what merges, in words."""
     return f"{version('mapweave')} {merger.settings}"

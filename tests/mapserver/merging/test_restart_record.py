@@ -33,7 +33,7 @@ from mapweave.mapserver.merging.verification_cache_keeper import (
     RECORD_SUFFIX,
     SUFFIX,
     VerificationCacheKeeper,
-    _made_by,
+    made_by,
 )
 from mapweave.merge.map_maintenance import comparisons
 from mapweave.merge.pose_graph import verification
@@ -408,7 +408,7 @@ def test_a_slow_disk_is_used_a_twentieth_of_the_time(tmp_path: Path, monkeypatch
         now[0] += 4.0
     assert len(written) == 3 and min(np.diff(written)) >= 20.0
     keeper.save(merger, last=True)
-    assert len(written) == 4 and load(tmp_path / f"x{RECORD_SUFFIX}", _made_by(merger)) == merger.record()
+    assert len(written) == 4 and load(tmp_path / f"x{RECORD_SUFFIX}", made_by(merger)) == merger.record()
 
 
 def test_a_full_disk_is_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:

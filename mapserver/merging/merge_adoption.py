@@ -1,0 +1,202 @@
+"""How a server that follows another takes over its merges, without comparing or merging anything itself.
+
+Changes are held back until a merge that has them is handed over: then the maps are just those that were
+merged, which digests prove. The nodes among them can be found all the while.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+
+from mapweave.hybridmap.change import Change, NodePut
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.mapserver.merging.merge_sharing import MergeSharing, adopted
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.pruning_record import PruningRecord
+from mapweave.mapserver.merging.shared_merge import SharedMerge
+from mapweave.mapserver.merging.verification_cache import VerificationCache, fingerprint_of
+from mapweave.mapserver.merging.verification_cache_keeper import made_by
+from mapweave.merge.pose_graph.merged_map import MergedMap
+
+log = logging.getLogger(__name__)
+
+PATIENCE = 10.0
+"""s without a merge that can be used, after which a server merges itself."""
+OTHER_MAPS = "its maps are not those that {} has merged"
+"""Why a merge is not used."""
+RETRY = 1.0
+"""s between two attempts to read a merge that cannot be read: it may just be written."""
+AGAIN = 60.0
+"""s after which a server that merges itself for that reason tries to follow again."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Read:
+    """A merge that was handed over, with what comparisons had found."""
+
+    merge: SharedMerge
+    findings: VerificationCache
+
+
+class MergeAdoption:
+    """Only the merging thread may call it; anyone may read `reason` and `behind`.
+
+    Attributes:
+        reason: why no merge can be used now; empty if one can, or if it is not known yet.
+    """
+
+    def __init__(
+        self,
+        sharing: MergeSharing,
+        pruning: PruningRecord | None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Nothing is adopted yet.
+
+        Args:
+            sharing: reads what was handed over.
+            pruning: what was pruned, of the same store.
+            clock: the time, s.
+        """
+        self._sharing, self._pruning, self._clock = sharing, pruning, clock
+        self._held: list[Change] = []
+        self._mark: bytes | None = None
+        self._read_at = 0.0
+        self._newest: _Read | None = None
+        self._last: _Read | None = None
+        self._adopted: bytes | None = None
+        self._since, self._again_at = clock(), 0.0
+        self.reason = ""
+
+    @property
+    def behind(self) -> int:
+        """Changes that are held back."""
+        return len(self._held)
+
+    @property
+    def overdue(self) -> bool:
+        """Whether it is time to merge without a leader."""
+        return bool(self.reason) and self._clock() >= self._since + PATIENCE
+
+    def begin(self) -> None:
+        """This server follows from now on."""
+        self._adopted, self.reason = None, ""
+
+    def hold(self, change: Change) -> None:
+        """Hold a change back."""
+        self._held.append(change)
+
+    def promising(self, merger: Merger) -> bool:
+        """Whether a server that merges itself may follow again: there is a merge that it has not tried."""
+        try:
+            mark = self._sharing.mark
+        except InvalidFile:
+            return False
+        if self._clock() < self._again_at or mark in (None, self._mark):
+            return False
+        self._read(mark, merger)
+        return self._newest is not None
+
+    def adopt(
+        self, merger: Merger, take: Callable[[list[Change]], None], has_merged: bool
+    ) -> MergedMap | None:
+        """Adopt the newest merge, if it is new and has just these maps.
+
+        Args:
+            merger: with the maps.
+            take: takes changes into it, without comparing.
+            has_merged: see `Merger.adopt`.
+
+        Returns:
+            The merged map; None if there is none that is new and can be used.
+        """
+        try:
+            mark = self._sharing.mark
+        except InvalidFile:  # it is away: nothing new comes either
+            return None
+        if mark == self._adopted is not None:
+            self.reason = ""
+            return None
+        if mark != self._mark or (self._newest is None and self._clock() >= self._read_at + RETRY):
+            self._read(mark, merger)
+        if self._newest is None:
+            return None
+        merge = self._newest.merge
+        try:
+            if not self._same_pruning(merge) and self._pruning:
+                self._pruning.adopt(merger)
+            take([*self._covered(merge)])
+            merger.copy_maps()
+            wanted = {which: print_ for which, _, print_ in merge.head.maps}
+            if self._sharing.prints(merger) != wanted or not self._same_pruning(merge):
+                raise InvalidFile(OTHER_MAPS.format(merge.head.by))
+            merged = adopted(merge, self._newest.findings, merger)
+        except InvalidFile as error:
+            self._fail(str(error))
+            return None
+        merger.adopt(merged, has_merged)
+        self._adopted, self._last, self.reason = mark, self._newest, ""
+        return merged
+
+    def in_step(self, merger: Merger) -> bool:
+        """Whether the merge that was adopted has all that this server knows."""
+        if self._held or self._last is None or self._adopted != self._mark or self.reason:
+            return False
+        head, constraints = self._last.merge.head, merger.constraints
+        return (
+            head.made == constraints.made
+            and dict(head.floors) == dict(constraints.floors)
+            and head.pins == merger.pins
+            and self._same_pruning(self._last.merge)
+        )
+
+    def hand_over(self, merger: Merger, has_merged: bool) -> list[Change]:
+        """End to follow: have a merger go on from the newest merge; returns what was held back.
+
+        Args:
+            merger: with the maps.
+            has_merged: see `Merger.adopt`: then it goes on from its own.
+        """
+        newest = self._newest or self._last
+        if newest is not None and not has_merged and (self._last or not merger.recollecting):
+            merger.recollect(newest.findings, newest.merge.record)
+        held, self._held = self._held, []
+        if self.reason.startswith(OTHER_MAPS[:20]):
+            self._again_at = self._clock() + AGAIN
+        return held
+
+    def _same_pruning(self, merge: SharedMerge) -> bool:
+        return self._pruning is None or (self._pruning.mark or b"") == merge.head.mark
+
+    def _fail(self, reason: str) -> None:
+        if not self.reason:
+            self._since = self._clock()
+        self.reason = reason
+
+    def _read(self, mark: bytes | None, merger: Merger) -> None:
+        """Read a merge, if that can be."""
+        words = made_by(merger)
+        self._mark, self._newest, self._read_at = mark, None, self._clock()
+        if mark is None:
+            self._fail("no merge is handed over")
+            return
+        try:
+            merge = self._sharing.read(mark, words)
+            self._newest = _Read(merge, self._sharing.findings(merge.head.parts, words))
+        except InvalidFile as error:
+            self._fail(f"the merge that was handed over {error}")
+
+    def _covered(self, merge: SharedMerge) -> Iterable[Change]:
+        """What was held back and is in a merge, in order."""
+        last = {which: sequence for which, sequence, _ in merge.head.maps}
+        nodes, held = merge.record.recent.prints, self._held
+        self._held = [change for change in held if change.sequence > last.get(change.map, 0)]
+        for change in held:
+            if change.sequence <= last.get(change.map, 0):
+                body = change.body
+                # A merge may have left out a node that was already there once more behind it.
+                if not isinstance(body, NodePut) or nodes.get(body.node.id) == fingerprint_of(body.node):
+                    yield change
