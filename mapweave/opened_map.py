@@ -34,6 +34,7 @@ from mapweave.storage.database_reader import MAGIC as SQLITE
 from mapweave.storage.database_reader import reading
 from mapweave.storage.file_format import of_format
 from mapweave.storage.map_file import MAGIC, MapFile, read_map_file, write_map_file
+from mapweave.storage.os_errors import unreadable
 from mapweave.wire.messages import KeptHistory, KeptPruning, decode
 
 if TYPE_CHECKING:
@@ -199,7 +200,7 @@ def source_of(path: Path, live: bool = False) -> MapSource:
         with path.open("rb") as file:
             head = file.read(len(SQLITE))
     except OSError as error:
-        raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
+        raise unreadable(path, error) from None
     if head and head.startswith(MAGIC[: len(head)]):
         return MapSource.FILE
     if head != SQLITE:

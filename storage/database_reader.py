@@ -12,6 +12,7 @@ from pathlib import Path
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.file_owner import is_owned
 from mapweave.storage.first_bytes import SQLITE
+from mapweave.storage.os_errors import unreadable
 
 MAGIC = SQLITE
 
@@ -61,7 +62,7 @@ def reading(path: Path, what: str = "file", live: bool = False) -> Iterator[sqli
                     _hold(connection, path, what)
                 yield connection
     except OSError as error:
-        raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
+        raise unreadable(path, error) from None
 
 
 def _hold(connection: sqlite3.Connection, path: Path, what: str) -> None:

@@ -40,6 +40,7 @@ from mapweave.hybridmap.superseded import Superseded
 from mapweave.storage.atomic_file import read_whole, write_whole
 from mapweave.storage.file_format import what_to_do
 from mapweave.storage.first_bytes import MAP_FILE
+from mapweave.storage.os_errors import unreadable
 from mapweave.wire.packing import Limit
 from mapweave.wire.typed import decode, encode
 
@@ -143,7 +144,7 @@ def read_map_file(path: str | PathLike[str], kind: Kind | Literal["any"] = "any"
     try:
         data = read_whole(Path(path))
     except OSError as error:
-        raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
+        raise unreadable(path, error) from None
     try:
         content = unpack_map_file(data)
     except InvalidMessage as error:

@@ -12,6 +12,7 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.limits import MAX_FLOAT
 from mapweave.hybridmap.pose import Pose2
 from mapweave.storage.atomic_file import read_whole
+from mapweave.storage.os_errors import unreadable
 
 MAX_BYTES = 8192
 """A map.yaml has ten lines; the parser takes time by the square of what is nested."""
@@ -48,7 +49,7 @@ def read_nav2_map(path: Path) -> Nav2Map:
     try:
         data = read_whole(path)
     except OSError as error:
-        raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
+        raise unreadable(path, error) from None
     return parse_nav2_map(data, path)
 
 

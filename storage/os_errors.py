@@ -6,6 +6,8 @@ import errno
 import os
 import pwd
 
+from mapweave.hybridmap.errors import InvalidFile
+
 NO_ROOM = "the disk is full; make room, or give a place on another disk"
 DISK_FULL = "the disk is full; make room, and what waits is written"
 READ_ONLY = "the disk is read-only; a damaged disk becomes so by itself: see the system's log"
@@ -18,6 +20,11 @@ def reason_of(error: OSError) -> str:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return NO_ROOM
     return READ_ONLY if error.errno == errno.EROFS else error.strerror or str(error)
+
+
+def unreadable(path: str | os.PathLike[str], error: OSError) -> InvalidFile:
+    """The error that a file cannot be read, and why."""
+    return InvalidFile(f"{path}: cannot be read ({reason_of(error)})")
 
 
 def no_permission() -> str:

@@ -13,6 +13,7 @@ from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.floor_plan import MAX_BYTES, MAX_SIDE, PlanImage
 from mapweave.storage.atomic_file import read_whole
 from mapweave.storage.image_file import check_cost, image_size, to_end
+from mapweave.storage.os_errors import unreadable
 
 WITH_ALPHA = (4, 6)
 """Colour types of PNG files with transparency."""
@@ -44,7 +45,7 @@ def read_plan_file(path: Path, negate: bool = False) -> PlanFile:
     try:
         data = read_whole(path)
     except OSError as error:
-        raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
+        raise unreadable(path, error) from None
     try:
         return plan_file(data, path.name, negate)
     except InvalidValue as error:

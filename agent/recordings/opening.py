@@ -11,6 +11,7 @@ from mapweave.agent.recordings.folders import euroc, four_seasons, images_folder
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.recording import Recording
 from mapweave.hybridmap.errors import DeviceError
+from mapweave.storage.os_errors import unreadable
 
 FORMATS = (
     "a folder with images/ and camera.toml, a bag (.mcap, .bag, .db3 or its folder), a video, or a sequence "
@@ -38,6 +39,11 @@ def _opener(path: Path) -> Callable[[Path, RecordingOptions], Recording]:
         DeviceError: it is none.
     """
     if path.is_file():
+        try:
+            path.open("rb").close()
+        except OSError as error:
+            # Those that read bags and videos say that it is none.
+            raise DeviceError(str(unreadable(path, error))) from None
         if path.suffix.lower() in bags.SUFFIXES:
             return bags.bag
         if path.suffix.lower() in videos.SUFFIXES:

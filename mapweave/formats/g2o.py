@@ -21,6 +21,7 @@ import numpy as np
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 from mapweave.storage.atomic_file import read_whole, write_whole
+from mapweave.storage.os_errors import unreadable
 
 UPPER = np.triu_indices(3)
 FIELDS = {"VERTEX_SE2": 5, "EDGE_SE2": 12, "FIX": 2}
@@ -117,7 +118,7 @@ def read_g2o(path: Path) -> G2oGraph:
     except UnicodeDecodeError:
         raise InvalidFile(f"{path}: is no g2o file") from None
     except OSError as error:
-        raise InvalidFile(f"{path}: cannot be read ({error.strerror})") from None
+        raise unreadable(path, error) from None
     poses: dict[int, Pose2] = {}
     edges: list[G2oEdge] = []
     fixed: list[int] = []

@@ -10,9 +10,12 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
+import cv2
+import numpy as np
 import pytest
 
 from mapweave.exit_status import FAILED
+from tests.mapweave.command_line import CAMERA
 
 WORDS = "permission denied to user "
 ADVICE = "give a place of your own, or change the owner or mode of this one (chown, chmod)"
@@ -24,6 +27,17 @@ COMMANDS = {
     "keys": ["keys", "init", "--at", "10.0.0.5", "--keys", "{locked}/keys"],
     "a key file": ["status", "--keys", "{secret}"],
     "settings": ["agent", "r0", "--settings", "{secret}"],
+    "a map": ["map", "show", "{secret}", "--no-picture"],
+    "a map that is corrected": ["map", "retire", "r0.1", "--map", "{secret}"],
+    "a map that is annotated": ["place", "add", "sink", "r0.1.1", "--map", "{secret}"],
+    "a pose graph": ["map", "import", "{secret}", "--out", "x.g2o"],
+    "a camera": ["relocalize", "{locked}/0.png", "--camera", "{secret}"],
+    "an image": ["relocalize", "{secret}", "--camera", "{locked}/camera.toml"],
+    "a bag": ["info", "{bag}"],
+    "a video": ["replay", "{video}", "--camera", "{locked}/camera.toml", "--offline"],
+    "a scenario": ["sim", "run", "{secret}"],
+    "a plan": ["plan", "add", "{secret}", "--pair", "0,0=1,1", "--map", "{locked}/none.mapweave"],
+    "a copy of a key": ["keys", "list", "--keys", "{hidden}"],
     "a picture": ["calibrate", "target", "--out", "{locked}/board.pdf"],
 }
 
@@ -59,10 +73,21 @@ def places(tmp_path_factory: pytest.TempPathFactory) -> Iterator[dict[str, Path]
     locked, secret = folder / "locked", folder / "secret.toml"
     locked.mkdir()
     secret.write_text("")
+    cv2.imwrite(str(locked / "0.png"), np.full((48, 64), 90, np.uint8))
+    (locked / "camera.toml").write_text(CAMERA)
+    hidden = folder / "hidden"
+    hidden.mkdir()
+    (hidden / "fleet.json").write_text("{}")
     locked.chmod(0o555)
-    secret.chmod(0)
-    yield {"locked": locked, "secret": secret}
+    bag, video = folder / "drive.mcap", folder / "drive.mp4"
+    for one in (bag, video):
+        one.touch()
+    for one in (secret, bag, video):
+        one.chmod(0)
+    hidden.chmod(0)
+    yield {"locked": locked, "secret": secret, "hidden": hidden, "bag": bag, "video": video}
     locked.chmod(0o755)
+    hidden.chmod(0o755)
 
 
 @pytest.fixture(scope="module")
@@ -91,5 +116,5 @@ def test_what_the_user_may_not_do_is_one_line(
     status, output = ended[name]
     (line,) = output.splitlines()
     assert WORDS in line and ADVICE in line and "Errno" not in line, line
-    assert str(places["locked"]) in line or str(places["secret"]) in line
+    assert any(str(place) in line for place in places.values())
     assert status == FAILED
