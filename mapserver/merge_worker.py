@@ -164,9 +164,9 @@ class MergeWorker:
         return replace(self._merger.counters)
 
     def queues(self) -> Mapping[str, int]:
-        """Changes that wait to be taken in, and nodes to be compared."""
+        """Changes that wait to be taken in, or for another server's merge, and nodes to be compared."""
         compare = 0 if self._following else self._merger.uncompared
-        return {"merge": len(self._waiting) + self.behind, "comparisons": compare}
+        return {"merge": len(self._waiting), "leader": self.behind, "comparisons": compare}
 
     def unmerged(self, robot: str) -> int:
         """Changes of a robot that wait to be taken in: robots take turns."""

@@ -91,6 +91,8 @@ class Sources:
         queues: what waits, by the name of the queue.
         failing: whether the disk takes no changes now.
         settled: whether everything that came is merged.
+        leads: whether this server leads those that share its store; always, if none do.
+        merges_itself: whether it merges all the same, though it does not lead.
     """
 
     store: Path
@@ -107,6 +109,8 @@ class Sources:
     queues: Callable[[], Mapping[str, int]]
     failing: Callable[[], bool]
     settled: Callable[[], bool]
+    leads: Callable[[], bool]
+    merges_itself: Callable[[], bool]
 
 
 class Metrics:
@@ -184,6 +188,9 @@ class _Reader(Collector):
         queues = {**s.queues(), "questions": admission["open"]}
         yield _gauge("queue_length", "What waits in a queue of the server.", queues, "queue")
         yield _gauge("settled", "Whether everything that came is merged.", float(s.settled()))
+        yield _gauge("leads", "Whether this server leads those that share its store.", float(s.leads()))
+        words = "Whether this server merges, though another one leads."
+        yield _gauge("merges_itself", words, float(s.merges_itself()))
         yield _gauge("store_failing", "Whether the disk takes no changes now.", float(s.failing()))
         yield _gauge("changes_damaged_on_disk", "Changes to be sent again by robots.", float(s.damaged()))
         yield from self._files()

@@ -308,6 +308,7 @@ class MapServer:
     def _merging(self) -> dict[str, Scalar]:
         """Which of the servers that share the store leads, and how this one comes by its merged map."""
         return {
+            "name": self._name,
             "leads": self._store.leads,
             "leader": self._store.leader,
             "behind": self._worker.behind,
@@ -351,6 +352,7 @@ class MapServer:
             self._roster.presence, self._quotas.over, self._damaged,
             lambda: {"ingest": ingest.waiting, **worker.queues()},
             lambda: bool(ingest.failure), lambda: worker.settled,
+            lambda: self._store.leads, lambda: bool(worker.alone),
         )  # fmt: skip
 
     def _follow(self, news: News) -> None:

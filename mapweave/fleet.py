@@ -42,7 +42,7 @@ from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Credentials
 from mapweave.wire.each_robot import alive_robots, each_robot, in_parallel
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import decode_record
+from mapweave.wire.log_messages import Scalar, decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import sent_by
 from mapweave.wire.zenoh_bus import ZenohBus
@@ -216,6 +216,11 @@ class Fleet(FleetMap, FleetConstraints):
         if not robots:
             raise self._no_answer()
         return FleetStatus(tuple(sorted(robots, key=lambda entry: entry.robot)))
+
+    def servers(self) -> list[dict[str, Scalar]]:
+        """What the map servers say of themselves, those that answer."""
+        replies = self._ask(self._keys.server_statuses(), b"", ANSWERED)
+        return [decode_record(reply.payload) for reply in replies if not reply.error]
 
     def missions(self, robot: str = "") -> tuple[MissionReport, ...]:
         """The missions that the map server knows of, or those of one robot, oldest first; none is in an older

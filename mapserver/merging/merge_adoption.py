@@ -24,7 +24,11 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 log = logging.getLogger(__name__)
 
 PATIENCE = 10.0
-"""s without a merge that can be used, after which a server merges itself."""
+"""s without a merge that can be used, after which a server merges itself ..."""
+FIRST = 60.0
+"""... and so many while there is none at all: the server that leads may have to compare everything first."""
+NONE = "no merge is handed over"
+"""Why there is none to be used."""
 OTHER_MAPS = "its maps are not those that {} has merged"
 """Why a merge is not used."""
 RETRY = 1.0
@@ -79,7 +83,8 @@ class MergeAdoption:
     @property
     def overdue(self) -> bool:
         """Whether it is time to merge without a leader."""
-        return bool(self.reason) and self._clock() >= self._since + PATIENCE
+        wait = FIRST if self.reason == NONE else PATIENCE
+        return bool(self.reason) and self._clock() >= self._since + wait
 
     def begin(self) -> None:
         """This server follows from now on."""
@@ -181,7 +186,7 @@ class MergeAdoption:
         words = made_by(merger)
         self._mark, self._newest, self._read_at = mark, None, self._clock()
         if mark is None:
-            self._fail("no merge is handed over")
+            self._fail(NONE)
             return
         try:
             merge = self._sharing.read(mark, words)

@@ -16,7 +16,7 @@ from mapweave.commands.network import add_network
 from mapweave.hybridmap.errors import NotConnected
 
 if TYPE_CHECKING:
-    from collections.abc import Sequence
+    from collections.abc import Mapping, Sequence
 
     from rich.console import RenderableType
     from rich.table import Table
@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from mapweave.fleet import Fleet
     from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
     from mapweave.hybridmap.floor_plan import PlacedPlan
+    from mapweave.wire.log_messages import Scalar
 
 COLUMNS = (
     "robot", "mission", "doing", "at", "last node", "links", "nodes", "battery", "unsent", "lag", "age",
@@ -80,12 +81,13 @@ def run(arguments: argparse.Namespace) -> int:
         # A line a robot where another program reads.
         console = plain_or_terminal(stderr=False)
         if not arguments.watch:
-            console.print(_shown(fleet.status(), console.width, _plan(fleet, arguments)))
+            console.print(_shown(fleet.status(), console.width, _plan(fleet, arguments), fleet.servers()))
             return 0
         with Live(console=console, auto_refresh=False) if console.is_terminal else nullcontext() as live:
             while True:
                 try:
-                    shown = _shown(fleet.status(), console.width, _plan(fleet, arguments))
+                    plan, servers = _plan(fleet, arguments), fleet.servers()
+                    shown = _shown(fleet.status(), console.width, plan, servers)
                 except NotConnected as error:  # it may come back
                     shown = str(error)
                 if live is not None:
@@ -114,14 +116,33 @@ def _plan(fleet: Fleet, arguments: argparse.Namespace) -> PlacedPlan | None:
     return None if arguments.plan is None else fleet.plans().plan(arguments.plan)
 
 
-def _shown(status: FleetStatus, width: int, plan: PlacedPlan | None) -> RenderableType:
-    """The table, and why maps are not merged."""
+def _shown(
+    status: FleetStatus, width: int, plan: PlacedPlan | None, servers: Sequence[Mapping[str, Scalar]]
+) -> RenderableType:
+    """The table, why maps are not merged, and which server leads."""
     from rich.console import Group
     from rich.text import Text
 
     if not status.robots:
         return "no robot is there"
-    return Group(table(status, width, plan), *map(Text, (*troubles(status, width, plan), *apart(status))))
+    return Group(
+        table(status, width, plan),
+        *map(Text, (*troubles(status, width, plan), *apart(status), *leading(servers))),
+    )
+
+
+def leading(servers: Sequence[Mapping[str, Scalar]]) -> list[str]:
+    """Lines that say which of the servers that share a store merges, and how far the others are behind it."""
+    lines = []
+    for one in sorted(servers, key=lambda server: str(server.get("name", ""))):
+        name, leader = one.get("name", ""), one.get("leader", "")
+        if one.get("merges_itself"):
+            lines.append(f"server {name} merges itself: {one['merges_itself']}")
+        elif one.get("leads") and len(servers) > 1:
+            lines.append(f"server {name} leads")
+        elif leader and not one.get("leads"):
+            lines.append(f"server {name} follows {leader}, {one.get('behind', 0)} changes behind")
+    return lines
 
 
 def apart(status: FleetStatus) -> list[str]:

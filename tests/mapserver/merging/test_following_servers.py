@@ -59,6 +59,7 @@ def address(postgres: PostgresServer) -> str:
 def patient(monkeypatch: pytest.MonkeyPatch) -> None:
     """A busy machine is no reason to merge."""
     monkeypatch.setattr(merge_adoption, "PATIENCE", 1000.0)
+    monkeypatch.setattr(merge_adoption, "FIRST", 1000.0)
 
 
 def hash_of(merged: MergedMap) -> str:
@@ -240,6 +241,7 @@ def test_a_follower_whose_merge_is_damaged_merges_itself_and_says_so(
         else:
             people.execute("UPDATE mapweave.result SET value = %s WHERE name = %s", (damaged, name))
     monkeypatch.setattr(merge_adoption, "PATIENCE", 1.0)
+    monkeypatch.setattr(merge_adoption, "FIRST", 1.0)
     servers.start("s2")
     eventually(lambda: servers["s2"].status()["merges_itself"], PATIENCE)
     assert "merge" in str(servers["s2"].status()["merges_itself"])
