@@ -1,0 +1,19 @@
+"""What `mapweave status` says of servers that share a store."""
+
+from mapweave.commands.status import leading
+
+FOLLOWS = {"name": "s1", "leads": False, "leader": "s0", "behind": 3, "merges_itself": ""}
+LEADS = {"name": "s0", "leads": True, "leader": "s0", "behind": 0, "merges_itself": ""}
+ALONE = {"name": "s2", "leads": False, "leader": "s0", "behind": 0, "merges_itself": "of another version"}
+
+
+def test_it_says_who_leads_who_follows_and_who_merges_itself() -> None:
+    assert leading([FOLLOWS, LEADS, ALONE]) == [
+        "server s0 leads",
+        "server s1 follows s0, 3 changes behind",
+        "server s2 merges itself: of another version",
+    ]
+
+
+def test_of_a_server_without_others_it_says_nothing() -> None:
+    assert leading([LEADS]) == leading([{"summary": "no nodes"}]) == leading([]) == []
