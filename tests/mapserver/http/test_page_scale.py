@@ -2,15 +2,25 @@
 
 from __future__ import annotations
 
+import socket
+import subprocess
+import sys
+import time
 from pathlib import Path
 
 import pytest
 
+from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
+from mapweave.hybridmap.change import EdgePut
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.storage.map_file import MapFile, write_map_file
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.http.large_map import large_map
 from tests.mapserver.stub_services import StubServices
-from tests.waiting import eventually
+from tests.waiting import eventually, free_port
 
 # What a person does, and what is measured: `act` is done every `every` ms, `count` times, then the map rests.
 GESTURE = """
@@ -46,12 +56,40 @@ SHARP = "return mapweave.painter.drawn.scale === mapweave.viewport.scale && !map
 STRAY = "const b = mapweave.model.bounds(); return Math.max(b[2] - b[0], b[3] - b[1])"
 
 
+def serves(port: int) -> bool:
+    """Whether a program takes connections at a port of loopback."""
+    try:
+        with socket.create_connection(("127.0.0.1", port), 1.0):
+            return True
+    except OSError:
+        return False
+
+
+class DrivenServices(StubServices):
+    """40 robots drive along their nodes, a node each two statuses."""
+
+    def __init__(self, merged: MergedMap) -> None:
+        super().__init__()
+        self.map, self._began = merged, time.monotonic()
+
+    def robots(self) -> FleetStatus:
+        driven = (time.monotonic() - self._began) % 400.0
+        return FleetStatus(tuple(self._robot(k, driven) for k in range(40)))
+
+    def _robot(self, k: int, driven: float) -> RobotEntry:
+        assert self.map is not None
+        a, b = (self.map.graphs[0].pose(NodeId(f"r{k}", 1, int(driven) + step)) for step in (0, 1))
+        share = driven % 1.0
+        at = Pose2(a.x + share * (b.x - a.x), a.y + share * (b.y - a.y), a.heading)
+        status = Status("travelling", "", 3, 40, Pose2(), False, covariance=(0.01, 0.0, 0.02, 0.001))
+        return RobotEntry(f"r{k}", True, 0.1, AgentStatus(status, int(1e9 * driven), f"r{k}", 1), at, 0)
+
+
 @pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 def test_20_000_nodes_are_smooth(tmp_path: Path) -> None:
-    services = StubServices()
-    services.map = large_map(robots=40, nodes=500, links=3000)
+    services = DrivenServices(large_map(robots=40, nodes=500, links=3000))
     with Web(("127.0.0.1", 0), services) as served, Browser(tmp_path) as page:
         page.look(1280, 800)
         page.open(f"http://127.0.0.1:{served.port}/")
@@ -62,6 +100,9 @@ def test_20_000_nodes_are_smooth(tmp_path: Path) -> None:
         assert sent < 1.5e6, "of text, before it is compressed"
         assert drawn < 5000.0
         assert page.run(STRAY) < 200.0
+        eventually(lambda: page.run("return mapweave.painter.robots.length") == 40)
+        moved = "return mapweave.painter.robots.map(one => one.x)"
+        before = page.run(moved)
         slow = {}
         for name, gesture in GESTURES.items():
             page.run(GESTURE.format(gesture=gesture))
@@ -75,4 +116,32 @@ def test_20_000_nodes_are_smooth(tmp_path: Path) -> None:
             # At rest it is sharp.
             eventually(lambda: page.run(SHARP))
         assert not slow
+        assert all(a != b for a, b in zip(before, page.run(moved), strict=True)), "all robots have moved"
         print(f"{sent} bytes, drawn after {drawn:.0f} ms")
+
+
+@pytest.mark.slow
+@pytest.mark.alone
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+def test_a_map_file_of_20_000_nodes_is_opened_and_shown(tmp_path: Path) -> None:
+    """By `mapweave open` as a process."""
+    merged = large_map(robots=40, nodes=500, links=3000)
+    edges = {edge.id: edge for edge in (link.edge() for link in merged.links)}
+    changes = [change for one in merged.maps.values() for change in one.contents()]
+    changes += [EdgePut(edge) for edge in edges.values()]
+    path, port = tmp_path / "large.mapweave", free_port()
+    write_map_file(path, MapFile("merged", merged.summary(), tuple(changes)))
+    command = [sys.executable, "-m", "mapweave", "open", str(path), "--http", str(port)]
+    opened = subprocess.Popen(command, stdout=subprocess.DEVNULL)
+    try:
+        with Browser(tmp_path / "profile") as page:
+            page.look(1280, 800)
+            eventually(lambda: serves(port), 120.0)
+            page.open(f"http://127.0.0.1:{port}/")
+            eventually(lambda: page.run(NODES) == 20_000)
+            eventually(lambda: page.run(DRAWN) is not None)
+            assert page.run("return mapweave.page.bytes") < 1.5e6 and page.run(DRAWN) < 5000.0
+            assert page.run("return mapweave.model.components.length") == 1
+    finally:
+        opened.terminate()
+        opened.wait(30)
