@@ -177,7 +177,7 @@ OUTS = (
 )  # fmt: skip
 """Command lines that would write to {bad}."""
 PLACES = {"full": "full", "missing": "none/x", "below a file": "map/x"}
-"""Where they cannot: a folder with a file of a person's own, in a folder that is not there, below what is a file."""
+"""Where they cannot: a folder with a file of its owner, in a folder that is not there, below a file."""
 MADE = {
     ("map extract {journal} -o {bad}", "full"), ("map extract {journal} -o {bad}", "missing"),
     ("map export {map} --format tum -o {bad}", "full"), ("map export {map} --format tum -o {bad}", "missing"),
