@@ -11,7 +11,7 @@ import numpy as np
 from mapweave.hybridmap.annotation import BODIES, Annotation, Annotations, Body, Place
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.floor_plan import IDENTITY, PlacedPlans, PlanPart
+from mapweave.hybridmap.floor_plan import IDENTITY, PlacedPlan, PlacedPlans, PlanPart
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.named_nodes import Resolve
@@ -19,7 +19,7 @@ from mapweave.hybridmap.query import Resolved, ResolveRequest
 from mapweave.hybridmap.wall_time import read_time
 from mapweave.mapserver.field_words import field_words
 from mapweave.mapserver.places import others_of, position_of
-from mapweave.mapserver.plan_answers import in_merged, near_part, word_in_merged
+from mapweave.mapserver.plan_answers import goal_on_plan, in_merged, near_part
 from mapweave.wire.typed import packed, value_of
 
 NODES = ("node", "anchor", "a", "b", "merged_from_node")
@@ -91,7 +91,7 @@ def body_of_words(
     if placed is not None and kind != "pin":
         part = placed.part(_found(near, "", resolve).component if near else None)
         near = near or near_part(part)
-        plain = {name: _in_merged(value, name, part) for name, value in plain.items()}
+        plain = {name: _off_plan(value, name, placed, part, resolve) for name, value in plain.items()}
         if corners is not None:
             corners = [in_merged(corner, part) for corner in _corners(corners)]
     for name in TIMES:
@@ -184,12 +184,12 @@ def _pair(pair: Any, near: str | None, resolve: Resolve) -> Any:
     return {**plain, "node": packed(found.node), "x": x, "y": y}
 
 
-def _in_merged(value: Any, name: str, part: PlanPart) -> Any:
-    """A field whose words that are positions on a plan become such in the frame of a component."""
+def _off_plan(value: Any, name: str, placed: PlacedPlan, part: PlanPart, resolve: Resolve) -> Any:
+    """A field with nodes in the place of positions on a plan."""
     if name in NODES and isinstance(value, str):
-        return word_in_merged(value, part)
+        return goal_on_plan(value, placed, part.component, resolve)
     if name == "edge" and isinstance(value, list | tuple):
-        return [_in_merged(word, "node", part) for word in value]
+        return [_off_plan(word, "node", placed, part, resolve) for word in value]
     return value
 
 

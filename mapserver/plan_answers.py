@@ -12,11 +12,13 @@ from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
 from mapweave.hybridmap.errors import Refused
 from mapweave.hybridmap.floor_plan import PlacedPlan, PlanPart
 from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.named_nodes import Resolve
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import (
     MAX_WORDS_ASKED,
     NO_COMPONENT,
+    REACH,
     RelocalizeAnswer,
     ResolveRequest,
     Whereabouts,
@@ -98,10 +100,10 @@ def goal_on_plan(goal: str, plan: PlacedPlan, component: int, resolve: Resolve) 
         The node nearest to the position: the numbers alone do not say in which part of the map they are.
 
     Raises:
-        Refused: the plan does not lie where the robot is.
-        InvalidValue: no node is near.
+        Refused: the plan does not lie where the robot is, or no node is near.
     """
-    if position_of(goal) is None:
+    position = position_of(goal)
+    if position is None:
         return goal
     if component == NO_COMPONENT and len(plan.parts) > 1:
         raise Refused(
@@ -109,8 +111,16 @@ def goal_on_plan(goal: str, plan: PlacedPlan, component: int, resolve: Resolve) 
             "the robot is: give a node, or the name of a place"
         )
     part = plan.part(None if component == NO_COMPONENT else component)
-    request = ResolveRequest((word_in_merged(goal, part),), near_part(part))
-    return str(resolve(request).found[0].node)
+    x, y = in_merged(position, part)
+    (found,) = resolve(ResolveRequest((f"{x:.3f},{y:.3f}",), near_part(part), MAX_POSITION)).found
+    nearest = part.plan_from_merged @ found.merged_from_node
+    if (away := nearest.distance(Pose2(*position))) > REACH:
+        # A person who has given numbers of the plan is not answered in those of the map.
+        raise Refused(
+            f"nothing is mapped within {REACH:g} m of {goal} on plan {plan.name}: the nearest node is "
+            f"{found.node}, {away:.1f} m away at {nearest.x:.1f},{nearest.y:.1f}"
+        )
+    return str(found.node)
 
 
 def nodes_on_plan(nodes: Sequence[NodeId], plan: PlacedPlan, resolve: Resolve) -> list[Pose2 | None]:
@@ -125,15 +135,6 @@ def nodes_on_plan(nodes: Sequence[NodeId], plan: PlacedPlan, resolve: Resolve) -
         for one in resolve(ResolveRequest(tuple(map(str, nodes[begin : begin + MAX_WORDS_ASKED])))).found
     )
     return [plan.pose(one.component, one.merged_from_node) for one in found]
-
-
-def word_in_merged(word: str, part: PlanPart) -> str:
-    """A position on a plan, `9.0,7.0`, as one in the frame of a component; all other words as they are."""
-    position = position_of(word)
-    if position is None:
-        return word
-    x, y = in_merged(position, part)
-    return f"{x:.3f},{y:.3f}"
 
 
 def in_merged(position: tuple[float, float], part: PlanPart) -> tuple[float, float]:

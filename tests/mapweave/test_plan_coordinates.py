@@ -126,6 +126,16 @@ def test_places_and_closures(copy: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert main(["reopen", at, *words]) == 0
     assert Annotations(read_map_file(copy).annotations).in_force(Closure) == ()
     capsys.readouterr()
+    used = ~room.nodes.superseded
+    points = on_plan(positions(room))[used]
+    away = np.linalg.norm(points - [40.0, 30.0], axis=1)
+    (u, v), nearest = points[away.argmin()], room.nodes.ids[used][away.argmin()]
+    words = (
+        f"of 40,30 on plan flat: the nearest node is {nearest}, {away.min():.1f} m away at {u:.1f},{v:.1f}"
+    )
+    for command in (["place", "add", "gone", "40,30"], ["map", "route", "far", "40,30"], ["close", "40,30"]):
+        assert main([*command, "--map", str(copy), "--plan", "flat"]) == NO
+        assert words in capsys.readouterr().err
     assert main(["place", "add", "gone", at, "--map", str(copy), "--plan", "none"]) == NO
     assert "no plan 'none'; there are: flat" in capsys.readouterr().err
 
