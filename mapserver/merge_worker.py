@@ -351,6 +351,7 @@ class MergeWorker:
             log.warning("this server merges itself, though it does not lead: %s", self._alone)
             self._go_on()
             return 0.0
+        self._problem = self._adoption.reason
         if self._adoption.in_step(self._merger):
             self._done = self._applied
             self._release()
@@ -364,7 +365,7 @@ class MergeWorker:
         if self._adoption is None:
             return
         try:
-            merged = self._adoption.adopt(self._merger, self._take_held, self._has_merged)
+            merged = self._adoption.adopt(self._merger, self._take_held, self._has_merged, self._last)
             if merged is None:
                 return
             self._own_merges = self._merger.counters.merges

@@ -177,7 +177,7 @@ class PostgresFollower:
         if not self._leads:
             self._lose()
         with self._publishing:
-            results = self._results
+            results = dict(self._results)
         if not results:
             return
         try:

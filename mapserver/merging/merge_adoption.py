@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import logging
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.merging.merge_sharing import MergeSharing, adopted
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.pruning_record import PruningRecord
@@ -29,6 +30,8 @@ FIRST = 60.0
 """... and so many while there is none at all: the server that leads may have to compare everything first."""
 NONE = "no merge is handed over"
 """Why there is none to be used."""
+NOT_YET = "{} has not merged what this server knows, or the other way round"
+"""Why a merge is not used yet. It is waited for as long."""
 OTHER_MAPS = "its maps are not those that {} has merged"
 """Why a merge is not used."""
 RETRY = 1.0
@@ -72,7 +75,7 @@ class MergeAdoption:
         self._newest: _Read | None = None
         self._last: _Read | None = None
         self._adopted: bytes | None = None
-        self._since, self._again_at = clock(), 0.0
+        self._since, self._wait, self._again_at = clock(), FIRST, 0.0
         self.reason = ""
 
     @property
@@ -83,8 +86,7 @@ class MergeAdoption:
     @property
     def overdue(self) -> bool:
         """Whether it is time to merge without a leader."""
-        wait = FIRST if self.reason == NONE else PATIENCE
-        return bool(self.reason) and self._clock() >= self._since + wait
+        return bool(self.reason) and self._clock() >= self._since + self._wait
 
     def begin(self) -> None:
         """This server follows from now on."""
@@ -106,7 +108,11 @@ class MergeAdoption:
         return self._newest is not None
 
     def adopt(
-        self, merger: Merger, take: Callable[[list[Change]], None], has_merged: bool
+        self,
+        merger: Merger,
+        take: Callable[[list[Change]], None],
+        has_merged: bool,
+        last: Mapping[MapId, int],
     ) -> MergedMap | None:
         """Adopt the newest merge, if it is new and has just these maps.
 
@@ -114,6 +120,7 @@ class MergeAdoption:
             merger: with the maps.
             take: takes changes into it, without comparing.
             has_merged: see `Merger.adopt`.
+            last: the last change of each log that the merger has.
 
         Returns:
             The merged map; None if there is none that is new and can be used.
@@ -137,10 +144,14 @@ class MergeAdoption:
             merger.copy_maps()
             wanted = {which: print_ for which, _, print_ in merge.head.maps}
             if self._sharing.prints(merger) != wanted or not self._same_pruning(merge):
-                raise InvalidFile(OTHER_MAPS.format(merge.head.by))
+                same = all(last.get(which, 0) == sequence for which, sequence, _ in merge.head.maps)
+                self._fail(
+                    (OTHER_MAPS if same else NOT_YET).format(merge.head.by), PATIENCE if same else FIRST
+                )
+                return None
             merged = adopted(merge, self._newest.findings, merger)
         except InvalidFile as error:
-            self._fail(str(error))
+            self._fail(str(error), PATIENCE)
             return None
         merger.adopt(merged, has_merged)
         self._adopted, self._last, self.reason = mark, self._newest, ""
@@ -176,23 +187,24 @@ class MergeAdoption:
     def _same_pruning(self, merge: SharedMerge) -> bool:
         return self._pruning is None or (self._pruning.mark or b"") == merge.head.mark
 
-    def _fail(self, reason: str) -> None:
-        if not self.reason:
+    def _fail(self, reason: str, wait: float) -> None:
+        """No merge can be used; after so many seconds this server merges itself."""
+        if reason != self.reason:
             self._since = self._clock()
-        self.reason = reason
+        self.reason, self._wait = reason, wait
 
     def _read(self, mark: bytes | None, merger: Merger) -> None:
         """Read a merge, if that can be."""
         words = made_by(merger)
         self._mark, self._newest, self._read_at = mark, None, self._clock()
         if mark is None:
-            self._fail(NONE)
+            self._fail(NONE, FIRST)
             return
         try:
             merge = self._sharing.read(mark, words)
             self._newest = _Read(merge, self._sharing.findings(merge.head.parts, words))
         except InvalidFile as error:
-            self._fail(f"the merge that was handed over {error}")
+            self._fail(f"the merge that was handed over {error}", PATIENCE)
 
     def _covered(self, merge: SharedMerge) -> Iterable[Change]:
         """What was held back and is in a merge, in order."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import psycopg
@@ -284,3 +285,37 @@ def test_a_frozen_server_does_not_lead_for_ever(address: str, monkeypatch: pytes
     eventually(lambda: not frozen.leads)
     other.close()
     frozen.close()
+
+
+def test_what_a_leader_publishes_is_stored_whole(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also if more is published while it is stored; and nothing of a server that does not lead."""
+    leader, other = PostgresStore(address, "s0"), PostgresStore(address, "s1")
+    leader.follow(lambda news: None)
+    eventually(lambda: leader.leads)
+    other.follow(lambda news: None)
+    eventually(lambda: leader.followed and other.leader == "s0")
+    assert not other.followed and not other.leads
+    other.publish({"a": b"of another"})
+    execute, more = psycopg.Connection.execute, [b"second", b"third"]
+
+    def publishing(connection: psycopg.Connection, query: Any, *rest: Any, **how: Any) -> Any:
+        """While a result is stored the next are published."""
+        if query == postgres_follower.PUBLISH and more:
+            value = more.pop(0)
+            leader.publish({"a": value, "b": value})
+        return execute(connection, query, *rest, **how)
+
+    monkeypatch.setattr(psycopg.Connection, "execute", publishing)
+    leader.publish({"a": b"first", "b": b"first"})
+    seen = set()
+
+    def stored() -> bool:
+        with psycopg.connect(address) as people:
+            rows = people.execute("SELECT value FROM mapweave.result WHERE name IN ('a', 'b')").fetchall()
+        seen.add(tuple(bytes(value) for (value,) in rows))
+        return seen >= {(b"third", b"third")}
+
+    eventually(stored)
+    assert all(len({*values}) <= 1 for values in seen), "all at once"
+    other.close()
+    leader.close()

@@ -90,16 +90,18 @@ class Follower:
         self.merger = Merger(compare=compare, settings=merging)
         self.adoption = MergeAdoption(MergeSharing(cast(Store, results), "s1"), None, lambda: self.now)
         self.merged = MergedMap.empty()
+        self.last: dict[MapId, int] = {}
 
     def take(self, changes: list[Change]) -> None:
         for change in changes:
             self.adoption.hold(change)
 
     def read(self, changes: list[Change]) -> None:
+        self.last |= {change.map: change.sequence for change in changes}
         self.merger.read((change.map, change.body) for change in changes)
 
     def look(self) -> bool:
-        merged = self.adoption.adopt(self.merger, self.read, self.merger.counters.merges > 0)
+        merged = self.adoption.adopt(self.merger, self.read, self.merger.counters.merges > 0, self.last)
         self.merged = merged or self.merged
         return merged is not None
 
