@@ -144,6 +144,12 @@ class MappingMonitor:
             )
         if wheels == "standing" and image_moves and commanded == "moving":
             return "the image moves and the encoders do not count: check their cable and [robot.options]"
+        if wheels == "standing" and image_moves and commanded == "standing" and mission == "carried":
+            # No image can tell these apart: a train that passes looks like a turn of the robot.
+            return (
+                "the image moves and the wheels count nothing: is the robot carried, does something pass in "
+                "front of it, or does neither encoder count (cable, [robot.options])?"
+            )
         if wheels == "standing" and image_moves is False and commanded == "moving" and self._driven:
             return "the wheels do not obey: check motor power, emergency stop, and whether the robot is stuck"
         # A robot that explores says itself why it stands.

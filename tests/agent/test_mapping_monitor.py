@@ -83,6 +83,7 @@ def dead_encoders(seen: Observation) -> Observation:
         (no_camera, DRIVE, "no image for"),
         ("other camera", DRIVE, "the wheels turn and the image stands still"),
         (dead_encoders, DRIVE, "the encoders do not count"),
+        (dead_encoders, Command(), "or does neither encoder count"),
         ("dead motors", DRIVE, "the wheels do not obey"),
         ("dead motors", Command(), "the robot stands still"),
     ],
@@ -110,6 +111,14 @@ def test_a_robot_that_explores_says_itself_why_it_stands(drive, description) -> 
         return replace(dead_encoders(seen), image=drive[0].image)
 
     (line,) = lines(drive, description, stands, PATIENCE + 5.0, Command(), "explore")
+    assert line.endswith(": mapping: 9 tracks")
+    (line,) = lines(drive, description, dead_encoders, PATIENCE + 5.0, Command(), "explore")
+    assert line.endswith(": mapping: 9 tracks"), "somebody moves in front of it"
+
+
+def test_a_robot_that_is_pushed_has_encoders(drive, description) -> None:
+    """A person drives it, so it has no commands, and its wheels count."""
+    (line,) = lines(drive, description, working, PATIENCE + 5.0, Command())
     assert line.endswith(": mapping: 9 tracks")
 
 
