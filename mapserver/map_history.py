@@ -17,8 +17,9 @@ from mapweave.hybridmap.limits import MAX_WORDS
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.mapserver.log.store import HISTORY, Store
 from mapweave.merge.explanation.component_changes import joined_maps, joinings, partings
+from mapweave.merge.explanation.twin_maps import TWINS, are_twins, is_twin_reason
 from mapweave.merge.mutual_exclusion.collision import is_exclusion
-from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.pinned_frames import FrameChange, frame_changes
 from mapweave.wire.messages import KeptHistory, decode, encode
@@ -195,27 +196,31 @@ def _part_of(parts: Iterable[frozenset[MapId]]) -> dict[MapId, int]:
 
 
 def _kept_apart(merged: MergedMap, parts: Sequence[frozenset[MapId]]) -> dict[Pair, str]:
-    """Maps that are kept apart by mutual exclusion, or since one has wrong geometry."""
+    """Maps that are kept apart: by mutual exclusion, as twins, or since one has wrong geometry."""
     part_of = _part_of(parts)
-    reasons: dict[Pair, Counter[str]] = {}
-    by_exclusion: dict[str, bool] = {}
+    refused: dict[Pair, list[RefusedLink]] = {}
+    telling: dict[str, bool] = {}
     for r in merged.refused:
         if r.link is None or r.edge is not None:
             continue
-        if r.reason not in by_exclusion:
-            by_exclusion[r.reason] = is_exclusion(r.reason)
+        if r.reason not in telling:
+            telling[r.reason] = is_twin_reason(r.reason)
         first, second = sorted((r.a.map, r.b.map))
-        if by_exclusion[r.reason] and part_of.get(first) != part_of.get(second):
-            reasons.setdefault((first, second), Counter())[r.reason] += 1
+        if telling[r.reason] and part_of.get(first) != part_of.get(second):
+            refused.setdefault((first, second), []).append(r)
     # One line for a map with wrong geometry, under its pair with the first of those that it contradicts.
     out: dict[Pair, str] = {}
     for wrong in merged.wrong.values():
         first, second = sorted((wrong.which, wrong.agreeing[0]))
         out[first, second] = wrong.reason
-    for (first, second), counts in sorted(reasons.items()):
-        count = sum(counts.values())
-        refused = f"{counted(count, 'link')} refused ({counts.most_common(1)[0][0]})"
-        out[first, second] = f"{first} and {second} are kept apart: {refused}"
+    for (first, second), links in sorted(refused.items()):
+        counts, twins = Counter(link.reason for link in links), are_twins(links)
+        excluded = any(is_exclusion(reason) for reason in counts)
+        if not (excluded or twins):
+            continue
+        why = f"{counted(len(links), 'link')} refused ({counts.most_common(1)[0][0]})"
+        more = f". They show the same places: {TWINS}" if twins else ""
+        out[first, second] = f"{first} and {second} are kept apart: {why}{more}"
     return out
 
 

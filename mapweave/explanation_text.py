@@ -23,6 +23,7 @@ from mapweave.hybridmap.explanation import (
 )
 from mapweave.hybridmap.manual_constraint import ManualConstraint, retired_words
 from mapweave.hybridmap.pose import Array, PoseGaussian
+from mapweave.merge.explanation.twin_maps import TWINS
 
 MOST_LINKS = 12
 """Lines of other links; `--json` has all."""
@@ -110,6 +111,9 @@ def maps_words(explanation: MapsExplanation) -> list[str]:
     if explanation.nearest:
         lines.append("  weakest links:" if explanation.joined else "  nearest to a link:")
     lines += [f"    {_near(near_miss, explanation.reason)}" for near_miss in explanation.nearest]
+    if TWINS in explanation.reason:
+        # The reason is the same on the page, where a command of the shell means nothing.
+        lines.append(f"  `mapweave map retire {explanation.first} --because TEXT`, or {explanation.second}")
     lines += _record(explanation.constraints, explanation.reason)
     return lines
 

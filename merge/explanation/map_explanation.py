@@ -19,6 +19,7 @@ from mapweave.hybridmap.reachability import reachability_of
 from mapweave.merge.explanation.component_changes import joined_maps
 from mapweave.merge.explanation.node_explanation import node_of
 from mapweave.merge.explanation.own_edges import reach_words
+from mapweave.merge.explanation.twin_maps import TWINS, are_twins
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verification import examine
@@ -189,7 +190,8 @@ def _why_apart(
             if len(refused) == 1
             else (f"{len(refused)} links were found and all refused")
         )
-        return f"{head}: {many}: {'; '.join(reasons_in_words)}"
+        twins = f". They show the same places: {TWINS}" if are_twins(refused) else ""
+        return f"{head}: {many}: {'; '.join(reasons_in_words)}{twins}"
     if unverified:
         best = f"; nearest are {nearest[0].a} and {nearest[0].b}: {nearest[0].lacks}" if nearest else ""
         many = "1 pair of nodes looks" if len(unverified) == 1 else f"{len(unverified)} pairs of nodes look"

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
+from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import reason_of
 from mapweave.merge.explanation.component_changes import joined_maps
+from mapweave.merge.explanation.twin_maps import are_twins, twin_words
+from mapweave.merge.pose_graph.links import RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
 
@@ -33,15 +36,19 @@ def map_standings(merged: MergedMap) -> dict[MapId, MapStanding]:
         if not link.within:
             links.update((link.a.map, link.b.map))
     refused: dict[MapId, Counter[str]] = {}
+    between: dict[tuple[MapId, MapId], list[RefusedLink]] = {}
     alike: Counter[MapId] = Counter()
     for pair in merged.refused:
         if pair.edge is not None or pair.a.map == pair.b.map:
             continue
+        if pair.link is not None:
+            between.setdefault(_ordered(pair.a.map, pair.b.map), []).append(pair)
         for map_id in (pair.a.map, pair.b.map):
             if pair.link is None:
                 alike[map_id] += 1
             else:
                 refused.setdefault(map_id, Counter())[pair.reason] += 1
+    twin = _twins(merged, between)
     accusations, out = merged.accusations(), dict[MapId, MapStanding]()
     for map_id in sorted({*merged.maps, *merged.set_apart}):
         nodes = merged.maps[map_id].nodes if map_id in merged.maps else ()
@@ -51,10 +58,26 @@ def map_standings(merged: MergedMap) -> dict[MapId, MapStanding]:
             apart = (
                 (reason_of(constraint) if constraint is not None else "")
                 or accusations.get(map_id, "")
-                or _refused(refused.get(map_id, Counter()))
+                or "; ".join(filter(None, (twin.get(map_id), _refused(refused.get(map_id, Counter())))))
                 or _unverified(alike[map_id])
             )
         out[map_id] = MapStanding(max(nodes, default=None), links[map_id], apart)
+    return out
+
+
+def _ordered(one: MapId, other: MapId) -> tuple[MapId, MapId]:
+    return min(one, other), max(one, other)
+
+
+def _twins(
+    merged: MergedMap, between: Mapping[tuple[MapId, MapId], Sequence[RefusedLink]]
+) -> dict[MapId, str]:
+    """What is said of each map that shows the same places as another one; of several the most alike."""
+    out: dict[MapId, str] = {}
+    for pair, links in sorted(between.items(), key=lambda item: (-len(item[1]), item[0])):
+        if are_twins(links) and not merged.joined(*pair):
+            for map_id in pair:
+                out.setdefault(map_id, twin_words(*pair))
     return out
 
 

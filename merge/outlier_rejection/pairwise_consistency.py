@@ -35,6 +35,8 @@ from mapweave.merge.pose_graph.links import Link, RefusedLink, place_distinct, r
 from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.pose_arrays import PoseGaussians
 
+ALIASED = "is found at other places too"
+"""Words of the reason why links with aliased landmarks are refused."""
 CHANCE = 0.01
 """So many false sets at most may be expected between two pieces that are as good as the one that is
 kept."""
@@ -251,7 +253,7 @@ def _too_little(kept: Sequence[Link], s: ConsistencySettings) -> str:
         return "no links"
     if not _identify(kept) and not any(_identify(rest) for rest in _without_each_robot(kept)):
         agree = "the link shows" if len(kept) == 1 else f"the {len(kept)} links that agree show"
-        return f"most of what {agree} is found at other places too"
+        return f"most of what {agree} {ALIASED}"
     telling = [link for link in kept if link.telling]
     independent = independent_links(telling, s.least_links)
     if independent >= s.least_links:

@@ -22,6 +22,7 @@ from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.map_history import MOST_AT_ONCE, MapHistory
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.merge.explanation.twin_maps import TWINS
 from mapweave.merge.mutual_exclusion.collision import Collision, is_exclusion
 from mapweave.merge.pose_graph.links import refuse
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -120,7 +121,11 @@ def test_mutual_exclusion_is_reported_until_the_maps_are_joined(
     history.follow(replace(two, refused=tuple(refuse(link, seen.reason) for link in links)))
     ((kind, _),) = events(history)
     assert kind is MapEventKind.KEPT_APART
-    assert history.newest == (f"a.1 and b.1 are kept apart: {len(links)} links refused ({clash.reason})")
+    # What people can do about it is said where several nodes of each map show the same places.
+    assert history.newest == (
+        f"a.1 and b.1 are kept apart: {len(links)} links refused ({clash.reason}). "
+        f"They show the same places: {TWINS}"
+    )
     again = MapHistory(store)
     again.follow(held)
     assert again.events == history.events, "recorded already"
