@@ -3,6 +3,7 @@
     python -m benchmarks.liar [--seed N] [--ways NAME ...] [--without RULE] [--json]
     python -m benchmarks.liar --rules [--seed N] [--ways NAME ...] [--jobs N] [--json]
     python -m benchmarks.liar --margins [--seed N] [--json]
+    python -m benchmarks.liar --recovery [--seed N] [--ways NAME ...] [--json]
 
 Nothing is rendered (see `synthetic.wrong_geometry`); server, ingest, merge and relocalization are the real
 ones, and all that robots send and ask goes over a bus. Three robots map a house. A fourth one then sends its
@@ -14,7 +15,8 @@ moves them by 2 to 3 cm. It is named if the history that the page shows holds it
 cannot be found out (`UNDECIDABLE`): they are measured, and not counted.
 
 With `--rules` all ways that can be found out are tried with all rules, and without each. With `--margins` the
-ways of `margins.py` are, each without the one rule that contains it.
+ways of `margins.py` are, each without the one rule that contains it. With `--recovery` a person retires what
+the robot that lies has sent: then the three have what they had without it, node by node.
 """
 
 from __future__ import annotations
@@ -46,8 +48,15 @@ from mapweave.merge.outlier_rejection import distinctness, wrong_geometry
 from mapweave.merge.outlier_rejection.fleet_chance import FleetChance
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
 from mapweave.merge.pose_graph.staged_optimization import StagedOptimization
-from mapweave.scenarios.liar.lies import EVERY, WAYS, Map
-from mapweave.scenarios.liar.trial import ContainmentOutcome, LiarTrial, row, totals
+from mapweave.scenarios.liar.lies import EVERY, WAYS, Map, honest
+from mapweave.scenarios.liar.trial import (
+    ContainmentOutcome,
+    LiarTrial,
+    RecoveryOutcome,
+    recovery_row,
+    row,
+    totals,
+)
 from synthetic.wrong_geometry import ODD, SCENES, FaultyFleet, OdometryFault, draw_fleet, lost_views
 
 SCENE = "house", 3
@@ -139,6 +148,14 @@ def margins(seed: int, queries: int) -> Iterator[tuple[str, dict[str, Containmen
                 yield name, {**outcomes, rule: trial.outcome(lie)}
 
 
+def recoveries(seed: int, queries: int, ways: Sequence[str]) -> Iterator[tuple[str, RecoveryOutcome]]:
+    """What is left of an honest fourth robot, and of each way to lie, once a person has retired it."""
+    with tempfile.TemporaryDirectory() as folder:
+        trial = drawn_trial(seed, queries, Path(folder))
+        for name, lie in ((HONEST, honest), *((name, EVERY[name]) for name in ways)):
+            yield name, trial.recovery(lie)
+
+
 def _without(seed: int, queries: int, ways: Sequence[str], rule: str) -> dict[str, Any]:
     logging.disable(logging.WARNING)
     return totals(dict(tried(seed, queries, ways, rule)))
@@ -152,6 +169,7 @@ def main() -> None:
     parser.add_argument("--without", choices=list(RULES), metavar="RULE", help="switch a rule off: see RULES")
     parser.add_argument("--rules", action="store_true", help="all rules, and without each of them")
     parser.add_argument("--margins", action="store_true", help="the ways that one rule alone contains")
+    parser.add_argument("--recovery", action="store_true", help="what is left once a person has retired it")
     parser.add_argument("--jobs", type=int, default=1, help="processes, with --rules (default 1)")
     arguments = parser.parse_args()
     if min(arguments.queries, arguments.jobs) < 1:
@@ -160,6 +178,8 @@ def main() -> None:
         parser.error("--rules switches each rule off: leave out --without")
     if arguments.margins and (arguments.rules or arguments.without):
         parser.error("--margins has its own ways and rules: leave out --rules and --without")
+    if arguments.recovery and (arguments.rules or arguments.without or arguments.margins):
+        parser.error("--recovery is by all rules: leave out --rules, --without and --margins")
     logging.disable(logging.WARNING)
     console = Console(stderr=arguments.json)
     with Progress(console=console) as progress:
@@ -172,6 +192,12 @@ def main() -> None:
                 found[name] = {rule: asdict(one) for rule, one in by_rule.items()}
                 for rule, one in by_rule.items():
                     console.print(f"without {rule}: " if rule != ALL else "", row(name, one), sep="")
+        elif arguments.recovery:
+            found = {}
+            left = recoveries(arguments.seed, arguments.queries, arguments.ways)
+            for name, gone in progress.track(left, len(arguments.ways) + 1, description="ways"):
+                found[name] = asdict(gone)
+                console.print(recovery_row(name, gone))
         else:
             outcomes: dict[str, ContainmentOutcome] = {}
             rule = arguments.without or ALL

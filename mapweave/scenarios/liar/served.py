@@ -11,17 +11,21 @@ from types import TracebackType
 import numpy as np
 
 from mapweave.hybridmap.agent_status import FleetStatus
+from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.mapserver.relocalization.verdict import FLOOR_HEADING, FLOOR_XY, GATE
 from mapweave.mapserver.server import MapServer
+from mapweave.merge.explanation.map_standing import map_standings
+from mapweave.merge.explanation.twin_maps import TWINS
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Closing, Request, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, Mark, decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from mapweave.wire.messages import decode, encode_view
+from mapweave.wire.messages import decode, encode, encode_view
 
 KEYS = Keys("liars")
 LOG_ID = 7
@@ -69,12 +73,14 @@ class FleetResult:
         components: their nodes, by the component that holds them; parts without them are left out.
         poses: of their nodes, in the frame of the first node of the same component.
         answers: to lost robots.
+        superseded: their nodes that others replace.
     """
 
     links: frozenset[tuple[NodeId, NodeId]]
     components: frozenset[frozenset[NodeId]]
     poses: Mapping[NodeId, Pose2]
     answers: Sequence[TrialAnswer]
+    superseded: frozenset[NodeId]
 
 
 class Served:
@@ -150,6 +156,21 @@ class Served:
         """How many links there are between a robot's maps and those of others."""
         return sum((link.a.agent == agent) != (link.b.agent == agent) for link in self._server.merged().links)
 
+    def twins(self, agent: str) -> str:
+        """What the status says of two maps that show the same places, one of them of a robot; else empty."""
+        standings = map_standings(self._server.merged()).values()
+        said = (one.apart for one in standings if TWINS in one.apart)
+        return next((words for words in said if f"{agent}." in words.partition(TWINS)[0]), "")
+
+    def retire(self, maps: Iterable[MapId]) -> bool:
+        """Have a person retire maps; returns whether all is merged without them in time."""
+        for map_id in maps:
+            made = ManualConstraint(RetiredMap(map_id), True, "operator", time.time_ns(), "it is a copy")
+            replies = self._bus.ask(KEYS.constrain("s0"), encode(ConstraintRequest(made)), 20.0)
+            if not replies or replies[0].error:
+                return False
+        return self.settle()
+
     def seen(
         self, maps: Collection[MapId], lost: Sequence[tuple[View, Pose2]], truth: Mapping[NodeId, Pose2]
     ) -> FleetResult:
@@ -168,6 +189,7 @@ class Served:
             frozenset(parts.values()),
             {node: merged.pose(first).inverse() @ merged.pose(node) for node, first in frames.items()},
             [self._answer(merged, frames, view, at, truth) for view, at in lost],
+            frozenset(node for node in merged.superseded if node.map in maps),
         )
 
     def _answer(
