@@ -113,7 +113,7 @@ def test_a_robot_that_explores_says_itself_why_it_stands(drive, description) -> 
     (line,) = lines(drive, description, stands, PATIENCE + 5.0, Command(), "explore")
     assert line.endswith(": mapping: 9 tracks")
     (line,) = lines(drive, description, dead_encoders, PATIENCE + 5.0, Command(), "explore")
-    assert line.endswith(": mapping: 9 tracks"), "somebody moves in front of it"
+    assert line.endswith(": mapping: 9 tracks"), "a person moves in front of it"
 
 
 def test_a_robot_that_is_pushed_has_encoders(drive, description) -> None:
