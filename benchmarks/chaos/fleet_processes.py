@@ -7,7 +7,6 @@ Agents and servers are clients of two routers that are joined. Each has a link o
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -196,7 +195,8 @@ class FleetProcesses:
 
     def _signal(self, name: str, number: signal.Signals) -> None:
         if name in self._running:
-            os.kill(self._running[name].pid, number)
+            # One that has ended by itself, since it found no database, is left alone.
+            self._running[name].send_signal(number)
 
     def _last_line(self, name: str) -> str:
         lines = (self.folder / f"{name}.log").read_text(errors="replace").strip().splitlines()

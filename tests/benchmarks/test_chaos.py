@@ -278,6 +278,17 @@ def test_robots_that_are_not_done_are_named(tmp_path: Path) -> None:
         assert comes_true(lambda: fleet.mapping() == ["r1"], 60.0)
 
 
+def test_a_server_that_has_ended_by_itself_is_neither_frozen_nor_thawed(tmp_path: Path) -> None:
+    """It found no database; it is started again later."""
+    with FleetProcesses(tmp_path, 1, 1, "sqlite") as fleet:
+        fleet._commands["s0"] = [sys.executable, "-c", "pass"]
+        fleet.start("s0")
+        fleet.begin(Kind.STOP, "s0")
+        fleet.end_disturbance(Kind.STOP, "s0")
+        eventually(lambda: fleet._running["s0"].poll() == 0)
+        fleet.end_disturbance(Kind.STOP, "s0")
+
+
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_nothing_is_lost_in_a_short_chaos() -> None:
