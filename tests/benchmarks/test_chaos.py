@@ -290,6 +290,7 @@ def test_a_server_that_has_ended_by_itself_is_neither_frozen_nor_thawed(tmp_path
 
 
 @pytest.mark.slow
+@pytest.mark.alone
 @pytest.mark.timeout(600)
 def test_nothing_is_lost_in_a_short_chaos() -> None:
     ran = subprocess.run(
