@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from docs import floor_plan, independent_support
-from docs.site import calibration_picture, demo_picture, hooks
+from docs.site import calibration_picture, demo_picture, hooks, page_picture
 from mapweave.vision.calibration.target import CalibrationTarget
 from mapweave.vision.calibration.views import BoardDetector
 
@@ -59,6 +59,47 @@ def test_a_picture_that_looks_the_same_stays(tmp_path: Path) -> None:
     for levels, same in ((0, True), (40, False)):
         cv2.imwrite(str(kept), grey + levels)
         assert floor_plan.looks_the_same(drawn, kept) is same
+
+
+class DrawnPage:
+    """A page that shows some words and is drawn in some grey, as a browser would."""
+
+    def __init__(self, words: str, grey: int) -> None:
+        self.words, self.grey = words, grey
+
+    def run(self, script: str) -> dict[str, str]:
+        assert script == page_picture.SHOWN
+        return {"words": self.words}
+
+    def screenshot(self, path: Path) -> None:
+        cv2.imwrite(str(path), np.full((4, 5, 3), self.grey, np.uint8))
+
+
+def test_a_picture_of_the_page_is_drawn_when_the_page_shows_something_else(tmp_path: Path) -> None:
+    """Another browser with other fonts draws the same a little differently: that is no new picture."""
+    path = tmp_path / "page.png"
+    cv2.imwrite(str(path), np.full((4, 5, 3), 100, np.uint8))
+    for words, grey, expected in (
+        ("live", 100, 100),
+        ("live", 140, 100),
+        ("87 nodes", 101, 100),
+        ("87 nodes", 140, 140),
+        ("live", 140, 140),
+        ("live", 100, 100),
+    ):
+        page_picture.keep(DrawnPage(words, grey), path)
+        assert cv2.imread(str(path))[0, 0, 0] == expected, (words, grey)
+        assert list(tmp_path.iterdir()) == [path]
+    assert page_picture.content_of(path)
+
+
+def test_without_a_browser_the_pictures_of_the_page_stay(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(page_picture, "there_is_none", lambda: True)
+    page_picture.main()
+    reason = "page.png and edit.png stay as they are: drawing needs chromium and chromedriver\n"
+    assert capsys.readouterr().err == reason
 
 
 @pytest.mark.parametrize("reached", [True, False])

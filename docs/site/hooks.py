@@ -22,7 +22,7 @@ PICTURES = {
     "docs/floor_plan.py": ("floor-plan.png",),
     "docs/independent_support.py": ("independent-support.svg",),
 }  # fmt: skip
-"""What is drawn, by program. `page.png` and `edit.png` need a browser, and stay once they are."""
+"""What is drawn, by program. `page.png` and `edit.png` need a browser, and stay as they are without one."""
 BY_HAND = {"docs/site/demo_picture.py": ("demo.png",)}
 """What takes minutes: drawn when a person runs the program."""
 

@@ -63,7 +63,7 @@ def main() -> None:
         draw_map(MapPicture(title, poses, edges, landmarks=landmarks(merged)), FOLDER / f"{name}.png")
     link = next(link for link in both.links if not link.within)
     draw_link(explain_nodes(both, link.a, link.b), FOLDER / "link.png")
-    page_picture.main(again=False)
+    page_picture.main()
 
 
 if __name__ == "__main__":

@@ -55,6 +55,14 @@ def prepare(folder: Path, store: Path, shown: LastShown) -> None:
             filled.put_result(HISTORY, encode(KeptHistory(shown.history, tuple(shown.parts))))
 
 
+def replayed_robots(bus: Bus, keys: Keys, server: str, folder: Path) -> list[ReplayedRobot]:
+    """The robots, announced, at the beginnings of their recordings; for the arguments see `RecordedFleet`."""
+    return [
+        ReplayedRobot(bus, keys, server, map_id, *split(map_id, changes), _journal(folder, map_id))
+        for map_id, changes in recorded_maps().items()
+    ]
+
+
 class RecordedFleet:
     """A context manager."""
 
@@ -68,10 +76,7 @@ class RecordedFleet:
             folder: with the journals, see `prepare`.
         """
         self._stop = threading.Event()
-        self._robots = [
-            ReplayedRobot(bus, keys, server, map_id, *split(map_id, changes), _journal(folder, map_id))
-            for map_id, changes in recorded_maps().items()
-        ]
+        self._robots = replayed_robots(bus, keys, server, folder)
         self._thread = threading.Thread(target=self._move, name="recorded fleet", daemon=True)
         self._thread.start()
 
