@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import pytest
 
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.constraint_subject import Apart
+from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.pose import Pose2
@@ -160,8 +161,17 @@ def assert_follows(servers: Servers, *, unmerged: bool = True) -> None:
 
 
 def answers_of(server: MapServer, views: list[View]) -> list[RelocalizeAnswer]:
-    asked = [server.locate(lambda view=view: view, number) for number, view in enumerate(views)]
-    return [answer.result(PATIENCE) for answer in asked]
+    """To one question after the other; a server that is busy is asked again."""
+    answers: list[RelocalizeAnswer] = []
+    for number, view in enumerate(views):
+
+        def answered(view: View = view, number: int = number) -> bool:
+            with suppress(Busy):
+                answers.append(server.locate(lambda: view, number).result(PATIENCE))
+            return len(answers) == number + 1
+
+        eventually(answered, PATIENCE)
+    return answers
 
 
 def views_of(changes: list[Change]) -> list[View]:
