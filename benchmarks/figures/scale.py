@@ -167,9 +167,9 @@ One server a site is the plan: sites share no floor, so no map, no link and no r
 stands alone keeps working when the network between sites fails."""
 TOGETHER = """\
 Then one merged map has to be shared: several front servers on one record take changes and answer. The record
-has what robots and people sent. Each front server compares all new nodes and merges the whole map by itself,
-so each needs the processor and the memory for that: more front servers bring neither down. Workers of a
-[Ray cluster](cluster.md) compare what a front server does not compare itself."""
+has what robots and people sent. One front server compares all new nodes and merges; the others take over its
+merged map. Each needs the memory for the whole map: more front servers do not bring that down. Workers of a
+[Ray cluster](cluster.md) compare what the one that leads does not compare itself."""
 WATCH = """\
 The [metrics](monitoring.md) show where the plan is wrong: `mapweave_ack_seconds` (fronts),
 `mapweave_queue_length{queue="comparisons"}` and `mapweave_merge_seconds` (merging),
@@ -282,9 +282,6 @@ def _building(costs: Costs, plan: ScalePlan) -> list[Row]:
     whole = costs.base_bytes + SITES * plan.nodes * costs.kept_bytes
     fronts = math.ceil(ROBOTS / costs.carried) if costs.carried else 0
 
-    def of_all(each: float) -> str:
-        return f"{fronts * each:.0f}" if fronts else "not known"
-
     carried = (
         f"{costs.carried} robots" if costs.carried else f"none of {costs.agents} was in time on that machine"
     )
@@ -297,13 +294,11 @@ def _building(costs: Costs, plan: ScalePlan) -> list[Row]:
          "extrapolated, at most"),
         ("cores for answers", "robots × questions × answer",
          f"{ROBOTS / QUESTION_EVERY * costs.answer_s:.1f}", EXTRAPOLATED),
-        ("cores for comparing, of one front server", "new nodes × comparing", f"{rate * costs.compare_s:.1f}",
-         EXTRAPOLATED),
+        ("cores for comparing, of the one that leads", "new nodes × comparing",
+         f"{rate * costs.compare_s:.1f}", EXTRAPOLATED),
         ("the same on the first day", "new nodes × comparing", f"{first * costs.compare_s:.0f}",
          EXTRAPOLATED),
-        ("cores for comparing, of all; on the first day", "front servers × that",
-         f"{of_all(rate * costs.compare_s)}; {of_all(first * costs.compare_s)}", EXTRAPOLATED),
-        ("cores for merging, of all", "front servers × share of a core", of_all(MERGE_SHARE),
+        ("cores for merging, of the one that leads", "share of a core", f"{MERGE_SHARE:.1f}",
          "as built, at most"),
         ("a merge is behind by", "a merge × nodes of all sites / 10 000, over its share",
          f"{SITES * plan.merge_s / MERGE_SHARE:.0f} s", EXTRAPOLATED),
