@@ -6,6 +6,7 @@ import ctypes
 import gc
 import os
 import sys
+from collections import Counter
 
 # numpy reads it when it is imported, and cv2 imports numpy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -53,6 +54,15 @@ def pytest_collection_finish() -> None:
     gc.enable()
     # All that was made since is looked through far less often: that was 3 % of the time of all tests.
     gc.set_threshold(5000, 10, 50)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """Say what was not tested: one line for each reason, such as a machine without a browser."""
+    skipped = terminalreporter.stats.get("skipped", [])
+    # Of a skipped test there are a file, a line and the reason.
+    reasons = Counter(str(report.longrepr[-1]).removeprefix("Skipped: ") for report in skipped)
+    for reason, count in reasons.most_common():
+        terminalreporter.write_line(f"skipped {count}: {reason}", yellow=True)
 
 
 if not INSTALLED:

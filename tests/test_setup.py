@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -70,3 +71,21 @@ def test_a_missing_network_is_not_taken_for_a_missing_wheel(checkout: Path) -> N
     (checkout / "offline").touch()
     status, said = setup(checkout)
     assert status != 0 and "wheel" not in said, said
+
+
+@pytest.mark.parametrize("workers", [(), ("-n", "1")])
+def test_what_was_skipped_is_said_in_one_line_for_each_reason(workers: tuple[str, ...]) -> None:
+    """Without a browser all tests are green; how many were left out, and why, must be seen."""
+    tests = [f"tests/mapserver/http/{name}.py" for name in ("test_page_robots", "test_page_connection")]
+    environment = {**os.environ, "PATH": ""}
+    ran = subprocess.run(
+        [sys.executable, "-m", "pytest", *tests, *workers],
+        cwd=MAKEFILE.parent,
+        env=environment,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    (line,) = (line for line in ran.stdout.splitlines() if line.startswith("skipped "))
+    count = sum((MAKEFILE.parent / name).read_text(encoding="utf-8").count("\ndef test_") for name in tests)
+    assert line == f"skipped {count}: needs chromium and chromedriver on the PATH"
