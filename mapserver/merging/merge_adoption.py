@@ -7,6 +7,7 @@ merged, which digests prove. The nodes among them can be found all the while.
 from __future__ import annotations
 
 import logging
+import math
 import time
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
@@ -71,7 +72,7 @@ class MergeAdoption:
         self._sharing, self._pruning, self._clock = sharing, pruning, clock
         self._held: list[Change] = []
         self._mark: bytes | None = None
-        self._read_at = 0.0
+        self._read_at = -math.inf
         self._newest: _Read | None = None
         self._last: _Read | None = None
         self._adopted: bytes | None = None
@@ -127,7 +128,8 @@ class MergeAdoption:
         """
         try:
             mark = self._sharing.mark
-        except InvalidFile:  # it is away: nothing new comes either
+        except InvalidFile:  # it is away: nothing new comes either, and that is no time without a leader
+            self._since = self._clock()
             return None
         if mark == self._adopted is not None:
             self.reason = ""

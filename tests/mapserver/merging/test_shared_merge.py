@@ -15,20 +15,21 @@ from hypothesis import strategies as st
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.constraint_subject import Apart, Linked, RetiredMap, RetiredNodes
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.content_hash import content_hash
-from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.log.store import MERGE, MERGE_MARK, Store
 from mapweave.mapserver.map_files import map_file_of
-from mapweave.mapserver.merging import merge_sharing
+from mapweave.mapserver.merging import merge_adoption, merge_sharing, verification_cache_keeper
 from mapweave.mapserver.merging.merge_adoption import MergeAdoption
-from mapweave.mapserver.merging.merge_sharing import MergeSharing
+from mapweave.mapserver.merging.merge_sharing import PART, MergeSharing
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.map_maintenance import comparisons
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.merge.settings import MergeSettings
+from mapweave.merge.settings import ExclusionSettings, MergeSettings
 from tests.mapserver.merging.test_restart_record import Log, Server, compare, decided, drives, verify
 from tests.quick import first_quick
 
@@ -47,6 +48,7 @@ class Results:
 
     leads = followed = True
     term = 1
+    away = False
 
     def __init__(self) -> None:
         self.values: dict[str, bytes] = {}
@@ -55,6 +57,8 @@ class Results:
         self.values |= results
 
     def result(self, name: str) -> bytes | None:
+        if self.away:
+            raise InvalidFile("the map store cannot be used")
         return self.values.get(name)
 
 
@@ -86,7 +90,7 @@ class Follower:
     """What that of a server that follows does; its clock is set by hand."""
 
     def __init__(self, results: Results, merging: MergeSettings | None = None) -> None:
-        self.now = 0.0
+        self.now, self.results = 0.0, results
         self.merger = Merger(compare=compare, settings=merging)
         self.adoption = MergeAdoption(MergeSharing(cast(Store, results), "s1"), None, lambda: self.now)
         self.merged = MergedMap.empty()
@@ -217,3 +221,79 @@ def test_a_follower_has_the_leaders_map_and_goes_on_from_it(
             assert follower.merger.counters.verified == 0, "what was compared is compared once"
         for node in merged.poses if heard == done else ():
             assert follower.merger.merged().pose(node).distance(merged.pose(node)) < 1e-6
+
+
+@pytest.fixture(scope="module")
+def handed_over(
+    each_pair_once: None, tmp_path_factory: pytest.TempPathFactory
+) -> tuple[Results, list[Change]]:
+    """A merge of the first changes, to be looked at only."""
+    results, changes = Results(), numbered(drives(1))[:24]
+    leader = Leader(results, tmp_path_factory.mktemp("leader") / "s0")
+    leader.put(changes)
+    leader.merge()
+    return results, changes
+
+
+def follower_of(handed_over: tuple[Results, list[Change]]) -> Follower:
+    results = Results()
+    results.values = dict(handed_over[0].values)
+    return Follower(results)
+
+
+def test_time_without_a_store_is_no_time_without_a_leader(handed_over: tuple[Results, list[Change]]) -> None:
+    follower = follower_of(handed_over)
+    follower.results.values[MERGE] = b""
+    assert not follower.look() and follower.adoption.reason.endswith("is incomplete or damaged")
+    follower.results.away = True
+    follower.now = 100.0
+    assert not follower.look() and not follower.adoption.overdue
+    follower.results.away = False
+    follower.now += merge_adoption.PATIENCE
+    assert not follower.look() and follower.adoption.overdue
+
+
+def test_a_follower_that_has_not_all_waits_longer_than_one_with_other_maps(
+    handed_over: tuple[Results, list[Change]],
+) -> None:
+    changes, lacking, other = handed_over[1], follower_of(handed_over), follower_of(handed_over)
+    lacking.take(changes[:-1])
+    assert not lacking.look() and "has not merged" in lacking.adoption.reason
+    lacking.now = merge_adoption.PATIENCE
+    assert not lacking.adoption.overdue
+    lacking.take(changes[-1:])
+    assert lacking.look() and not lacking.adoption.reason
+    # Another one has lost a change on the way.
+    other.take(changes[1:])
+    assert not other.look() and other.adoption.reason == merge_adoption.OTHER_MAPS.format("s0")
+    other.now = merge_adoption.PATIENCE
+    assert other.adoption.overdue
+
+
+@pytest.mark.parametrize("name", [MERGE, MERGE_MARK, PART.format(0)])
+@pytest.mark.parametrize("how", ["missing", "empty", "cut", "flipped"])
+def test_what_is_damaged_is_not_adopted(
+    handed_over: tuple[Results, list[Change]], name: str, how: str
+) -> None:
+    follower = follower_of(handed_over)
+    value, values = follower.results.values.pop(name), follower.results.values
+    if how != "missing":
+        middle = len(value) // 2
+        flipped = value[:middle] + bytes([value[middle] ^ 1]) + value[middle + 1 :]
+        values[name] = {"empty": b"", "cut": value[:-1], "flipped": flipped}[how]
+    follower.take(handed_over[1])
+    assert not follower.look() and follower.adoption.reason
+    values[name] = value
+    follower.now = merge_adoption.RETRY
+    assert follower.look() and not follower.adoption.reason
+
+
+def test_merges_with_other_settings_or_of_another_version_are_not_adopted(
+    handed_over: tuple[Results, list[Change]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    follower = Follower(handed_over[0], MergeSettings(exclusion=ExclusionSettings(doubt=0.01)))
+    follower.take(handed_over[1])
+    assert not follower.look() and "with other settings" in follower.adoption.reason
+    monkeypatch.setattr(verification_cache_keeper, "version", lambda _: "0.0.0")
+    follower = Follower(handed_over[0])
+    assert not follower.look() and "of another version" in follower.adoption.reason
