@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.calibration.correction import geometry_of
-from mapweave.agent.calibration.parameter_sigmas import MODEL_SIGMAS
+from mapweave.agent.calibration.parameter_sigmas import MODEL_SIGMAS, PRIOR_SIGMAS
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.pose import Array
@@ -125,4 +125,8 @@ def joined(value: float, sigma: float, other: float, its_sigma: float, p: Parame
     """
     weight, its_weight = sigma**-2, its_sigma**-2
     mean = (weight * value + its_weight * other) / (weight + its_weight)
-    return mean, max(math.sqrt(1.0 / (weight + its_weight)), float(MODEL_SIGMAS[p]))
+    alike = float(MODEL_SIGMAS[p])
+    if p is P.WHEEL_SCALE:
+        # The declared height of the camera is the same on each drive.
+        alike = math.hypot(alike, PRIOR_SIGMAS[P.HEIGHT])
+    return mean, max(math.sqrt(1.0 / (weight + its_weight)), min(alike, sigma, its_sigma))

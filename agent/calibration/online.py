@@ -63,13 +63,12 @@ by chance, more do not bear out. Without, one of nine simulated robots got three
 WORTH = np.full(COUNT, 2.0)
 """A change is put to use if it is larger than so many useful sigmas, and sure enough to be named."""
 WORTH[P.WHEEL_SCALE] = 1.0
-"""Two lengths that agree are used as soon as they are sure enough to name the wheels."""
+"""Wheels are corrected as soon as they are named."""
 
 NAMED_ONLY = [p for p in Parameter if p not in (P.FORWARD, P.HEADING, P.PITCH, P.DELAY)]
-"""Named, but not used by themselves. The wheels' scales and drift are what all else is measured by, and the
-floor shows the height only as a multiple of the way: on KITTI 03, where the road is not flat, the scale is up
-to 8 % off in the middle of the drive. A camera aside or rolled shows too weakly. Only where proximity sensors
-bear out what the floor shows, two lengths against one, is the wheels' scale used."""
+"""Named, but not used by themselves. The wheels' scales and drift are what all else is measured by; a camera
+aside or rolled shows too weakly. Of these only the wheels' scale is used, where the floor shows it, and
+proximity sensors, if there are any, bear it out. The floor shows it for the height that is declared."""
 
 
 class OnlineCalibration:
@@ -283,16 +282,17 @@ class OnlineCalibration:
             & (off > WORTH * useful(estimate.declared))
             & (off > SIGNIFICANT * np.hypot(estimate.sigmas, np.where(self._earlier, self._sigmas, 0.0)))
         )
-        named_only = [p for p in NAMED_ONLY if not (p is P.WHEEL_SCALE and estimate.lengths is Lengths.BOTH)]
+        by_floor = estimate.lengths in (Lengths.FLOOR, Lengths.BOTH)
+        named_only = [p for p in NAMED_ONLY if not (p is P.WHEEL_SCALE and by_floor)]
         change[named_only] = False
         change &= self._lasting(change, self._changed_since)
         if not change.any():
             return
         # What is shown but differs less goes along: the estimates belong together. The wheels' scale brings
-        # nothing along: only lengths tell of it.
+        # nothing along and does not go along: only lengths tell of it.
         belongs = change.any(where=np.arange(COUNT) != P.WHEEL_SCALE)
         along = belongs & estimate.shown & settled & (off > estimate.sigmas)
-        along[named_only] = False
+        along[[*named_only, P.WHEEL_SCALE]] = False
         self._next = DriveGeometry.of(np.where(change | along, estimate.vector, target))
         self._note(change | along, change, target, estimate)
         self.pending = (*corrected(self._declared, self._next), frame_change(self._geometry, self._next))

@@ -9,8 +9,8 @@ is that of the trajectory of all images against truth.csv after one rigid alignm
 know where it is the wheels lead on. error_ratio is the worst error over that with the right geometry,
 wheels_ratio the worst error over that of dead reckoning by the wheels with the same declared geometry,
 rpe_m and wheels_rpe_m the error of the motion over each metre, root mean square, diagnosed whether every
-wrong parameter was named while mapping. The scale of the wheels is named but never corrected while mapping
-(see docs/calibrate-drive.md), so its ratio shows what the wheels' own error costs.
+wrong parameter was named while mapping. What was mapped before the wheels' scale is corrected keeps the scale
+(see docs/calibrate-drive.md), and so does the trajectory.
 
 With --seed the wheels are simulated: the increments of truth.csv with 2 % of noise a step and 1 % a drive on
 the way, 0.15 degrees a step and 0.01 degrees a step all along on the turn.

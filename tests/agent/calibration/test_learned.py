@@ -98,6 +98,8 @@ def test_two_estimates_are_joined_as_least_squares_do() -> None:
     assert value == pytest.approx(((design.T * weights) @ [0.8, 1.0] / normal[0, 0]).item())
     assert sigma == pytest.approx(math.sqrt(1.0 / normal[0, 0]))
     assert joined(0.8, 0.011, 0.8, 0.011, P.FORWARD)[1] == pytest.approx(0.01)
+    # Both by the floor and one declared height.
+    assert joined(0.05, 0.0123, 0.05, 0.0123, P.WHEEL_SCALE)[1] == pytest.approx(math.hypot(0.005, 0.01))
 
 
 @pytest.mark.parametrize(
