@@ -319,3 +319,27 @@ def test_what_a_leader_publishes_is_stored_whole(address: str, monkeypatch: pyte
     assert all(len({*values}) <= 1 for values in seen), "all at once"
     other.close()
     leader.close()
+
+
+def test_no_commit_of_changes_waits_for_what_a_leader_publishes(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """One is made while the other transaction is open, and is there before that is."""
+    leader = PostgresStore(address, "s0")
+    leader.follow(lambda news: None)
+    eventually(lambda: leader.leads)
+    execute, done = psycopg.Connection.execute, list[tuple[object, bytes | None]]()
+
+    def publishing(connection: psycopg.Connection, query: Any, *rest: Any, **how: Any) -> Any:
+        result = execute(connection, query, *rest, **how)
+        if query == postgres_follower.PUBLISH:
+            (applied,) = leader.apply_all([LogChanges(MAP, 5, [entry(1)])])
+            done.append((applied, leader.result("a")))
+        return result
+
+    monkeypatch.setattr(psycopg.Connection, "execute", publishing)
+    leader.publish({"a": bytes(5_000_000)})
+    eventually(lambda: leader.result("a"))
+    ((applied, published),) = done
+    assert isinstance(applied, Applied) and applied.watermark == 1 and published is None
+    leader.close()
