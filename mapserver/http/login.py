@@ -37,7 +37,7 @@ LONGEST_LOGIN = 1024
 PUBLIC = ""
 """In place of a question: it needs no login."""
 READ_ONLY = (
-    "This is a map file, which is only shown. Commands such as mapweave map link --map FILE -o OUT write a "
+    "This is a map file, which is only shown. In a shell, mapweave map link, retire and others write a "
     "corrected copy."
 )
 PERSON = "mapweave.person"
@@ -220,7 +220,7 @@ def why_not(person: Person, question: str) -> str:
     if question in may_ask(person.role):
         return ""
     if not person.name:
-        return "Missions and corrections come from the server's own machine alone: start it with --keys."
+        return "Missions and corrections come from the server's own machine alone, until the server has keys."
     if question in COMMANDS:
         return f"You are {person.name}, a {person.role}: missions and corrections need an operator."
     return f"You are {person.name}, a {person.role}, which may not ask for {question}."

@@ -8,8 +8,10 @@ from urllib.request import urlopen
 
 import pytest
 
+from mapweave.mapserver.http.login import READ_ONLY, Person, why_not
 from mapweave.mapserver.http.pages import STATIC, WORKERS
 from mapweave.mapserver.http.web import Web
+from mapweave.wire.credentials import Role
 from tests.mapserver.stub_services import StubServices
 from tests.waiting import eventually
 
@@ -34,6 +36,18 @@ def test_the_browser_asks_for_all_modules_at_once(served: Web) -> None:
     for wrong in ("none.js", "..%2fweb.py", "page.js/x"):
         with pytest.raises(HTTPError, match="404"):
             urlopen(f"{root}/static/{wrong}", timeout=10)
+
+
+def test_the_page_names_no_options_of_commands() -> None:
+    """A person at the page has none: what may not be done there is said in words."""
+    files = (path for path in STATIC.iterdir() if path.suffix in {".html", ".js"})
+    said = {"map file": READ_ONLY, **{path.name: path.read_text(encoding="utf-8") for path in files}}
+    for name in ("", "anna"):
+        for role in Role:
+            said[f"{name} {role}"] = why_not(Person(name, role), "give")
+    for where, words in said.items():
+        assert not re.search(r"(^|[\s`(])--[a-z]", words), where
+    assert "until the server has keys" in said[f" {Role.VIEWER}"]
 
 
 def luminance(colour: str) -> float:
