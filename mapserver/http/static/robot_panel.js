@@ -7,11 +7,17 @@ const QUIET = 5; // s without a status
 const KINDS = { sent: "good", running: "good", done: "good", failed: "bad", refused: "bad", replaced: "warn" }; // of missions
 let panel = null;
 
-export function poseOf(robot, model) {
-  if (!robot.merged_from_robot || robot.component < 0) return null;
-  const [x, y, heading] = model.placed(robot.merged_from_robot, robot.component);
-  return { name: robot.robot, alive: robot.alive, x, y, heading, doing: robot.status?.status.doing || "",
-    ellipse: ellipseOf(robot.status?.status.covariance) };
+const known = new Map(); // robot: its last pose, and the anchor of the component in which that is
+
+// Where a robot is drawn; while it does not know where it is, where it was last, in grey.
+export function poseOf({ robot: name, alive, merged_from_robot: pose, component, status }, model) {
+  const there = Boolean(pose) && component >= 0;
+  if (there) known.set(name, { pose, anchor: model.components[component]?.anchor });
+  const last = known.get(name), number = there ? component : model.components.findIndex(one => one.anchor === last?.anchor);
+  if (!last || number < 0) return null;
+  const [x, y, heading] = model.placed(last.pose, number);
+  return { name, alive: alive && there, x, y, heading, doing: there ? status?.status.doing || "" : "was here last",
+    ellipse: there ? ellipseOf(status?.status.covariance) : null };
 }
 // Axes of the covariance [xx, xy, yy, heading] of the position, in the robot's frame.
 function ellipseOf(covariance) {

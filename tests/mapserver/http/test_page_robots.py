@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -99,6 +100,25 @@ def test_the_selected_robot_stays_in_view(person: Person, services: DrivenServic
     services.fleet = robot_at(80.0, 0.0)
     eventually(lambda: person.page.run("return mapweave.painter.robots[0].x") == 80.0)
     assert person.page.run(VIEW) == before
+
+
+def test_a_robot_that_does_not_know_where_it_is_stays_where_it_was_last(
+    person: Person, services: DrivenServices
+) -> None:
+    """As at the beginning of each drive: it vanished from the map."""
+    drawn = (
+        "const { robots, labels } = mapweave.painter;"
+        "return [robots.map(({ x, y, alive, ellipse }) => [x, y, alive, Boolean(ellipse)]),"
+        " labels.texts.map(one => one.text).find(text => text.startsWith('r0:'))]"
+    )
+    services.fleet = robot_at(0.5, 0.25)
+    eventually(lambda: person.page.run(drawn) == [[[0.5, 0.25, True, True]], "r0: driving"])
+    (robot,) = services.fleet.robots
+    services.fleet = FleetStatus((replace(robot, merged_from_robot=None, component=-1),))
+    eventually(lambda: person.page.run(drawn) == [[[0.5, 0.25, False, False]], "r0: was here last"])
+    assert "not on the map" in person.text("robots")
+    services.fleet = robot_at(0.7, 0.25)
+    eventually(lambda: person.page.run(drawn) == [[[0.7, 0.25, True, True]], "r0: driving"])
 
 
 def test_a_click_on_a_robot_moves_no_map(person: Person) -> None:
