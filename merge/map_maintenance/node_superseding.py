@@ -46,7 +46,6 @@ from mapweave.hybridmap.superseding import (
 from mapweave.merge.map_maintenance.adjacency import Adjacency
 from mapweave.merge.map_maintenance.comparisons import Comparisons
 from mapweave.merge.map_maintenance.node_age import is_older
-from mapweave.merge.map_maintenance.superseding_log import SupersedingLog
 from mapweave.merge.map_maintenance.traversability import ForeignEdges, Traversability
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link
@@ -96,7 +95,6 @@ class NodeSuperseder:
         self._blocking: dict[NodeId, NodeId] = {}
         self._unsure: Set[MapId] = frozenset()
         self._linked: Set[Pair] = frozenset()
-        self._log = SupersedingLog()
 
     @property
     def state(self) -> Superseding:
@@ -114,7 +112,6 @@ class NodeSuperseder:
         """
         self._superseded, self._nodes_seen = dict(state.superseded), dict(state.judged)
         self._linked, self._unsure = state.linked, state.unsure
-        self._log = SupersedingLog({node.map for node in state.judged})
 
     def renewed(self, merged: MergedMap, unsure: Set[MapId] = frozenset()) -> MergedMap:
         """The same map with the nodes that are superseded.
@@ -129,17 +126,8 @@ class NodeSuperseder:
         changed = {node for node, content in nodes.items() if self._nodes_seen.get(node) is not content}
         self._nodes_seen |= nodes
         come = [link.pair for link in self._links.follow(merged.links)]
-        come = [pair for pair in come if pair not in self._linked]
+        fresh = {node for pair in come if pair not in self._linked for node in pair}
         self._linked = frozenset()
-        since = self._log.follow(merged, unsure)
-        if since is not None:
-            # What others have superseded among each other does not depend on a map that is not with them.
-            maps = {node.map for node in nodes}
-            undone = self._log.undo(since, self._superseded, nodes, maps)
-            changed |= undone.judged
-            come += [pair for pair in undone.linked if self._links.between(*pair) is not None]
-        before = dict(self._superseded)
-        fresh = {node for pair in come for node in pair}
         fresh = changed | fresh & nodes.keys() | {node for node in nodes if node.map in differ}
         # A node that was written again is judged again, with those that it covers.
         for node, successor in tuple(self._superseded.items()):
@@ -167,7 +155,6 @@ class NodeSuperseder:
                 unsure,
             )
             round_.update(fresh | round_.reinstate())
-        self._log.note(before, self._superseded, changed, come)
         return replace(merged, superseded=dict(sorted(self._superseded.items())))
 
     def _changed(self, merged: MergedMap, differ: Set[MapId]) -> dict[NodeId, Node]:
