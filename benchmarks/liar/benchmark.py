@@ -16,7 +16,7 @@ cannot be found out (`UNDECIDABLE`): they are measured, and not counted.
 
 With `--rules` all ways that can be found out are tried with all rules, and without each. With `--margins` the
 ways of `margins.py` are, each without the one rule that contains it. With `--recovery` a person retires what
-the robot that lies has sent: then the three have what they had without it, node by node.
+the robot that lies has sent, and the three are compared, node by node, with what they had without it.
 """
 
 from __future__ import annotations
