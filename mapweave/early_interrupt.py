@@ -45,14 +45,14 @@ def _interrupt(signum: int, frame: FrameType | None) -> None:
 
 
 def _raise_again_what_is_dropped() -> None:
-    before = sys.unraisablehook
+    before, main = sys.unraisablehook, threading.get_ident()
 
     def hook(dropped: UnraisableHookArgs) -> None:
         if not issubclass(dropped.exc_type, KeyboardInterrupt):
             before(dropped)
             return
-        # Not here: this is still within what drops it.
-        again = threading.Timer(AGAIN, signal.raise_signal, (signal.SIGINT,))
+        # Not here: this is still within what drops it. To the main thread, whose system call it has to end.
+        again = threading.Timer(AGAIN, signal.pthread_kill, (main, signal.SIGINT))
         again.daemon = True
         again.start()
 

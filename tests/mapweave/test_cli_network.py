@@ -347,12 +347,13 @@ early_interrupt.remember()
 class Lock: pass
 lock = Lock()
 reference = weakref.ref(lock, lambda _: signal.raise_signal(signal.SIGINT))
+began = time.monotonic()
 try:
     del lock
     time.sleep(20)
     print("went on")
 except KeyboardInterrupt:
-    print("interrupted")
+    print("interrupted" if time.monotonic() < began + 10 else "interrupted late")
 class Other:
     def __del__(self): raise ValueError("of its own")
 del reference
