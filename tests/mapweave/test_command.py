@@ -317,7 +317,7 @@ def answer_with(monkeypatch: pytest.MonkeyPatch, found: list[FleetStatus | NotCo
             raise one
         return one
 
-    fleet = SimpleNamespace(status=answer)
+    fleet = SimpleNamespace(status=answer, servers=list)
     monkeypatch.setattr(status_command, "fleet_of", lambda arguments: nullcontext(fleet))
 
 

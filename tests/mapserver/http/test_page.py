@@ -159,6 +159,7 @@ def test_nodes_are_named_and_found_in_coordinates_of_a_plan(
     page.run(search.format("ground floor 500,500"))
     says = page.run("return document.getElementById('query').validationMessage")
     assert says == "Nothing is mapped within 2 m of ground floor 500,500."
+    eventually(lambda: page.run("return document.querySelector('#robots button') !== null"))
     page.run("document.querySelector('#robots button').click(); document.getElementById('goal').value = ''")
     page.type("#via", f"r0.1.1, {words}, r0.1.7")
     page.type("#goal", f"{words}\n")
