@@ -54,6 +54,7 @@ from benchmarks.shards.ray_nodes import RayNodes
 from benchmarks.shards.servers import MapServers
 from benchmarks.shards.shared_store import SharedStore, can_be_shared
 from mapweave.hybridmap.change import EdgePut
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.scenarios.children import ChildFailed
 from mapweave.storage.map_file import MapFile
 
@@ -71,10 +72,8 @@ AFTER = 4.0
 
 def links_of(content: MapFile) -> set[tuple[str, str]]:
     """Pairs of nodes that are linked across maps, or by a loop."""
-    edges = [body.edge for body in content.changes if isinstance(body, EdgePut)]
-    return {
-        (str(edge.a), str(edge.b)) for edge in edges if edge.kind.name == "LINK" or edge.a.map != edge.b.map
-    }
+    edges = (body.edge for body in content.changes if isinstance(body, EdgePut))
+    return {(str(edge.a), str(edge.b)) for edge in edges if edge.kind is EdgeKind.MERGED}
 
 
 def compared(content: MapFile, reference: MapFile) -> dict[str, Any]:
@@ -126,7 +125,7 @@ def measure(
         merge_s = time.monotonic() - began
         for robot in robots:
             robot.close()
-        contents = servers.maps()
+        contents = servers.maps(fleet.edges)
         askers = Askers(fleet, servers.endpoint, o.askers)
         time.sleep(o.seconds)
         tally = askers.close()
@@ -191,7 +190,7 @@ def killed(
         late |= unacknowledged(robots)
         if not late:
             servers.wait(len(fleet.nodes))
-        contents = servers.maps()
+        contents = servers.maps(fleet.edges)
         tally = askers.close()
         for robot in robots:
             robot.close()

@@ -10,7 +10,7 @@ import numpy as np
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
-from mapweave.hybridmap.change import ChangeBody, NodePut
+from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RelocalizeAnswer
@@ -34,6 +34,7 @@ class BuildingFleet:
         building: with the truth.
         logs: of each robot.
         nodes: of all robots.
+        edges: how many they have measured.
     """
 
     def __init__(self, robots: int, nodes: int, seed: int) -> None:
@@ -49,6 +50,7 @@ class BuildingFleet:
             list(self.building.log(robot)) for robot in range(robots)
         ]
         self.nodes = [body.node for log in self.logs for _, body in log if isinstance(body, NodePut)]
+        self.edges = len({body.edge.id for log in self.logs for _, body in log if isinstance(body, EdgePut)})
         self._seed = seed
 
     def write(self, address: Path | str, robots: Sequence[int]) -> None:

@@ -10,6 +10,8 @@ from benchmarks.shards.askers import ASK_WITHIN, PATIENCE
 from benchmarks.shards.fleet import FLEET
 from benchmarks.shards.ray_nodes import RayNodes, descendants
 from benchmarks.shards.shared_store import SharedStore
+from mapweave.hybridmap.change import EdgePut
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, unpack_map_file
 from mapweave.wire.bus_settings import BusSettings
@@ -91,10 +93,28 @@ class MapServers:
                     if not reply.error:
                         status = decode_record(reply.payload)
 
-    def maps(self) -> list[MapFile]:
-        """The merged map of each."""
-        keys = [Keys(FLEET).server_map(name) for name in self.names]
-        return [unpack_map_file(self._bus.ask(key, b"", PATIENCE)[0].payload) for key in keys]
+    def maps(self, edges: int) -> list[MapFile]:
+        """The merged map of each, with so many edges of robots, once it is settled.
+
+        An edge comes behind its nodes. What one server acknowledges, another one that shares its store may
+        not have read yet.
+
+        Raises:
+            SystemExit: one does not have them in time.
+        """
+        return [self._map(name, edges, time.monotonic() + PATIENCE) for name in self.names]
+
+    def _map(self, name: str, edges: int, end: float) -> MapFile:
+        while True:
+            content = unpack_map_file(self._bus.ask(Keys(FLEET).server_map(name), b"", PATIENCE)[0].payload)
+            puts = (body.edge.kind for body in content.changes if isinstance(body, EdgePut))
+            known = sum(kind is not EdgeKind.MERGED for kind in puts)
+            if known >= edges:
+                return content
+            if time.monotonic() > end:
+                raise SystemExit(f"server {name} has {known} of {edges} edges after {PATIENCE:g} s")
+            time.sleep(0.1)
+            self.wait(0)
 
     def _start(self, name: str) -> None:
         ray = [] if self._cluster is None else ["--ray", self._cluster.address]
