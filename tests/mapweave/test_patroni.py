@@ -78,8 +78,9 @@ class Robot:
 
 
 def stored(cluster: PatroniCluster) -> dict[MapId, list[tuple[int, bytes]]]:
-    """All that the primary has."""
-    with closing(PostgresStore(cluster.address("maps"), read_only=True)) as store:
+    """All that the primary has. Who only reads may read from a standby, which may lag behind."""
+    primary = f"{cluster.address('maps')}?target_session_attrs=read-write"
+    with closing(PostgresStore(primary, read_only=True)) as store:
         return {m: [(c.sequence, encode_change(c)) for c in store.replay(m)] for m in store.maps()}
 
 
