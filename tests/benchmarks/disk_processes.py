@@ -31,7 +31,8 @@ from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.postgres_server import PostgresServer
 from tests.waiting import eventually, free_port
 
-SEED, INTERVAL = 7, 0.02
+SEED, INTERVAL = 7, 0.1
+"""Of the robot; the second is s between two steps: it stays below the server's quota of changes."""
 PATIENCE = 90.0
 FULL = {"sqlite": "the disk is full", "postgresql": "No space left on device"}
 """What is said of a full disk; PostgreSQL's words are its own."""
