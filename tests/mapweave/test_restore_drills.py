@@ -91,7 +91,7 @@ class Fleet:
 def shown(address: str, capsys: pytest.CaptureFixture[str]) -> str:
     """The content hash that `mapweave map show` prints."""
     capsys.readouterr()
-    assert main(["map", "show", address]) == 0
+    assert main(["map", "show", address, "--no-picture"]) == 0
     (line,) = [line for line in capsys.readouterr().out.splitlines() if "content hash" in line]
     return line.split()[-1]
 
