@@ -11,7 +11,7 @@ import numpy as np
 from mapweave.hybridmap.annotation import BODIES, Annotation, Annotations, Body, Place
 from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.floor_plan import IDENTITY, PlacedPlan, PlacedPlans, PlanPart
+from mapweave.hybridmap.floor_plan import PlacedPlan, PlacedPlans, PlanPart
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.named_nodes import Resolve
@@ -123,8 +123,10 @@ def body_of_words(
             raise InvalidValue(f"plan {placed.name} says where {word} is on it: leave the pose out")
         if "merged_from_node" not in plain:
             found = _found(word, near or "", resolve)
-            frame = IDENTITY if placed is None else placed.part(found.component).plan_from_merged
-            plain["merged_from_node"] = packed(frame @ found.merged_from_node)
+            pose = found.merged_from_node
+            if placed is not None:
+                pose = placed.part(found.component).plan_from_merged @ pose
+            plain["merged_from_node"] = packed(pose)
     body = {name: _node(value, name, near, resolve) for name, value in plain.items()}
     unknown = body.keys() - BODIES[kind].__dataclass_fields__.keys() - {"kind"}
     if unknown:
