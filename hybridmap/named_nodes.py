@@ -36,17 +36,22 @@ def asked_of(words: ResolveRequest | str | Iterable[str]) -> ResolveRequest:
     return ResolveRequest((words,) if isinstance(words, str) else tuple(words))
 
 
-def ids_of(words: Iterable[str], resolve: Resolve) -> list[str]:
+def ids_of(words: Iterable[str], resolve: Resolve, near: str = "") -> list[str]:
     """An id for each word: nodes (`r0.1.17`) and maps (`r0.1`) as they are, active nodes for all else.
 
     Ids are not looked up: a retired node has no place in the map, and can be taken back all the same.
+
+    Args:
+        words: as people write them.
+        resolve: returns nodes for words.
+        near: a node or place in the component in whose frame positions are; empty: the largest one.
 
     Raises:
         InvalidValue: a word is neither an id, nor the name of a place, nor a position.
     """
     written = [word.strip() for word in words]
     asked = tuple(dict.fromkeys(word for word in written if not _is_id(word)))
-    found = resolve(ResolveRequest(asked)).found if asked else ()
+    found = resolve(ResolveRequest(asked, near)).found if asked else ()
     ids = {word: str(one.node) for word, one in zip(asked, found, strict=True)}
     return [ids.get(word, word) for word in written]
 

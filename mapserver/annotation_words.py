@@ -19,7 +19,7 @@ from mapweave.hybridmap.query import Resolved, ResolveRequest
 from mapweave.hybridmap.wall_time import read_time
 from mapweave.mapserver.field_words import field_words
 from mapweave.mapserver.places import others_of, position_of
-from mapweave.mapserver.plan_answers import goal_on_plan, in_merged, near_part
+from mapweave.mapserver.plan_answers import goal_on_plan, in_merged, near_part, part_near
 from mapweave.wire.typed import packed, value_of
 
 NODES = ("node", "anchor", "a", "b", "merged_from_node")
@@ -89,7 +89,7 @@ def body_of_words(
     plan = plain.pop("plan", None) if kind != "plan" else None
     placed = None if plan is None else plans().plan(str(plan))
     if placed is not None and kind != "pin":
-        part = placed.part(_found(near, "", resolve).component if near else None)
+        part = part_near(placed, near or "", resolve)
         near = near or near_part(part)
         plain = {name: _off_plan(value, name, placed, part, resolve) for name, value in plain.items()}
         if corners is not None:

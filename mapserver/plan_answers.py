@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -121,6 +121,27 @@ def goal_on_plan(goal: str, plan: PlacedPlan, component: int, resolve: Resolve) 
             f"{found.node}, {away:.1f} m away at {nearest.x:.1f},{nearest.y:.1f}"
         )
     return str(found.node)
+
+
+def part_near(plan: PlacedPlan, near: str, resolve: Resolve) -> PlanPart:
+    """The part of the map under which positions on a plan are meant.
+
+    Args:
+        plan: under the merged map.
+        near: a node or place in this part; empty: the one with most pairs of the plan.
+        resolve: returns nodes for words.
+
+    Raises:
+        InvalidValue: `near` is not there.
+        Refused: the plan does not lie there.
+    """
+    return plan.part(resolve(ResolveRequest((near,))).found[0].component if near else None)
+
+
+def off_plan(words: Iterable[str], plan: PlacedPlan, near: str, resolve: Resolve) -> list[str]:
+    """Words with nodes in the place of positions on a plan; see `goal_on_plan` and `part_near`."""
+    component = part_near(plan, near, resolve).component
+    return [goal_on_plan(word, plan, component, resolve) for word in words]
 
 
 def nodes_on_plan(nodes: Sequence[NodeId], plan: PlacedPlan, resolve: Resolve) -> list[Pose2 | None]:

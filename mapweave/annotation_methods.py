@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence
 from typing import Any, Literal
 
-from mapweave.hybridmap.floor_plan import PlanImage
+from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.named_nodes import ids_of
 from mapweave.hybridmap.pose import Pose2
@@ -45,6 +45,10 @@ class AnnotationMethods(ABC):
     @abstractmethod
     def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
         """Nodes for words."""
+
+    @abstractmethod
+    def plans(self) -> PlacedPlans:
+        """Floor plans, and where they lie under the merged map."""
 
     def place(
         self,
@@ -142,9 +146,32 @@ class AnnotationMethods(ABC):
         fields = {**_where(edge, place, node, radius, corners, near, plan), "factor": factor}
         return self.annotate("preference", name, because, check=check, **fields)
 
-    def floor(self, node: NodeWord, label: str, *, because: str = "", check: bool = False) -> str:
-        """Label the map of a node with its floor; a label that parts maps needs a reason."""
-        (own,) = ids_of([_word(node)], self.resolve)
+    def floor(
+        self,
+        node: NodeWord,
+        label: str,
+        *,
+        near: str = "",
+        plan: str | None = None,
+        because: str = "",
+        check: bool = False,
+    ) -> str:
+        """Label the map of a node with its floor; a label that parts maps needs a reason.
+
+        Args:
+            node: any of the map.
+            label: of the floor.
+            near: see `place`.
+            plan: see `place`.
+            because: why.
+            check: only say what it would do.
+        """
+        words = [_word(node)]
+        if plan is not None:
+            from mapweave.mapserver.plan_answers import off_plan
+
+            words = off_plan(words, self.plans().plan(plan), near, self.resolve)
+        (own,) = ids_of(words, self.resolve, near)
         name = str(NodeId.parse(own).map)
         return self.annotate("floor", name, because, check=check, node=own, label=label)
 
@@ -156,11 +183,26 @@ class AnnotationMethods(ABC):
         means: Literal["lift", "ramp", "door"],
         note: str = "",
         *,
+        near: str = "",
+        plan: str | None = None,
         because: str = "",
         check: bool = False,
     ) -> str:
-        """Add a lift, a ramp or a door between two nodes; the note is for who takes robots through."""
-        fields = {"a": _word(a), "b": _word(b), "means": str(means), "note": note}
+        """Add a lift, a ramp or a door between two nodes.
+
+        Args:
+            name: of the portal.
+            a: node at one side.
+            b: at the other side.
+            means: what it is.
+            note: for who takes robots through.
+            near: see `place`.
+            plan: see `place`; a node that is not on it is given by its id or a name.
+            because: why.
+            check: only say what it would do.
+        """
+        given = _given(near=near, plan=plan)
+        fields = {"a": _word(a), "b": _word(b), "means": str(means), "note": note, **given}
         return self.annotate("portal", name, because, check=check, **fields)
 
     def plan(

@@ -266,6 +266,7 @@ class Map(ABC):
         blocked: Iterable[tuple[NodeName, NodeName]] = (),
         via: Iterable[NodeName] = (),
         plan: str | None = None,
+        near: str = "",
     ) -> RouteExplanation:
         """The way that a robot would drive, step by step, or why there is none.
 
@@ -274,7 +275,9 @@ class Map(ABC):
             goal: another one.
             blocked: as if a robot could not get through between these.
             via: what to pass before, in order.
-            plan: a floor plan, in whose frame positions are then, under the component with most of its pairs.
+            plan: a floor plan, in whose frame positions are then.
+            near: in the part of the map where this node or place is; without, in the largest one, with a
+                plan in that with most of its pairs.
 
         Raises:
             InvalidValue: one place is given for a list of places, or for a pair.
@@ -286,11 +289,10 @@ class Map(ABC):
             raise InvalidValue("`blocked` is a list of pairs of nodes")
         words = [*stops, *(end for pair in pairs_of_names for end in pair)]
         if plan is not None:
-            from mapweave.mapserver.plan_answers import goal_on_plan
+            from mapweave.mapserver.plan_answers import off_plan
 
-            placed = self.plans().plan(plan)
-            words = [goal_on_plan(str(w), placed, placed.part().component, self.resolve) for w in words]
-        nodes = self._named(*words)
+            words = [*off_plan(map(str, words), self.plans().plan(plan), near, self.resolve)]
+        nodes = self._named(*words, near=near)
         stopping, closed = nodes[: len(stops)], nodes[len(stops) :]
         pairs = tuple(zip(closed[::2], closed[1::2], strict=True))
         legs = []
@@ -331,13 +333,13 @@ class Map(ABC):
         assert isinstance(explanation, FleetExplanation), "maps were asked for"
         return explanation.maps
 
-    def _named(self, *names: NodeName) -> list[NodeId]:
-        """The nodes for names.
+    def _named(self, *names: NodeName, near: str = "") -> list[NodeId]:
+        """The nodes for names; positions are in the component of `near`, see `ids_of`.
 
         Raises:
             Refused: one is none.
         """
-        return [NodeId.parse(word) for word in ids_of(map(str, names), self.resolve)]
+        return [NodeId.parse(word) for word in ids_of(map(str, names), self.resolve, near)]
 
     def _frame(self, component: int | None, plan: str | None) -> tuple[int, Pose2]:
         """A component, and what takes its coordinates to those of a plan.

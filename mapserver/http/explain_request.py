@@ -3,6 +3,7 @@
 /explain                       each two maps of the fleet
 /explain?a=r0.1&b=r1.1         two maps, or two nodes, places or positions
 /route?a=r0.1.17&b=kitchen     a route; with &via=PLACE, also several times, over these in order
+/route?a=1,2&b=3,4&near=r1.1.5 positions in the part of the map of this node or place, not in the largest one
 """
 
 from __future__ import annotations
@@ -33,10 +34,10 @@ def read_questions(path: str, query: QueryParams, resolve: Resolve) -> list[Expl
     if not query and not route:
         return [ExplainRequest()]
     via = query.getlist("via") if route else []
-    if query.keys() - ({"via"} if route else set()) != {"a", "b"}:
-        more = "; for a route also &via=PLACE" if route else ""
+    if query.keys() - ({"via", "near"} if route else set()) != {"a", "b"}:
+        more = "; for a route also &via=PLACE and &near=PLACE" if route else ""
         raise InvalidValue(f"write {path}?a=r0.1.17&b=r1.1.5: {EXAMPLE}{more}")
     if len(via) > MAX_VIA:
         raise InvalidValue(f"a route passes at most {MAX_VIA} places, not {len(via)}")
-    stops = ids_of([query["a"], *via, query["b"]], resolve)
+    stops = ids_of([query["a"], *via, query["b"]], resolve, query.get("near", ""))
     return [ExplainRequest(read_ends(a, b), route) for a, b in pairwise(stops)]

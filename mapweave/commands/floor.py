@@ -6,7 +6,13 @@ import argparse
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_record_options, print_entries, record_of
+from mapweave.commands.annotating import (
+    add_near,
+    add_plan_option,
+    add_record_options,
+    print_entries,
+    record_of,
+)
 from mapweave.commands.answer import print_said
 from mapweave.commands.usage import UsageError
 
@@ -23,9 +29,11 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument("label", nargs="?", type=values.title, metavar="NAME", help="of the floor")
     parser.add_argument(
-        "node", type=values.node, metavar="NODE|PLACE", help="any node of the map; `list` alone lists all"
+        "node", type=values.node, metavar="NODE|PLACE|X,Y", help="any node of the map; `list` alone lists all"
     )
     parser.add_argument("--undo", action="store_true", help="take it back")
+    add_near(parser)
+    add_plan_option(parser)
     add_record_options(parser, changes=True)
     parser.set_defaults(run=run)
 
@@ -34,13 +42,17 @@ def run(arguments: argparse.Namespace) -> int:
     """Label a map, or withdraw its label."""
     from mapweave.hybridmap.annotation import Floor
     from mapweave.hybridmap.query import ResolveRequest
+    from mapweave.mapserver.plan_answers import off_plan
 
     if (arguments.label, arguments.node, arguments.undo) == (None, "list", False):
         return print_entries(arguments, "floors", Floor, "no map has a label yet: mapweave floor NAME NODE")
     if (arguments.label is None) != arguments.undo:
         raise UsageError("give the name of a floor and a node; with --undo a node alone")
     with record_of(arguments) as record:
-        node = record.resolve(ResolveRequest((arguments.node,))).found[0].node
+        words, near = [arguments.node], arguments.near or ""
+        if arguments.plan is not None:
+            words = off_plan(words, record.plans().plan(arguments.plan), near, record.resolve)
+        node = record.resolve(ResolveRequest(tuple(words), near)).found[0].node
         name, because = str(node.map), arguments.because
         if arguments.undo:
             said = [record.withdraw("floor", name, because, check=arguments.check)]

@@ -44,18 +44,21 @@ def different_ends_of(words: list[str]) -> Ends:
     return ends
 
 
-def resolved(arguments: argparse.Namespace, words: list[str], router: Router | None = None) -> list[str]:
+def resolved(
+    arguments: argparse.Namespace, words: list[str], router: Router | None = None, near: str = ""
+) -> list[str]:
     """Words with active nodes in the place of named places and positions; nodes and maps as they are.
 
     Args:
         arguments: of the command line; with `map`, of this file, else of a running server.
         words: as people write them.
         router: of the map of `map`, if it is there already.
+        near: a node or place in the part of the map where positions are; empty: the largest part.
 
     Raises:
         MapweaveError: a word is none of these, or no server answers.
     """
-    return ids_of(words, names_of(arguments, router)[1])
+    return ids_of(words, names_of(arguments, router)[1], near)
 
 
 def names_of(arguments: argparse.Namespace, router: Router | None = None) -> tuple[Record, Resolve]:

@@ -7,6 +7,8 @@ from typing import Any
 
 from mapweave.commands import values
 from mapweave.commands.annotating import (
+    add_near,
+    add_plan_option,
     add_record_options,
     add_remove,
     print_entries,
@@ -37,12 +39,14 @@ def add_to(actions: Any) -> None:
     add.add_argument(
         "name", type=values.title, metavar="NAME", help="1 to 64 characters, for example 'east lift'"
     )
-    add.add_argument("a", type=values.node, metavar="A", help="node or place at one side")
+    add.add_argument("a", type=values.node, metavar="A", help="node, place or position at one side")
     add.add_argument("b", type=values.node, metavar="B", help="at the other side")
     add.add_argument("--kind", choices=KINDS, required=True, help="what it is")
     add.add_argument(
         "--note", type=values.note, default="", metavar="TEXT", help="for who takes a robot through"
     )
+    add_near(add)
+    add_plan_option(add)
     add_record_options(add, changes=True)
     add.set_defaults(run=run_add)
 
@@ -65,7 +69,8 @@ def run_add(arguments: argparse.Namespace) -> int:
     if a.a == a.b:
         raise UsageError(f"{a.a} twice: a portal leads from one node to another")
     with record_of(a) as record:
-        fields = {"a": a.a, "b": a.b, "means": a.kind, "note": a.note}
+        given = {name: said for name in ("near", "plan") if (said := getattr(a, name))}
+        fields = {"a": a.a, "b": a.b, "means": a.kind, "note": a.note, **given}
         said = record.annotate("portal", a.name, a.because, check=a.check, **fields)
     print_said(a, said)
     return 0

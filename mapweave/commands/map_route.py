@@ -9,7 +9,7 @@ from itertools import pairwise
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_plan_option
+from mapweave.commands.annotating import add_near, add_plan_option
 from mapweave.commands.answer import add_json
 from mapweave.commands.map_input import SOURCES, map_source, router_of
 from mapweave.commands.network import add_network, add_timeout
@@ -46,6 +46,7 @@ def add_to(actions: Any) -> None:
         help="pass this first: a node, a place or a position; may be given again, in the order of the way",
     )
     parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
+    add_near(parser)
     add_plan_option(parser)
     parser.add_argument("--draw", type=values.png, metavar="PNG", help="draw the way on the map")
     add_json(parser)
@@ -62,7 +63,7 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.extras import need
     from mapweave.hybridmap.explanation import route_over
     from mapweave.mapserver.http.json_values import json_values
-    from mapweave.mapserver.plan_answers import goal_on_plan, nodes_on_plan
+    from mapweave.mapserver.plan_answers import nodes_on_plan, off_plan
 
     if arguments.draw is not None:
         need("viz")
@@ -70,9 +71,10 @@ def run(arguments: argparse.Namespace) -> int:
     words = [*stops, *(word for pair in arguments.blocked for word in pair)]
     router = None if arguments.map is None else router_of(arguments)
     plan, resolve = plan_of(arguments, router), names_of(arguments, router)[1]
+    near = arguments.near or ""
     if plan is not None:
-        words = [goal_on_plan(word, plan, plan.part().component, resolve) for word in words]
-    nodes = list(map(node_of, resolved(arguments, words, router)))
+        words = off_plan(words, plan, near, resolve)
+    nodes = list(map(node_of, resolved(arguments, words, router, near)))
     rest = nodes[len(stops) :]
     blocked = tuple(zip(rest[::2], rest[1::2], strict=True))
     legs = [_explained(arguments, router, *ends, blocked) for ends in pairwise(nodes[: len(stops)])]

@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 import mapweave
 from mapweave.cli import main
 from mapweave.exit_status import NO, USAGE
-from mapweave.hybridmap.annotation import Annotations, Closure, Place
+from mapweave.hybridmap.annotation import Annotations, Closure, Floor, Place
 from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.portal import Portal
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.storage.map_file import read_map_file, write_map_file
 from mapweave.storage.plan_image import plan_file
@@ -159,6 +160,85 @@ def test_a_route_from_position_to_position(planned: Path, capsys: pytest.Capture
     assert "on plan" not in capsys.readouterr().out
     way = room.route(start, at, plan="flat")
     assert str(way.goal) == goal and way.found
+
+
+def test_floors_and_portals_on_the_plan(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    room = mapweave.open(copy)
+    node, at = farthest(room)
+    points, used = on_plan(positions(room)), ~room.nodes.superseded
+    k = next(k for k in np.flatnonzero(used).tolist() if room.nodes.ids[k] != node)
+    other, x, y = str(room.nodes.ids[k]), *points[k]
+    words = ["--map", str(copy), "--plan", "flat"]
+    assert main(["floor", "first", at, *words]) == 0
+    assert main(["map", "portal", "add", "gate", at, f"{x:.3f},{y:.3f}", "--kind", "door", *words]) == 0
+    said = Annotations(read_map_file(copy).annotations)
+    ((_, floor),) = said.in_force(Floor)
+    ((_, gate),) = said.in_force(Portal)
+    assert (str(floor.node), str(gate.a), str(gate.b)) == (node, node, other)
+    assert room.floor(at, "first", plan="flat")
+    assert room.portal("gate", at, f"{x:.3f},{y:.3f}", "door", plan="flat")
+    python = room.annotations()
+    assert [body for _, body in python.in_force(Floor)] == [floor]
+    assert [body for _, body in python.in_force(Portal)] == [gate]
+    assert main(["floor", "--undo", at, *words]) == 0
+    assert Annotations(read_map_file(copy).annotations).in_force(Floor) == ()
+    capsys.readouterr()
+    for command in (
+        ["floor", "first", "40,30"],
+        ["map", "portal", "add", "p", at, "40,30", "--kind", "door"],
+    ):
+        assert main([*command, *words]) == NO
+        assert "of 40,30 on plan flat" in capsys.readouterr().err
+
+
+@pytest.fixture(scope="module")
+def apart(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The maps of two rooms that have nothing in common; the second is the smaller part."""
+    rng = np.random.default_rng(9)
+    tours = {MapId("r0", 1): 6, MapId("r1", 1): 4}
+    maps = {
+        one: changes_of(
+            *take_map(
+                room_of(0, 0, 5, 4, 600, rng), one,
+                [mapweave.Pose2(1.0 + 0.5 * k, 1.5 + 0.1 * k, 0.9 * k) for k in range(stops)], rng,
+            )
+        )
+        for one, stops in tours.items()
+    }  # fmt: skip
+    path = tmp_path_factory.mktemp("map") / "apart.mapweave"
+    write_map_file(path, map_file_of(merger_of(maps).merged()))
+    return path
+
+
+def test_positions_are_in_the_part_of_the_map_that_near_names(
+    apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    room = mapweave.open(apart)
+    of_second = np.array([str(one).startswith("r1.") for one in room.nodes.ids])
+    assert set(room.nodes.component[of_second]) == {1} and set(room.nodes.component[~of_second]) == {0}
+    ids, points = list(map(str, room.nodes.ids)), positions(room)
+    first, last = (k for k in np.flatnonzero(of_second & ~room.nodes.superseded)[[0, -1]].tolist())
+    start, goal = (f"{points[k][0]:.3f},{points[k][1]:.3f}" for k in (first, last))
+    command = ["map", "route", start, goal, "--json", "--map", str(apart)]
+    assert main([*command, "--near", ids[last]]) == 0
+    near = json.loads(capsys.readouterr().out)
+    assert (near["start"], near["goal"]) == (ids[first], ids[last])
+    main(command)
+    far = json.loads(capsys.readouterr().out)
+    assert far["start"].startswith("r0.") and far["goal"].startswith("r0.")
+    way = room.route(start, goal, near=ids[last])
+    assert (str(way.start), str(way.goal)) == (ids[first], ids[last])
+    assert main([*command, "--near", "nowhere"]) == NO
+    assert "'nowhere' is no place of this map" in capsys.readouterr().err
+    path = tmp_path / "copy.mapweave"
+    path.write_bytes(apart.read_bytes())
+    assert main(["floor", "2", start, "--near", ids[last], "--map", str(path)]) == 0
+    ((_, floor),) = Annotations(read_map_file(path).annotations).in_force(Floor)
+    assert str(floor.node) == ids[first]
+    words = ["map", "portal", "add", "gate", start, goal, "--kind", "door", "--map", str(path)]
+    assert main([*words, "--near", ids[last]]) == 0
+    ((_, gate),) = Annotations(read_map_file(path).annotations).in_force(Portal)
+    assert (str(gate.a), str(gate.b)) == (ids[first], ids[last])
 
 
 def test_an_area_of_the_plan_is_retired(copy: Path) -> None:

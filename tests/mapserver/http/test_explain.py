@@ -95,6 +95,7 @@ def test_a_route_leads_over_what_it_must_pass(served: Web) -> None:
     assert all(f"{leg['start']} to {leg['goal']}: {leg['reason']}" in way["reason"] for leg in legs)
     for query, words in (
         (f"?a={start}&b={goal}&via=nowhere", "'nowhere' is no place of this map"),
+        (f"?a=0,0&b={goal}&near=nowhere", "'nowhere' is no place of this map"),
         (f"?a={start}&b={goal}&via=r0.1", "r0.1.1 and r0.1 are a node and a map"),
         (f"?a={start}&via={goal}", "write /route?a=r0.1.17&b=r1.1.5: "),
         (f"?a={start}&b={goal}{17 * f'&via={first}'}", "at most 16 places"),
