@@ -259,9 +259,11 @@ def explained() -> explanation.PairExplanation:
 
 
 def maps_explained() -> explanation.MapsExplanation:
-    """Two maps that are not one."""
+    """Two maps that are one over a third."""
     near = explanation.NearMiss(NODE, FAR, 20, 5, "15 landmarks would have to agree")
-    return explanation.MapsExplanation(MAP, OTHER, False, "no link", 0, 0, 1, 3, (near,), constraints()[:1])
+    return explanation.MapsExplanation(
+        MAP, OTHER, True, "over another", 0, 0, 1, 3, (near,), constraints()[:1], (MapId("r2", 1),)
+    )
 
 
 def map_file() -> MapFile:

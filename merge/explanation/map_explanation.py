@@ -125,8 +125,9 @@ def _explained(
         nearest = _strongest(refused)
         if closely and len(nearest) < MOST_NEAR:
             nearest = (*nearest, *_most_alike(merged, between.unverified))[:MOST_NEAR]
+    over = _over(merged, *pair) if joined and not links else ()
     reason = (
-        _why_joined(merged, *pair, links)
+        _why_joined(merged, *pair, links, over)
         if joined
         else _why_apart(merged, *pair, refused, between.unverified, nearest)
     )
@@ -140,23 +141,31 @@ def _explained(
         len(between.unverified),
         nearest,
         merged.constraints.about(*pair),
+        over,
     )
 
 
-def _why_joined(merged: MergedMap, first: MapId, second: MapId, links: Sequence[Link]) -> str:
+def _over(merged: MergedMap, first: MapId, second: MapId) -> tuple[MapId, ...]:
+    """The fewest maps over which links join two."""
+    graph: nx.Graph = nx.Graph((link.a.map, link.b.map) for link in merged.links)
+    # A map may be in several pieces, so a way over maps is only a hint.
+    way = nx.shortest_path(graph, first, second) if first in graph and second in graph else [first, second]
+    return tuple(way[1:-1])
+
+
+def _why_joined(
+    merged: MergedMap, first: MapId, second: MapId, links: Sequence[Link], over: Sequence[MapId]
+) -> str:
     if links:
         landmarks = sum(link.weight for link in links)
         many = "1 link joins" if len(links) == 1 else f"{len(links)} links join"
         driven = sum(_drivable(merged, link) for link in links)
         ways = f"{driven} of them can be driven" if driven else "they tie poses, none can be driven"
         return f"{first} and {second} are one map: {many} them, with {landmarks} landmarks behind; {ways}"
-    graph: nx.Graph = nx.Graph((link.a.map, link.b.map) for link in merged.links)
-    # A map may be in several pieces, so a way over maps is only a hint.
-    way = nx.shortest_path(graph, first, second) if first in graph and second in graph else [first, second]
-    over = ", ".join(map(str, way[1:-1])) or "each other's pieces"
+    way = ", ".join(map(str, over)) or "each other's pieces"
     apart = merged.constraints.standing(Apart((first, second))) is not None
     more = ", by a manual constraint; to separate them undo the links of that way too" if apart else ""
-    return f"{first} and {second} are one map by way of {over}; no link joins the two directly{more}"
+    return f"{first} and {second} are one map by way of {way}; no link joins the two directly{more}"
 
 
 def _drivable(merged: MergedMap, link: Link) -> bool:

@@ -70,13 +70,16 @@ def test_unmerging_two_maps_joined_by_a_third_explains_how(merger: Merger) -> No
     stops = [Pose2(2.45 + 0.05 * k, 2.05, 0.7 * k) for k in range(6)]
     for change in changes_of(*take_map(world, third, stops, rng)):
         merger.apply(third, change)
-    assert "links join them" in explain_maps(merger.merged(), A, B).reason
+    joined = explain_maps(merger.merged(), A, B)
+    assert "links join them" in joined.reason and joined.over == ()
     merger.constrain(ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", NOON)]))
-    explanation = explain_maps(merger.merged(), A, B).reason
+    apart = explain_maps(merger.merged(), A, B)
+    explanation = apart.reason
     assert (
         "by way of c.1; no link joins the two directly, by a manual constraint" in explanation
         and "undo the links" in explanation
     )
+    assert apart.joined and apart.over == (third,)
     merger.constrain(
         ManualConstraints(
             [
@@ -85,7 +88,8 @@ def test_unmerging_two_maps_joined_by_a_third_explains_how(merger: Merger) -> No
             ]
         )
     )
-    assert explain_maps(merger.merged(), A, B).reason.startswith("a.1 and b.1 are not one map")
+    apart = explain_maps(merger.merged(), A, B)
+    assert apart.reason.startswith("a.1 and b.1 are not one map") and apart.over == ()
 
 
 def test_a_robot_s_own_loop_can_be_undone_and_its_way_cannot(merger: Merger) -> None:

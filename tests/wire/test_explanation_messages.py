@@ -147,7 +147,7 @@ constraints = constraints_on(other_subjects | areas.map(RetiredArea))
 maps = st.builds(
     MapsExplanation, ids.map(lambda n: n.map), ids.map(lambda n: n.map), st.booleans(), words, counts, counts,
     counts, counts, st.lists(st.builds(NearMiss, ids, ids, counts, counts, words), max_size=3).map(tuple),
-    st.lists(constraints, max_size=3).map(tuple),
+    st.lists(constraints, max_size=3).map(tuple), st.lists(ids.map(lambda n: n.map), max_size=3).map(tuple),
 )  # fmt: skip
 
 

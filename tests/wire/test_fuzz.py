@@ -115,7 +115,7 @@ def explanations(some: SimpleNamespace, a: Node, pose: PoseGaussian) -> list[tup
         misfit, (link,), ("r0 says so",), (constraint,),
     )  # fmt: skip
     near = NearMiss(a.id, b.id, 5, 3, "too few")
-    maps = MapsExplanation(one, two, False, "why", 0, 0, 3, 4, (near,), (constraint,))
+    maps = MapsExplanation(one, two, False, "why", 0, 0, 3, 4, (near,), (constraint,), (one,))
     return [
         (partial(messages.decode, kind=PairExplanation), encode(pair)),
         (partial(messages.decode, kind=FleetExplanation), encode(FleetExplanation((maps,)))),

@@ -5,7 +5,6 @@ import { drawView } from "./views.js";
 const BAD_PX = 10;
 const COLOURS = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]];
 const SHOWN = 12;
-const MAP = /^[a-z0-9][a-z0-9_-]*\.\d+$/;
 const result = byId("result");
 
 function colour(px) {
@@ -94,16 +93,12 @@ function showOthers(box, links) {
     item.append(`: ${w.agrees ? "agrees" : "contradicts"}, ${deviations(w.distance2)}, ${w.kept ? "stands" : "refused"}`);
   }
 }
-// The maps over which two are one where no link joins them, as the reason names them.
-const overMaps = ({ joined, links, reason }) =>
-  joined && !links ? (/ by way of (.+?);/.exec(reason)?.[1].split(", ") || []).filter(name => MAP.test(name)) : [];
 function showTwo(one) {
   const box = add(result, "section", "", one.joined ? "box good" : "box");
   add(box, "p", one.reason);
-  const over = overMaps(one);
-  if (over.length) {
+  if (one.over.length) {
     add(box, "p", "By way of:");
-    const steps = add(box, "ol"), way = [one.first, ...over, one.second];
+    const steps = add(box, "ol"), way = [one.first, ...one.over, one.second];
     way.slice(1).forEach((name, k) => to(add(steps, "li"), way[k], name, `${way[k]} - ${name}`));
   }
   if (!one.joined)
