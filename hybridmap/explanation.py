@@ -179,8 +179,8 @@ class MapsExplanation:
         nearest: pairs that came nearest to a link, best first; of links that were refused, then of others. Of
             two maps that are one the links with the fewest landmarks behind them, weakest first.
         constraints: manual constraints on the two maps, in order.
-        over: maps, in order, over which links join two that are one and that no link joins directly. Empty also
-            where other pieces of the two themselves do.
+        over: maps, in order, over which links join two that are one and that no link joins directly. Empty
+            also where other pieces of the two themselves do.
     """
 
     first: MapId
