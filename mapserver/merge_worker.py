@@ -337,6 +337,7 @@ class MergeWorker:
                 self._term, self._shared_merges = self._sharing.term, -1
                 self._sharing.begin()
             if self._following:
+                self._adopt()
                 self._go_on()
             self._alone = ""
         elif not self._following and (not self._alone or self._adoption.promising(self._merger)):
@@ -347,7 +348,7 @@ class MergeWorker:
         """A piece of idle work: adopt what the server that leads has merged, or merge after all."""
         self._adopt()
         if self._adoption is None or self._adoption.overdue:
-            self._alone = self._adoption.reason if self._adoption else ""
+            self._alone = self._adoption.reason[:MOST_WORDS] if self._adoption else ""
             log.warning("this server merges itself, though it does not lead: %s", self._alone)
             self._go_on()
             return 0.0
@@ -370,10 +371,12 @@ class MergeWorker:
                 return
             self._own_merges = self._merger.counters.merges
             self._answers = self._answers_from(merged)
-            self._unprepared, self._begun, self._problem = True, True, ""
-            self._history.follow(merged)
-        except Exception:  # the next merge is the next chance
+        except Exception as error:  # the map of before must not pass for the newest
             log.exception("a merge could not be adopted")
+            self._adoption.give_up(f"a merge could not be adopted ({type(error).__name__}: {error})")
+            return
+        self._unprepared, self._begun, self._problem = True, True, ""
+        self._follow_history(merged)
 
     @property
     def _has_merged(self) -> bool:
@@ -382,9 +385,12 @@ class MergeWorker:
 
     def _go_on(self) -> None:
         """Merge from now on, from where the server that led left off."""
-        self._adopt()
         if self._adoption:
-            self._take_held(self._adoption.hand_over(self._merger, self._has_merged))
+            try:
+                self._adoption.hand_over(self._merger, self._has_merged)
+            except Exception:  # it can all be found out again
+                log.exception("what the server that led has found cannot be used: nodes are compared again")
+            self._take_held(self._adoption.release())
         self._following, self._dirty = False, True
         waiting, self._waiting_for = self._waiting_for, []
         for merged in waiting:
@@ -431,6 +437,8 @@ class MergeWorker:
                 self._pruning.came(node, self._merger)
             except InvalidFile as error:  # it stays until the next start
                 log.warning("%s", error)
+            except Exception:  # likewise; a defect with one node must not end the taking in of others
+                log.exception("%s may be pruned, and stays", node)
 
     def _forget(self, node: Node) -> None:
         if self._fresh.get(node.id) is node:
@@ -486,6 +494,12 @@ class MergeWorker:
         except Exception:  # it is evaluated with the next question
             log.exception("the aliasing of nodes could not be evaluated in advance")
 
+    def _follow_history(self, merged: MergedMap) -> None:
+        try:
+            self._history.follow(merged)
+        except Exception:  # a defect here must not end all merging
+            log.exception("the history of the maps could not be written")
+
     def _merge(self) -> None:
         self._dirty = False
         began = self._schedule.monotonic()
@@ -502,10 +516,7 @@ class MergeWorker:
             self._done, self._begun = self._applied, self._read_all
             self._observe(self._schedule.monotonic() - began)
         self._unprepared, self._problem = True, ""
-        try:
-            self._history.follow(merged)
-        except Exception:  # a defect here must not end all merging
-            log.exception("the history of the maps could not be written")
+        self._follow_history(merged)
         try:
             now_ns = self._schedule.time_ns()
             if self._pruning and self._pruning.prune(self._merger, now_ns, self._last):

@@ -9,7 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from mapweave.hybridmap.change import Change, NodePut
@@ -38,7 +38,7 @@ OTHER_MAPS = "its maps are not those that {} has merged"
 RETRY = 1.0
 """s between two attempts to read a merge that cannot be read: it may just be written."""
 AGAIN = 60.0
-"""s after which a server that merges itself for that reason tries to follow again."""
+"""s after which a server that merges itself for that reason, or after a failure, tries to follow again."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,6 +93,11 @@ class MergeAdoption:
         """This server follows from now on."""
         self._adopted, self.reason = None, ""
 
+    def give_up(self, reason: str) -> None:
+        """The newest merge cannot be used after an unforeseen failure: this server merges itself at once."""
+        self._adopted, self._again_at = None, self._clock() + AGAIN
+        self._fail(reason, 0.0)
+
     def hold(self, change: Change) -> None:
         """Hold a change back."""
         self._held.append(change)
@@ -142,7 +147,10 @@ class MergeAdoption:
         try:
             if not self._same_pruning(merge) and self._pruning:
                 self._pruning.adopt(merger)
-            take([*self._covered(merge)])
+            covered, rest = self._covered(merge)
+            take(covered)
+            # Not before: what failed is taken in once more, which leads to the same maps.
+            self._held = rest
             merger.copy_maps()
             wanted = {which: print_ for which, _, print_ in merge.head.maps}
             if self._sharing.prints(merger) != wanted or not self._same_pruning(merge):
@@ -171,19 +179,22 @@ class MergeAdoption:
             and self._same_pruning(self._last.merge)
         )
 
-    def hand_over(self, merger: Merger, has_merged: bool) -> list[Change]:
-        """End to follow: have a merger go on from the newest merge; returns what was held back.
+    def hand_over(self, merger: Merger, has_merged: bool) -> None:
+        """End to follow: have a merger go on from the newest merge, before it takes what was held back.
 
         Args:
             merger: with the maps.
             has_merged: see `Merger.adopt`: then it goes on from its own.
         """
+        if self.reason.startswith(OTHER_MAPS[:20]):
+            self._again_at = self._clock() + AGAIN
         newest = self._newest or self._last
         if newest is not None and not has_merged and (self._last or not merger.recollecting):
             merger.recollect(newest.findings, newest.merge.record)
+
+    def release(self) -> list[Change]:
+        """What was held back, which the merger takes in now."""
         held, self._held = self._held, []
-        if self.reason.startswith(OTHER_MAPS[:20]):
-            self._again_at = self._clock() + AGAIN
         return held
 
     def _same_pruning(self, merge: SharedMerge) -> bool:
@@ -208,14 +219,16 @@ class MergeAdoption:
         except InvalidFile as error:
             self._fail(f"the merge that was handed over {error}", PATIENCE)
 
-    def _covered(self, merge: SharedMerge) -> Iterable[Change]:
-        """What was held back and is in a merge, in order."""
+    def _covered(self, merge: SharedMerge) -> tuple[list[Change], list[Change]]:
+        """Of what was held back what is in a merge, in order, and the rest."""
         last = {which: sequence for which, sequence, _ in merge.head.maps}
-        nodes, held = merge.record.recent.prints, self._held
-        self._held = [change for change in held if change.sequence > last.get(change.map, 0)]
-        for change in held:
-            if change.sequence <= last.get(change.map, 0):
-                body = change.body
-                # A merge may have left out a node that was already there once more behind it.
-                if not isinstance(body, NodePut) or nodes.get(body.node.id) == fingerprint_of(body.node):
-                    yield change
+        nodes = merge.record.recent.prints
+        covered, rest = list[Change](), list[Change]()
+        for change in self._held:
+            body = change.body
+            if change.sequence > last.get(change.map, 0):
+                rest.append(change)
+            # A merge may have left out a node that was already there once more behind it.
+            elif not isinstance(body, NodePut) or nodes.get(body.node.id) == fingerprint_of(body.node):
+                covered.append(change)
+        return covered, rest

@@ -5,7 +5,11 @@ from __future__ import annotations
 import threading
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
 from dataclasses import replace
+from pathlib import Path
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -16,13 +20,21 @@ from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import NO_COMPONENT, Certainty
+from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.log.store import Store
+from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
+from mapweave.mapserver.merging.merge_sharing import MergeSharing
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.maps import changes_of, map_tours, numbered
 from synthetic.world import World, room, take_map, take_view
+from tests.mapserver.merging.test_restart_record import drives
+from tests.mapserver.merging.test_shared_merge import Leader, Results, hash_of
+from tests.mapserver.merging.test_shared_merge import numbered as numbered_log
+from tests.waiting import eventually
 
 
 def held_merges(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threading.Event]:
@@ -57,6 +69,59 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
         time.sleep(0.001)
     assert worker.answers.merged.constraints.made == constraints.made
     worker.close()
+
+
+@pytest.mark.parametrize(
+    ("where", "method"),
+    [(MergeSharing, "read"), (PlaceDatabase, "leave_out"), (Answers, "of"), (MapHistory, "follow")],
+)
+def test_a_follower_that_fails_with_a_merge_goes_on_alone_and_follows_again(
+    where: type, method: str, tmp_path: Path
+) -> None:
+    """Who waits for it is released; a history that fails is no reason to give up."""
+    log = numbered_log(drives(1))
+    results, followed = Results(), Results()
+    followed.leads, followed.values = False, results.values
+    leader = Leader(results, tmp_path / "s0")
+    worker = MergeWorker(LiveSchedule(), 1.0, sharing=MergeSharing(cast(Store, followed), "s1"))
+    adoption, real = worker._adoption, getattr(where, method)
+    assert adoption is not None
+
+    def fails(*args: Any) -> Any:
+        if worker._following:
+            raise RuntimeError("a defect")
+        return real(*args)
+
+    def merge(changes: list[Change]) -> MergedMap:
+        leader.put(changes)
+        return leader.merge()
+
+    worker.start()
+    worker.read(())
+    with closing(worker), ThreadPoolExecutor(1) as threads:
+        for change in log[:24]:
+            worker.take(change)
+        waiting = threads.submit(worker.settle, 20.0)
+        eventually(lambda: worker.behind == 24 and bool(worker._waiting_for))
+        merged = merge(log[:24])
+        with pytest.MonkeyPatch.context() as broken:
+            broken.setattr(where, method, fails)
+            worker.follow_merges()
+            assert waiting.result()
+        assert worker.settled and worker.behind == 0
+        assert worker.answers.merged.poses.keys() == merged.poses.keys()
+        alone = "" if where is MapHistory else "a merge could not be adopted (RuntimeError: a defect)"
+        assert worker.alone == alone and bool(worker.counters().merges) == bool(alone)
+        # The next merge is followed again, after a while.
+        merged = merge(log[24:40])
+        for change in log[24:40]:
+            worker.take(change)
+        worker.follow_merges()
+        assert worker.settle(20.0) and worker.alone == alone
+        adoption._again_at = 0.0
+        worker.follow_merges()
+        assert worker.settle(20.0) and worker.alone == ""
+        assert hash_of(worker.answers.merged) == hash_of(merged)
 
 
 @pytest.mark.parametrize("broken", [False, True])

@@ -110,7 +110,8 @@ class Follower:
         return merged is not None
 
     def lead(self) -> MergedMap:
-        self.read(self.adoption.hand_over(self.merger, self.merger.counters.merges > 0))
+        self.adoption.hand_over(self.merger, self.merger.counters.merges > 0)
+        self.read(self.adoption.release())
         return self.merger.merged()
 
 
@@ -268,6 +269,53 @@ def test_a_follower_that_has_not_all_waits_longer_than_one_with_other_maps(
     assert not other.look() and other.adoption.reason == merge_adoption.OTHER_MAPS.format("s0")
     other.now = merge_adoption.PATIENCE
     assert other.adoption.overdue
+
+
+@pytest.mark.parametrize("taken", [0, 5, 24])
+def test_changes_that_could_not_be_taken_in_are_not_lost(
+    handed_over: tuple[Results, list[Change]], taken: int
+) -> None:
+    """Those of a merge, of which some are in the map, and those behind it."""
+    changes = handed_over[1]
+    later = numbered(drives(1))[24:30]
+    follower, leading = follower_of(handed_over), follower_of(handed_over)
+    for one in (follower, leading):
+        one.take([*changes, *later])
+
+    def fails(some: list[Change]) -> None:
+        leading.read(some[:taken])
+        raise MemoryError
+
+    with pytest.raises(MemoryError):
+        leading.adoption.adopt(leading.merger, fails, False, leading.last)
+    assert follower.look() and leading.look()
+    assert_same(leading.merged, follower.merged)
+    assert leading.adoption.behind == follower.adoption.behind == len(later)
+    assert decided(leading.lead()) == decided(follower.lead())
+    assert leading.merger.maps.keys() == {change.map for change in [*changes, *later]}
+
+
+def test_a_follower_gives_up_at_once_and_tries_the_next_merge_later(
+    handed_over: tuple[Results, list[Change]], tmp_path: Path
+) -> None:
+    changes, follower = handed_over[1], follower_of(handed_over)
+    follower.take(changes)
+    assert follower.look() and follower.adoption.in_step(follower.merger)
+    follower.adoption.give_up("a defect")
+    assert follower.adoption.overdue and follower.adoption.reason == "a defect"
+    assert not follower.adoption.in_step(follower.merger)
+    assert follower.lead().poses.keys() == follower.merged.poses.keys()
+    follower.now += merge_adoption.AGAIN
+    assert not follower.adoption.promising(follower.merger), "it is the merge with which it failed"
+    follower.results.publish(handed_over[0].values)
+    leader = Leader(follower.results, tmp_path / "s0")
+    leader.put(changes)
+    leader.put(numbered(drives(1))[24:30])
+    leader.merge()
+    follower.now -= 0.1
+    assert not follower.adoption.promising(follower.merger), "it is too early"
+    follower.now += 0.1
+    assert follower.adoption.promising(follower.merger)
 
 
 @pytest.mark.parametrize("name", [MERGE, MERGE_MARK, PART.format(0)])
