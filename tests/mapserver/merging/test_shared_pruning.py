@@ -19,7 +19,7 @@ from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.store import PRUNING, PRUNING_MARK, News, Store
 from mapweave.mapserver.merge_worker import MergeWorker
-from mapweave.mapserver.merging import pruning
+from mapweave.mapserver.merging import merge_adoption, pruning
 from mapweave.mapserver.merging.pruning_record import PruningRecord
 from mapweave.mapserver.schedule import LiveSchedule
 from mapweave.mapserver.server import MapServer
@@ -314,11 +314,13 @@ def test_a_leader_that_is_killed_while_it_prunes(
         )
         stack.callback(child.kill)
         assert child.stdout is not None and child.stdout.readline() == "in the midst\n"
-        one = stack.enter_context(server("s1"))
+        with monkeypatch.context() as patch:
+            patch.setattr(merge_adoption, "FIRST", 1.0)  # this leader will never have merged
+            one = stack.enter_context(server("s1"))
+            assert one.settle(PATIENCE) and not one.status()["leads"]
         poses = [MergedPoses(MemoryBus(hub), KEYS, "r0", name) for name in ("s1", "s2")]
         for listening in poses:
             stack.callback(listening.close)
-        assert one.settle(PATIENCE) and not one.status()["leads"]
         before = one.merged()
         child.send_signal(signal.SIGKILL)
         child.wait()
