@@ -297,7 +297,9 @@ def answers() -> dict[str, tuple[Any, ...]]:
     obstacle = query.Obstacle(NEXT, 0.25, -0.5, 0.375, "r1")
     route = query.RouteRequest(NODE, FAR, ((NODE, NEXT),), Pose2(0.1, 0.0, 0.2), (obstacle,))
     robots = (
-        RobotEntry("r0", True, 0.5, status(), Pose2(1.0, 2.0, 3.0), 0, "kitchen", "ground"),
+        RobotEntry(
+            "r0", True, 0.5, status(), Pose2(1.0, 2.0, 3.0), 0, "kitchen", "ground", ahead=(NEXT, FAR)
+        ),
         RobotEntry(
             "r9", False, missing=3, lag=1.5, newest=FAR, links=2, apart="1 link was found and refused"
         ),

@@ -18,6 +18,8 @@ MAX_STATUS_WORDS = 500
 """Characters of a line. A limit for messages."""
 MAX_ROBOTS = 1024
 """Robots in a status. A limit for messages."""
+MOST_AHEAD = 64
+"""Nodes of a robot's way in a status. A limit for messages; of a longer way the beginning."""
 MAX_ACCUSATION = 1000
 """Characters. A limit for messages."""
 Line = Annotated[str, Meta(max_length=MAX_STATUS_WORDS)]
@@ -165,6 +167,7 @@ class RobotEntry:
         newest: the newest node of the map that it makes, as far as that is merged; None without one.
         links: of that map with others.
         apart: why that map is one with no other; empty if it is, or if there is no other.
+        ahead: the next nodes of its way, in order; empty while it has none, or asks another server.
     """
 
     robot: Name
@@ -182,6 +185,7 @@ class RobotEntry:
     newest: NodeId | None = None
     links: Number = 0
     apart: Annotated[str, Meta(max_length=MAX_ACCUSATION)] = ""
+    ahead: Annotated[tuple[NodeId, ...], Meta(max_length=MOST_AHEAD)] = ()
 
 
 @dataclass(frozen=True)

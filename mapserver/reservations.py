@@ -174,6 +174,11 @@ class Reservations:
             free = _free(aside.way, radius, others)[0] == len(aside.way) - 1
             return ReserveAnswer(0, holder, aside.node if free else None, reason)
 
+    def ways(self, now: float) -> dict[str, tuple[NodeId, ...]]:
+        """The nodes ahead of each robot that drives, in order; `now` is of the same clock, s."""
+        with self._turn:
+            return {robot: one.request.route for robot, one in self._leases.items() if now < one.until}
+
     def _note_standing(
         self, lease: _Lease, stops: Points, goal: Points, merged: MergedMap, now: float
     ) -> None:

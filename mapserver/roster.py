@@ -6,12 +6,14 @@ import hashlib
 import math
 import threading
 from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import NamedTuple
 
 from mapweave.hybridmap.agent_status import (
     LONGEST_STATUS_PERIOD,
     MAX_ACCUSATION,
     MAX_ROBOTS,
+    MOST_AHEAD,
     NO_COMPONENT,
     AgentStatus,
     FleetStatus,
@@ -162,8 +164,15 @@ class Roster(BusClient):
                 found[name] = Presence(bool(self._alive.get(name)), age, unsent)
         return found
 
-    def robots(self, places: PlaceResolver) -> FleetStatus:
-        """All robots, with where they are in a merged map."""
+    def robots(
+        self, places: PlaceResolver, ways: Mapping[str, tuple[NodeId, ...]] = MappingProxyType({})
+    ) -> FleetStatus:
+        """All robots, with where they are in a merged map.
+
+        Args:
+            places: of the map.
+            ways: the nodes ahead of robots that drive.
+        """
         merged = places.merged
         now = self._clock()
         with self._turn:
@@ -189,7 +198,7 @@ class Roster(BusClient):
             entries.append(
                 RobotEntry(
                     name, name in alive, age, status, pose, component, place, floor, words, accusation,
-                    missing, lag, newest, links, one_line(apart),
+                    missing, lag, newest, links, one_line(apart), ways.get(name, ())[:MOST_AHEAD],
                 )
             )  # fmt: skip
         return FleetStatus(tuple(entries))

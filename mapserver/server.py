@@ -342,7 +342,7 @@ class MapServer:
 
     def robots(self) -> FleetStatus:
         """The robots, and where they are."""
-        return self._roster.robots(self._named_places())
+        return self._services.robots()
 
     def _sources(self) -> Sources:
         worker, ingest = self._worker, self._ingest

@@ -9,6 +9,7 @@ from dataclasses import replace
 from functools import partial
 from itertools import islice
 
+from mapweave.hybridmap.agent_status import FleetStatus
 from mapweave.hybridmap.errors import Busy, InvalidMessage, MapweaveError
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.map_event import MapEvent
@@ -96,7 +97,7 @@ class Services(BusClient):
             quotas: of robots.
             observe: called with the time from each question for a place to its answer, s, and the answer.
         """
-        self._places = places
+        self._places, self._roster = places, roster
         self._quotas = quotas
         self._observe = observe
         self._clock = clock
@@ -128,7 +129,7 @@ class Services(BusClient):
             bus.serve(keys.server_map(name), self._map.ask),
             *serve_senders(bus, keys.server_mission(name), self._command_later),
             bus.serve(keys.missions(name), guarded(lambda _: encode(missions.missions()))),
-            bus.serve(keys.robots(name), guarded(lambda _: encode(roster.robots(places())))),
+            bus.serve(keys.robots(name), guarded(lambda _: encode(self.robots()))),
             bus.serve(keys.server_status(name), guarded(self._tell_status)),
             bus.announce(keys.server_alive(name)),
         ]
@@ -138,6 +139,10 @@ class Services(BusClient):
         super().close()
         self._relays.shutdown()
         self._map.close()
+
+    def robots(self) -> FleetStatus:
+        """The robots, where they are, and the ways of those that drive; from any thread."""
+        return self._roster.robots(self._places(), self._reservations.ways(self._clock()))
 
     def map_file(self) -> Future[bytes]:
         """The merged map as a map file, from any thread."""

@@ -68,6 +68,8 @@ def test_what_is_closed_from_the_shell_holds_for_all(
                 return decode(robot.ask(KEYS.any_reserve(), encode(drives), 5.0)[0].payload, ReserveAnswer)
 
             assert asks() == ReserveAnswer(1, "", None, "")
+            (entry,) = fleet.status().robots
+            assert entry.ahead == (last,) and server.robots().robots[0].ahead == (last,)
             status, out, _ = shell(
                 "close", "kitchen", "--radius", "0.02", "--until", "+2h", "--because", "paint", "--by", "bob"
             )

@@ -77,6 +77,18 @@ def test_the_way_of_a_lone_robot_is_free_as_far_as_it_may_hold_it(router: Router
     assert 8 <= long.granted < 13 and long.holder == "", "it holds no more than the next 10 m"
 
 
+def test_the_ways_of_robots_are_known_while_they_drive(router: Router) -> None:
+    traffic = Traffic(router)
+    traffic.ask("r0", 0, 1, 2, 3, 4)
+    traffic.ask("r1", 12, 13, 14)
+    way = tuple(map(node, (1, 2, 3, 4)))
+    assert traffic.reservations.ways(0.0) == {"r0": way, "r1": tuple(map(node, (13, 14)))}
+    assert traffic.reservations.ways(LEASE) == {}
+    here = ReserveRequest("r1", node(13), Pose2(), ())
+    assert traffic.reservations.ask(here, router, 1.0).granted == 0
+    assert traffic.reservations.ways(1.0) == {"r0": way}
+
+
 def test_a_way_that_no_robot_drives_takes_no_time_and_holds_nothing(router: Router) -> None:
     """A robot may say that it is a thousand kilometres away, or that it drives to and fro without end."""
     traffic = Traffic(router)

@@ -7,6 +7,7 @@ import { listCorrections } from "./corrections.js";
 import { Drawing } from "./drawing.js";
 import { EditPanel } from "./edit_panel.js";
 import { explain, explainAddress, explanation } from "./explanation.js";
+import { drawGoals, goalsOf } from "./goals.js";
 import { admitted } from "./login.js";
 import { forget, showNode } from "./node_panel.js";
 import { leaveRobot, listRobots, poseOf, showRobot, updateRobot } from "./robot_panel.js";
@@ -185,7 +186,8 @@ function drawLegend() {
   }
   const shapes = [["M2 5a4 4 0 1 0 8 0a4 4 0 1 0-8 0M6 5H20", colours.hues[0], "node, its heading"],
     ["M2 5a4 4 0 1 0 8 0a4 4 0 1 0-8 0M6 5H20", colours.hues[0], "superseded node", 0.35],
-    ["M4 0L24 5L4 10L9 5Z", colours.robot, "robot, ellipse of 2 sigma"]];
+    ["M4 0L24 5L4 10L9 5Z", colours.robot, "robot, ellipse of 2 sigma"],
+    ["M1 8.5H13V0H14.5L22 3L14.5 6V10.5H1Z", colours.robot, "goal of a robot, its way"]];
   for (const [d, colour, words, opacity = 1] of shapes) {
     const item = add(list, "li"), svg = draw(item, "svg", { viewBox: "0 0 30 10", "aria-hidden": true });
     draw(svg, "path", { d, fill: colour, stroke: colour, opacity });
@@ -194,7 +196,8 @@ function drawLegend() {
 }
 painter.underlays.push(drawPlans);
 // Where the photo may have been taken.
-painter.overlays.push(drawAnnotations, (c, v) => {
+painter.overlays.push((c, v, _, labels) => drawGoals(c, v, goalsOf(page.robots, painter.robots, model), labels), drawAnnotations,
+(c, v) => {
   if (isOpen("edit")) selection.draw(c, v);
   drawing.draw(c, v);
   planEditor.drawMarks(c, v);

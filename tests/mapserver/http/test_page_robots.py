@@ -13,9 +13,11 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
+from synthetic.maps import merger_of
 from tests.browser import PROGRAMS, Browser, there_is_none
-from tests.mapserver.http.person import Person
+from tests.mapserver.http.person import Person, logs
 from tests.mapserver.stub_services import StubServices
+from tests.mapserver.test_corrections import A
 from tests.waiting import eventually
 
 pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
@@ -82,6 +84,50 @@ def test_what_became_of_a_mission_replaces_what_was_said_when_it_was_given(
     failed = "go to hall, failed: a door is shut (by page)"
     eventually(lambda: person.page.run(SENT.format("textContent")) == failed)
     assert person.page.run(SENT.format("className")) == "bad"
+
+
+GOALS = """
+const c = mapweave.painter.canvas, m = mapweave.model, v = mapweave.viewport, ratio = mapweave.painter.ratio;
+const red = ([x, y]) => {
+  const [u, w] = v.toScreen(x, y).map(one => Math.round(one * ratio));
+  const [r, g] = c.getContext('2d').getImageData(u, w, 1, 1).data;
+  return r > g + 60;
+};
+const at = name => { const row = m.rowOf(name); return [m.x[row], m.y[row]]; };
+const shares = [...Array(20).keys()].map(k => 0.25 + k / 40);
+const share = (a, b) => shares.filter(s => red(a.map((from, k) => from + s * (b[k] - from)))).length / 20;
+const robot = mapweave.painter.robots[0], [first, second] = %s.map(at);
+return [mapweave.painter.labels.texts.map(one => one.text).filter(text => text.startsWith('goal')),
+  share([robot.x, robot.y], first) > 0.8, share(first, second) > 0.8];
+"""
+"""Texts at goals, and whether the way to the first node and from there to the second is drawn."""
+
+
+def test_the_goal_of_a_mission_and_the_way_there_are_on_the_map(
+    person: Person, services: DrivenServices
+) -> None:
+    """One saw only the words: not where the robot was going."""
+    services.map = merger_of(logs()).merged()
+    first, second = sorted(node for node in services.map.poses if node.map == A)[-1:-3:-1]
+    end = services.map.pose(first)
+    drawn = GOALS % [str(first), str(second)]
+    running, done = (
+        replace(one, order=replace(one.order, node=second))
+        for one in (report(MissionState.RUNNING, 0.25), report(MissionState.DONE, 1.0))
+    )
+    services.fleet = robot_at(end.x, end.y + 1.0)
+    eventually(lambda: person.page.run(f"return mapweave.model.rowOf('{first}')") is not None)
+    eventually(lambda: abs(person.page.run("return mapweave.painter.robots[0].y") - end.y - 1.0) < 1e-6)
+    person.press("fit")
+    assert person.page.run(drawn) == [[], False, False]
+    (robot,) = robot_at(end.x, end.y + 1.0, running).robots
+    services.fleet = FleetStatus((replace(robot, ahead=(first, second)),))
+    eventually(lambda: person.page.run(drawn) == [["goal of r0"], True, True])
+    # Of a way that is not known the goal alone is shown.
+    services.fleet = FleetStatus((robot,))
+    eventually(lambda: person.page.run(drawn) == [["goal of r0"], False, False])
+    services.fleet = robot_at(end.x, end.y + 1.0, done)
+    eventually(lambda: person.page.run(drawn) == [[], False, False])
 
 
 def test_the_selected_robot_stays_in_view(person: Person, services: DrivenServices) -> None:
