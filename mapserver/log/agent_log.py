@@ -145,6 +145,11 @@ class AgentLog:
         """Whether nothing is missing, as far as is known."""
         return self.newest <= self.watermark and not self.damaged and self.unverified is None
 
+    @property
+    def lacking(self) -> int:
+        """Changes that are known of and have not come."""
+        return max(self.newest - self.watermark - len(self.ahead), 0)
+
     def plan(self, now: float) -> None:
         """Note when to pull next, if that is not known yet."""
         if self.complete:

@@ -268,7 +268,9 @@ class Ingest:
         if mark.sequence <= agent_log.watermark or mark.sequence in agent_log.ahead:
             self._counters.add(doubled=1)
             return agent_log if intake.repeat() else None
-        if not intake.change(len(sample.payload), self._unmerged(map_id.agent)):
+        in_turn = mark.sequence == agent_log.watermark + 1
+        lacking = 1 if in_turn else agent_log.lacking
+        if not intake.change(len(sample.payload), self._unmerged(map_id.agent), lacking):
             return agent_log
         fits = len(sample.payload) <= MAX_CHANGE_BYTES
         entry = ReceivedChange.read(map_id, mark.sequence, sample.payload if fits else b"")

@@ -76,9 +76,16 @@ class Intake:
             self._quotas.hold_back(self._agent, what)
         return allowed
 
-    def change(self, size: int, unmerged: int) -> bool:
-        """Whether a published change is taken; one that is not is pulled later."""
-        if self.rows(unmerged) < 1:
+    def change(self, size: int, unmerged: int, lacking: int = 1) -> bool:
+        """Whether a published change is taken; one that is not is pulled later.
+
+        Args:
+            size: bytes.
+            unmerged: changes of the robot that wait to be merged.
+            lacking: changes of the log that have not come, this one included. There must be room for all of
+                them: else those behind a gap would leave none for it, and the log would hardly go on.
+        """
+        if self.rows(unmerged) < 1 or self._changes.available(self._quotas.clock()) < lacking:
             self._quotas.hold_back(self._agent, "changes")
             return False
         self.spend(1, size)

@@ -15,6 +15,7 @@ from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.mapserver import quotas as quotas_module
 from mapweave.mapserver.log import ingest, intake, kept_bytes, known_logs, pull_schedule, pulled
 from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.intake import ADVICE
@@ -120,6 +121,32 @@ def test_what_is_held_back_is_fetched_later_in_order(
     eventually(lambda: len(server.seen) >= 301)
     assert [c.sequence for c in server.seen if c.map == MAP] == list(range(1, 301))
     assert quotas.over() == {}, "it has kept to its quota for a while"
+
+
+def test_a_robot_that_sends_more_than_its_quota_is_stored_at_the_rate_of_its_quota(
+    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What it publishes behind a gap leaves room for the gap."""
+    monkeypatch.setattr(quotas_module, "BURST", 1.0)
+    clock = Clock()
+    server = Server(hub, tmp_path / "s0.sqlite", quotas=Quotas(QuotaSettings(changes=100.0), clock))
+    cleanup.callback(server.end)
+    agent = other_agent(hub, cleanup, MAP)
+    steps, sent, at_once = 20, 0, 100
+    agent.serve(at_once + 14 * steps)
+    for step in range(steps + 1):
+        for _ in range(14 if step else at_once):
+            sent += 1
+            agent.publish(sent)
+        eventually(lambda sent=sent: server.ingest.counters().messages == sent and not server.ingest.busy)
+        clock.now += 0.1
+    # What is asked for and what is published may come at once, and then take a little of what comes next.
+    allowed = at_once + 10 * (steps + 1)
+    eventually(lambda: server.store.watermark(MAP) >= allowed - 20)
+    assert server.store.watermark(MAP) <= allowed + 20
+    clock.now += 10.0
+    eventually(lambda: len(server.seen) == sent)
+    assert server.sequences == list(range(1, sent + 1))
 
 
 def test_a_change_that_is_sent_again_and_again_is_shown_and_takes_nothing_from_new_ones(
