@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal
 
+from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.named_nodes import ids_of
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
+from mapweave.refusals import refusals
 from mapweave.wire.typed import packed
 
 NodeWord = NodeId | str
@@ -26,13 +29,64 @@ class AnnotationMethods(ABC):
     would do. Each raises Refused with the reason, and what `annotate` raises.
     """
 
-    @abstractmethod
-    def annotate(self, kind: str, name: str, because: str = "", *, check: bool = False, **fields: Any) -> str:
-        """Say something of any kind."""
+    _by: str
+    """Who says so."""
 
     @abstractmethod
+    def _check_writable(self, check: bool) -> None:
+        """Raise if nothing can be said, before the words are looked up; with `check` it is only checked."""
+
+    @abstractmethod
+    def _say(self, annotation: Annotation, check: bool) -> str:
+        """Keep an annotation, unless it is only checked; returns what it says and does."""
+
+    @abstractmethod
+    def annotations(self) -> Annotations:
+        """What people say about the map."""
+
+    def annotate(self, kind: str, name: str, because: str = "", *, check: bool = False, **fields: Any) -> str:
+        """Say something about the map, for example `annotate("place", "kitchen", node="r0.1.17")`.
+
+        Each kind has a typed method: `place`, `close_way`, `prefer`, `floor`, `portal`, `plan`, `pin`. Of a
+        map only a pin moves it.
+
+        Args:
+            kind: of the annotation: place, closure, preference, floor, portal, plan, pin.
+            name: for the same kind and name the last one holds.
+            because: why.
+            check: only say what it would do.
+            fields: of the body, see mapweave.hybridmap.annotation. Nodes may be words: a node, the name of a
+                place, a position `3.1,-2.0` in the merged map. An area is `corners`, positions in the merged
+                map (in the component of the place or node `near`), or `radius`, m, around `node`.
+
+        Returns:
+            What it says, in words.
+
+        Raises:
+            Refused: it says nothing new, or is about something that is not there.
+            NotConnected: it is about a fleet, and no map server answers.
+            MissingExtra: a map that is open needs the extra "server" for it.
+            MapweaveError: the file cannot be written.
+        """
+        return self._annotate(name, {"kind": kind, **fields}, False, because, check)
+
     def withdraw(self, kind: str, name: str, because: str = "", *, check: bool = False) -> str:
-        """Withdraw what was said; the record keeps both."""
+        """Withdraw what was said about the map; the record keeps both. See `annotate`."""
+        return self._annotate(name, {"kind": kind}, True, because, check)
+
+    def _annotate(
+        self, name: str, fields: Mapping[str, Any], removed: bool, because: str, check: bool
+    ) -> str:
+        self._check_writable(check)
+        # It loads what reads maps: who only asks a fleet does without.
+        from mapweave.mapserver.annotation_words import annotation_of_words
+
+        with refusals():
+            annotation = annotation_of_words(
+                name, fields, removed, self.annotations, self.resolve, self.plans, self._by, because,
+                time.time_ns(),
+            )  # fmt: skip
+        return self._say(annotation, check)
 
     @abstractmethod
     def put_plan_image(self, png: bytes) -> PlanImage:

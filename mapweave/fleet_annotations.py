@@ -3,19 +3,15 @@
 from __future__ import annotations
 
 import hashlib
-import time
-from collections.abc import Iterable, Mapping
-from typing import Any
+from collections.abc import Iterable
 
 from mapweave.annotation_methods import AnnotationMethods
 from mapweave.fleet_questions import FleetQuestions
-from mapweave.hybridmap.annotation import AnnotationRequest, Annotations
+from mapweave.hybridmap.annotation import Annotation, AnnotationRequest, Annotations
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.floor_plan import PIECE, PlacedPlans, PlanImage, PlanPiece, PlanReceived
 from mapweave.hybridmap.named_nodes import asked_of
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
-from mapweave.mapserver.annotation_words import annotation_of_words
-from mapweave.refusals import refusals
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import sent_by
@@ -26,33 +22,6 @@ ANSWER = 10.0
 
 class FleetAnnotations(FleetQuestions, AnnotationMethods):
     """The part of `mapweave.fleet.Fleet` by which people say what is not on the map."""
-
-    def annotate(self, kind: str, name: str, because: str = "", *, check: bool = False, **fields: Any) -> str:
-        """Say something about the map, for example `fleet.annotate("place", "kitchen", node="r0.1.17")`.
-
-        Each kind has a typed method: `place`, `close_way`, `prefer`, `floor`, `portal`, `plan`, `pin`.
-
-        Args:
-            kind: of the annotation: place, closure, preference, floor, portal, plan, pin.
-            name: for the same kind and name the last one holds.
-            because: why.
-            check: only say what it would do.
-            fields: of the body, see mapweave.hybridmap.annotation. Nodes may be words: a node, the name of a
-                place, a position `3.1,-2.0` in the merged map. An area is `corners`, positions in the merged
-                map (in the component of the place or node `near`), or `radius`, m, around `node`.
-
-        Returns:
-            What it says, in words.
-
-        Raises:
-            Refused: it says nothing new, or is about something that is not there.
-            NotConnected: no map server answers.
-        """
-        return self._annotate(name, {"kind": kind, **fields}, False, because, check)
-
-    def withdraw(self, kind: str, name: str, because: str = "", *, check: bool = False) -> str:
-        """Withdraw what was said about the map; see `annotate`."""
-        return self._annotate(name, {"kind": kind}, True, because, check)
 
     def annotations(self) -> Annotations:
         """What people say about the map.
@@ -106,15 +75,10 @@ class FleetAnnotations(FleetQuestions, AnnotationMethods):
                 return received.image
         raise InvalidValue("a plan is a PNG file")
 
-    def _annotate(
-        self, name: str, fields: Mapping[str, Any], removed: bool, because: str, check: bool
-    ) -> str:
+    def _check_writable(self, check: bool) -> None:
         self._check_role()
-        with refusals():
-            annotation = annotation_of_words(
-                name, fields, removed, self.annotations, self.resolve, self.plans, self._by, because,
-                time.time_ns(),
-            )  # fmt: skip
+
+    def _say(self, annotation: Annotation, check: bool) -> str:
         key = sent_by(self._keys.any_annotate(), self._sender)
         return str(
             decode_record(self._question(key, encode(AnnotationRequest(annotation, check)), ANSWER))["said"]

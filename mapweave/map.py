@@ -13,11 +13,11 @@ import os
 import time
 import warnings
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, overload
+from typing import TYPE_CHECKING, overload
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 from mapweave.annotation_methods import AnnotationMethods
 from mapweave.constraint_methods import ConstraintMethods
 from mapweave.extras import need
-from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.constraint_subject import Subject, read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue, Refused
@@ -458,19 +458,6 @@ class FileMap(Map, ConstraintMethods, AnnotationMethods):
         """What people say about the map: what the file has, and what was said since it was opened."""
         return Annotations(self.content.annotations)
 
-    def annotate(self, kind: str, name: str, because: str = "", *, check: bool = False, **fields: Any) -> str:
-        """Say something of any kind; see Fleet.annotate. Only a pin moves the map.
-
-        Raises:
-            Refused: it says nothing new, or is about something that is not there.
-            MissingExtra: that needs the extra "server".
-        """
-        return self._annotate(name, {"kind": kind, **fields}, False, because, check)
-
-    def withdraw(self, kind: str, name: str, because: str = "", *, check: bool = False) -> str:
-        """Withdraw what was said about the map; see `annotate`."""
-        return self._annotate(name, {"kind": kind}, True, because, check)
-
     def plan_image(self, sha256: str) -> bytes:
         """The PNG file of a plan, by the name of its image.
 
@@ -506,20 +493,14 @@ class FileMap(Map, ConstraintMethods, AnnotationMethods):
         with refusals():
             return PlaceResolver(router, router.annotations).answer(asked)
 
-    def _annotate(
-        self, name: str, fields: Mapping[str, Any], removed: bool, because: str, check: bool
-    ) -> str:
-        router = self._read.router
-        from mapweave.mapserver.annotation_words import annotation_of_words
+    def _check_writable(self, check: bool) -> None:
+        need("server")
+
+    def _say(self, annotation: Annotation, check: bool) -> str:
         from mapweave.mapserver.annotator import CHECKED
         from mapweave.offline_annotations import checked_annotation, with_annotation
 
-        with refusals():
-            annotation = annotation_of_words(
-                name, fields, removed, self.annotations, self.resolve, self.plans, self._by, because,
-                time.time_ns(),
-            )  # fmt: skip
-        words = checked_annotation(self.content, router, annotation, self.plan_image)
+        words = checked_annotation(self.content, self._read.router, annotation, self.plan_image)
         if check:
             return CHECKED + words
         content = with_annotation(self.content, annotation, self._images)

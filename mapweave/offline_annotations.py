@@ -6,13 +6,12 @@ its map in memory by the same two functions.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Mapping
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from mapweave.annotation_methods import AnnotationMethods
 from mapweave.hybridmap.annotation import Annotation, Annotations
@@ -23,7 +22,6 @@ from mapweave.hybridmap.named_nodes import asked_of
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_effects import effects_of
-from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.mapserver.annotator import CHECKED, check_annotation, check_edge
 from mapweave.mapserver.floor_plans import placed_plans
 from mapweave.mapserver.places import PlaceResolver
@@ -110,19 +108,6 @@ class OfflineAnnotations(AnnotationMethods):
         self._out = Path(path) if out is None and self._opened.source is MapSource.FILE else out
         self._images = dict(self._opened.content.images)
 
-    def annotate(self, kind: str, name: str, because: str = "", *, check: bool = False, **fields: Any) -> str:
-        """See Fleet.annotate; the file is written, unless it is only checked.
-
-        Raises:
-            Refused: it says nothing new, or is about something that is not there.
-            MapweaveError: the file cannot be written.
-        """
-        return self._annotate(name, {"kind": kind, **fields}, False, because, check)
-
-    def withdraw(self, kind: str, name: str, because: str = "", *, check: bool = False) -> str:
-        """See Fleet.withdraw; the file is written, unless it is only checked."""
-        return self._annotate(name, {"kind": kind}, True, because, check)
-
     def annotations(self) -> Annotations:
         """What people say about the map."""
         return Annotations(self._opened.content.annotations)
@@ -168,23 +153,18 @@ class OfflineAnnotations(AnnotationMethods):
         with self._progress() as report:
             return Router(self._opened.merged(self._settings, report))
 
-    def _annotate(
-        self, name: str, fields: Mapping[str, Any], removed: bool, because: str, check: bool
-    ) -> str:
-        out = self._out
-        if out is None and not check:
+    def _check_writable(self, check: bool) -> None:
+        if check:
+            return
+        if self._out is None:
             raise InvalidValue(
                 f"{self._opened.path} is {self._opened.source.words}, which is not written: give -o"
             )
-        if out is not None and not check:
-            check_place(out)
-        with refusals():
-            annotation = annotation_of_words(
-                name, fields, removed, self.annotations, self.resolve, self.plans, self._by, because,
-                time.time_ns(),
-            )  # fmt: skip
+        check_place(self._out)
+
+    def _say(self, annotation: Annotation, check: bool) -> str:
         words = checked_annotation(self._opened.content, self._router, annotation, self.plan_image)
-        if check or out is None:
+        if check or self._out is None:
             return CHECKED + words
         content = with_annotation(self._opened.content, annotation, self._images)
         self._opened = replace(self._opened, content=content)
@@ -194,5 +174,5 @@ class OfflineAnnotations(AnnotationMethods):
         content = self._opened.file(self.merged)
         if moved and content.poses:
             content = replace(content, poses=dict(self.merged.poses))
-        self._opened = self._opened.written(out, content)
+        self._opened = self._opened.written(self._out, content)
         return words

@@ -11,6 +11,10 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave.hybridmap.ids import MapId
+from mapweave.mapserver.map_files import map_file_of
+from mapweave.storage.map_file import write_map_file
+from synthetic.maps import looked_around, merger_of
 from tests.examined import examined_once
 from tests.mapweave.command_line import CAMERA
 from tests.simulator import INSTALLED
@@ -22,6 +26,15 @@ def examined() -> Iterator[None]:
     """Servers and commands of tests compare the same nodes again and again."""
     with examined_once():
         yield
+
+
+@pytest.fixture(scope="session")
+def joined(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The file of two robots' maps of one room, merged; tests read it."""
+    merged = merger_of(looked_around((MapId("r0", 1), MapId("r1", 1)), seed=6)).merged()
+    path = tmp_path_factory.mktemp("map") / "room.mapweave"
+    write_map_file(path, map_file_of(merged))
+    return path
 
 
 @pytest.fixture

@@ -11,28 +11,17 @@ import pytest
 import mapweave
 from mapweave.hybridmap.annotation import Annotation, Closure, Place, Preference
 from mapweave.hybridmap.errors import InvalidValue, Refused
-from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.map_files import map_file_of
 from mapweave.offline_annotations import OfflineAnnotations
-from mapweave.storage.map_file import write_map_file
 from mapweave.storage.plan_image import plan_file
-from synthetic.maps import looked_around, merger_of
 
 FIRST, THIRD = NodeId("r0", 1, 1), NodeId("r1", 1, 3)
 
 
-@pytest.fixture(scope="module")
-def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    merged = merger_of(looked_around((MapId("r0", 1), MapId("r1", 1)), seed=6)).merged()
-    path = tmp_path_factory.mktemp("map") / "room.mapweave"
-    write_map_file(path, map_file_of(merged))
-    return path
-
-
 @pytest.fixture
-def record(path: Path, tmp_path: Path) -> OfflineAnnotations:
-    return OfflineAnnotations(path, tmp_path / "out.mapweave", "anna")
+def record(joined: Path, tmp_path: Path) -> OfflineAnnotations:
+    return OfflineAnnotations(joined, tmp_path / "out.mapweave", "anna")
 
 
 def last(record: OfflineAnnotations) -> Annotation:
@@ -79,8 +68,8 @@ def test_a_check_keeps_nothing_and_a_field_that_there_is_not_is_found(record: Of
     assert record.annotations().made == ()
 
 
-def test_words_are_nodes_and_what_is_none_is_refused(path: Path, record: OfflineAnnotations) -> None:
-    room = mapweave.open(path)
+def test_words_are_nodes_and_what_is_none_is_refused(joined: Path, record: OfflineAnnotations) -> None:
+    room = mapweave.open(joined)
     for one in (room, record):
         assert one.resolve("r1.1.3").found[0].node == THIRD
         assert [found.node for found in one.resolve(["r1.1.3", "r0.1.1"]).found] == [THIRD, FIRST]

@@ -16,23 +16,13 @@ from mapweave.cli import main
 from mapweave.exit_status import NO
 from mapweave.hybridmap.floor_plan import PlanImage
 from mapweave.hybridmap.ids import MapId
-from mapweave.mapserver.map_files import map_file_of
-from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
+from mapweave.storage.map_file import MapFile, read_map_file
 from mapweave.storage.plan_image import plan_file
-from synthetic.maps import looked_around, merger_of, write_store
+from synthetic.maps import looked_around, write_store
 
 FIRST, THIRD = "r0.1.1", "r1.1.3"
 CORNERS = ((0, 0), (4, 0), (4, 3), (0, 3))
 BEGIN, END = "2030-03-01 14:00 UTC", "2030-03-01 15:00 UTC"
-
-
-@pytest.fixture(scope="module")
-def joined(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two robots' maps of one room, merged."""
-    merged = merger_of(looked_around((MapId("r0", 1), MapId("r1", 1)), seed=6)).merged()
-    path = tmp_path_factory.mktemp("map") / "room.mapweave"
-    write_map_file(path, map_file_of(merged))
-    return path
 
 
 def png() -> bytes:

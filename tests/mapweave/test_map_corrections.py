@@ -10,22 +10,10 @@ import pytest
 import mapweave
 from mapweave.cli import main
 from mapweave.hybridmap.change import EdgePut
-from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.node import EdgeKind
-from mapweave.mapserver.map_files import map_file_of
-from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
-from synthetic.maps import looked_around, merger_of
+from mapweave.storage.map_file import MapFile, read_map_file
 
 NAMES = "r0.1", "r1.1"
-
-
-@pytest.fixture(scope="module")
-def joined(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """Two robots' maps of one room, merged."""
-    merged = merger_of(looked_around((MapId("r0", 1), MapId("r1", 1)), seed=6)).merged()
-    path = tmp_path_factory.mktemp("map") / "room.mapweave"
-    write_map_file(path, map_file_of(merged))
-    return path
 
 
 def decided(file: MapFile) -> tuple[object, ...]:
