@@ -14,10 +14,10 @@ pytest.importorskip("pybullet")
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_its_last_line_is_one_object() -> None:
-    command = [sys.executable, "-m", "benchmarks.agent", "--seconds", "20", "--seed", "3", "--json"]
+    command = [sys.executable, "-m", "benchmarks.agent", "--seconds", "10", "--seed", "3", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     values = json.loads(done.stdout.strip().splitlines()[-1])
-    assert values["ticks"] == 200 and values["nodes"] >= 1
+    assert values["ticks"] == 100 and values["nodes"] >= 1
     assert 0.0 < values["tick_ms_p50"] < values["tick_ms_p99"] < 1000.0
     assert values["with_numba"]["rss_mb"] > values["rss_mb"] + 50.0, "only one of the processes has numba"
     assert 40.0 < values["wheel_mb"] < 300.0
