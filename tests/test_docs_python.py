@@ -57,8 +57,11 @@ def with_endpoint(endpoint: str) -> dict[str, str]:
 
 
 def test_no_page_has_python_that_is_not_run() -> None:
-    pages = {str(page.relative_to(DOCS)) for page in DOCS.rglob("*.md") if BLOCK.search(page.read_text())}
-    assert pages == {"python.md", "command.md", "corrections.md", "http.md", "worlds.md"}
+    root = DOCS.parent
+    files = [*DOCS.rglob("*.md"), *root.glob("*.md")]
+    pages = {str(page.relative_to(root)) for page in files if BLOCK.search(page.read_text())}
+    run = {"python.md", "command.md", "corrections.md", "http.md", "worlds.md"}
+    assert pages == {*(f"docs/{page}" for page in run), "README.md"}
 
 
 def together() -> dict[str, list[ChangeBody]]:
@@ -123,23 +126,43 @@ def fleet_with(changes: Mapping[str, Sequence[ChangeBody]], tmp_path: Path) -> I
         bus.close()
 
 
-def test_every_block_of_the_page_of_python_runs(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
+def write_files(
+    changes: Mapping[str, Sequence[ChangeBody]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    """Map files, a photograph and its camera, where blocks of Python look for them."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("MPLBACKEND", "agg")
-    changes = together()
     for name, body in changes.items():
         mapweave.write_map_file(Path(f"{name}.mapweave"), mapweave.MapFile("agent", name, tuple(body)))
     mapweave.FileMap(mapweave.merge_map_files([Path("r0.mapweave"), Path("r1.mapweave")])).save(
         "office.mapweave"
     )
-    cv2.imwrite("photo.png", np.random.default_rng(2).integers(0, 255, (48, 64), dtype=np.uint8))
+    for photo in ("photo.png", "photo.jpg"):
+        cv2.imwrite(photo, np.random.default_rng(2).integers(0, 255, (48, 64), dtype=np.uint8))
     Path("camera.toml").write_text(
         "width = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 32\ncy = 24\nheight_m = 0.3\n"
     )
+
+
+@needs_simulator
+def test_the_blocks_of_the_readme_run(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    changes = together()
+    write_files(changes, tmp_path, monkeypatch)
+    with fleet_with(changes, tmp_path) as endpoint:
+        run_blocks("../README.md", {}, {**with_endpoint(endpoint), "seconds=60.0": "seconds=1.0"})
+    simulated, *library = capsys.readouterr().out.splitlines()
+    assert simulated.startswith("(240, 320) Odometry(") and len(library) > 3
+
+
+def test_every_block_of_the_page_of_python_runs(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    changes = together()
+    write_files(changes, tmp_path, monkeypatch)
     with fleet_with(changes, tmp_path) as endpoint:
         run_blocks("python.md", {}, with_endpoint(endpoint))
     printed = capsys.readouterr().out

@@ -53,6 +53,23 @@ def test_every_command_of_every_page_parses(capsys: pytest.CaptureFixture[str]) 
     assert checked > 100 and {"first-map.md", "robot.md", "security.md", "README.md"} <= of_pages
 
 
+def test_every_target_of_make_that_a_page_names_is_there() -> None:
+    targets = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
+    named = set()
+    for page in PAGES:
+        text = page.read_text(encoding="utf-8")
+        fenced = "\n".join(re.findall(r"^```\w*\n(.*?)^```", text, re.M | re.S))
+        lines = [
+            *re.findall(r"^make ([^#\n]*)", fenced, re.M),
+            *re.findall(r"^    make ([^#\n]*)", text, re.M),
+            *re.findall(r"`make ([^`]*)`", text),
+        ]
+        words = " ".join(lines).split()
+        named |= {(page.name, word) for word in words if re.fullmatch(r"[a-z][\w-]*", word)}
+    assert {("README.md", "demo"), ("README.md", "test")} <= named
+    assert not {(page, word) for page, word in named if word not in targets}
+
+
 def test_every_command_that_a_sentence_names_is_there() -> None:
     """Inline, commands lack their arguments: their words are compared."""
     known, wrong = parsers_of(parser()), []
