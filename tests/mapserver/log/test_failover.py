@@ -14,6 +14,7 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.mapserver.log.entry import Applied
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.store import LogChanges
+from mapweave.storage import postgres_watchdog
 from synthetic.postgres_server import ROLE, PostgresServer, binaries
 from tests.mapserver.log.test_store import MAP, entry
 from tests.postgres import started
@@ -26,8 +27,9 @@ from tests.waiting import eventually
     [(PostgresServer.kill, "Connection refused"), (PostgresServer.freeze, "connection timeout expired")],
 )
 def test_nothing_acknowledged_is_lost_with_the_primary(
-    loss: Callable[[PostgresServer], None], words: str
+    loss: Callable[[PostgresServer], None], words: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.setattr(postgres_watchdog, "LONG", 0.5)
     servers = started()
     primary = next(servers)
     folder = binaries()
