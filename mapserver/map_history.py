@@ -22,6 +22,7 @@ from mapweave.merge.mutual_exclusion.collision import is_exclusion
 from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.pinned_frames import FrameChange, frame_changes
+from mapweave.storage.full_disks import logged
 from mapweave.wire.messages import KeptHistory, decode, encode
 
 log = logging.getLogger(__name__)
@@ -180,7 +181,8 @@ class MapHistory:
         try:
             self._store.put_result(HISTORY, encode(kept))
         except (InvalidFile, InvalidValue) as error:
-            log.warning("what has happened to the maps is not kept: %s", error)
+            if not logged(error):
+                log.warning("what has happened to the maps is not kept: %s", error)
 
 
 def between(before: MergedMap, after: MergedMap, stamp_ns: int) -> tuple[MapEvent, ...]:

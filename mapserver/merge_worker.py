@@ -29,6 +29,7 @@ from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import Job, Schedule
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
+from mapweave.storage.full_disks import logged
 from mapweave.wire.fair_queue import FairQueue
 
 log = logging.getLogger(__name__)
@@ -522,6 +523,7 @@ class MergeWorker:
             if self._pruning and self._pruning.prune(self._merger, now_ns, self._last):
                 self._dirty = True
         except InvalidFile as error:  # it is tried again the next day
-            log.warning("what has been superseded for long is not pruned: %s", error)
+            if not logged(error):
+                log.warning("what has been superseded for long is not pruned: %s", error)
         except Exception:
             log.exception("what has been superseded for long could not be pruned")

@@ -33,6 +33,7 @@ from mapweave.mapserver.goals import node_of_goal
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.places import PlaceResolver, others_of
 from mapweave.mapserver.roster import Roster
+from mapweave.storage.full_disks import logged
 from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.each_robot import in_parallel
 from mapweave.wire.keys import Keys
@@ -321,7 +322,7 @@ class MissionRelay:
             try:
                 self._store.put_result(KEPT, encode(kept))
             except InvalidFile as error:
-                if not self._write_fails:
+                if not logged(error) and not self._write_fails:
                     log.warning("the record of missions is not on the disk, and is tried again: %s", error)
                 with self._turn:
                     self._unwritten = self._write_fails = True

@@ -14,7 +14,8 @@ from pathlib import Path
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.file_owner import owning
 from mapweave.storage.first_bytes import MAP_FILE, SQLITE
-from mapweave.storage.os_errors import READ_ONLY, no_permission, reason_of
+from mapweave.storage.full_disks import FullDisk, written
+from mapweave.storage.os_errors import NO_ROOM, READ_ONLY, no_permission, reason_of
 
 
 def write_whole(path: Path, data: bytes | memoryview) -> None:
@@ -50,6 +51,7 @@ def replacing(path: Path) -> Iterator[Path]:
             os.fsync(file.fileno())
         beside.replace(path)
         _sync_folder(path.parent)
+        written(path)
     except OSError as error:
         _remove(beside)
         raise unwritable(path, reason_of(error)) from None
@@ -142,7 +144,8 @@ def _begins(path: Path, first: bytes) -> bool:
 
 def unwritable(path: Path, why: str) -> InvalidFile:
     """The error of a file that cannot be written, with why."""
-    return InvalidFile(f"{path}: cannot be written ({why})")
+    words = f"{path}: cannot be written ({why})"
+    return FullDisk.of_file(words, path) if why == NO_ROOM else InvalidFile(words)
 
 
 def _sync_folder(folder: Path) -> None:

@@ -12,6 +12,7 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.database_reader import reading
 from mapweave.storage.file_format import of_format
 from mapweave.storage.file_owner import owning
+from mapweave.storage.full_disks import FullDisk, written
 from mapweave.storage.os_errors import DISK_FULL, READ_ONLY, no_permission
 from mapweave.storage.write_ahead_log import lost_commits
 
@@ -101,7 +102,9 @@ class Database:
             if code == sqlite3.SQLITE_CORRUPT:
                 raise self.damaged(str(error)) from None
             if code in DISK_ERRORS and (reason := _disk_trouble(self._file)):
-                raise InvalidFile(f"{self.path}: {self.what}: {reason}") from None
+                words = f"{self.path}: {self.what}: {reason}"
+                full = reason == DISK_FULL
+                raise FullDisk.of_file(words, self.path) if full else InvalidFile(words) from None
             advice = self._advice if code == sqlite3.SQLITE_NOTADB else ""
             raise InvalidFile(f"{self.path}: {self.what} cannot be used ({error}){advice}") from None
         except UnicodeDecodeError:
@@ -130,6 +133,7 @@ class Database:
                 if self.connection.in_transaction:
                     self.connection.execute("ROLLBACK")
                 raise
+        written(self.path)
 
     def damaged(self, reason: str) -> InvalidFile:
         """The error of a damaged file, with what to do about it."""

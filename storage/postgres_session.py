@@ -17,6 +17,7 @@ import psycopg
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.storage.full_disks import FullDisk
 
 SCHEME = "postgresql://"
 EXAMPLE = "postgresql://USER@HOST/DATABASE"
@@ -244,12 +245,13 @@ class PostgresSession:
         try:
             yield
         except psycopg.Error as error:
-            reason = _reason(error)
+            reason, full = _reason(error), isinstance(error, psycopg.errors.DiskFull)
             if self._connection is not None and self._connection.broken:
                 if self._given_up:
                     reason = f"{self._place}: PostgreSQL answers nothing"
                 self._drop()
-            raise self._unusable(reason) from None
+            unusable, address = self._unusable(reason), self.address.words
+            raise FullDisk.of_database(str(unusable), address) if full else unusable from None
         finally:
             self._uses -= 1
 

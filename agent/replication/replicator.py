@@ -23,6 +23,7 @@ from mapweave.hybridmap.change import ChangeBody, NodeRetired
 from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue, MapweaveError
 from mapweave.hybridmap.ids import MapId, NodeId, check_name
+from mapweave.storage.full_disks import logged
 from mapweave.wire.bus import Bus, Request, Sample
 from mapweave.wire.codec import wrap_body
 from mapweave.wire.keys import Keys
@@ -318,7 +319,7 @@ class Replicator:
             self._pending = drafts
             self._retry_at = time.monotonic() + self._settings.retry_interval
             with self._changed:
-                if not self._disk_failure and not self._unnoted:
+                if not logged(error) and not self._disk_failure and not self._unnoted:
                     log.error("%s; %s in memory", error, counted(len(drafts), "change"))
                 self._disk_failure = str(error)
             return
@@ -337,7 +338,8 @@ class Replicator:
             first = self._journal.write(retirement.map, retirement.drafts)
         except InvalidFile as error:
             # The nodes only take more room until they are asked about again.
-            log.warning("%s", error)
+            if not logged(error):
+                log.warning("%s", error)
             return
         with self._changed:
             state.newest = first + len(retirement.drafts) - 1
@@ -394,7 +396,7 @@ class Replicator:
         except InvalidFile as error:
             # The server sends it again, because the next beacon shows that it was not noted; a full disk is
             # one line meanwhile.
-            if not self._unnoted and not self._disk_failure:
+            if not logged(error) and not self._unnoted and not self._disk_failure:
                 log.error("%s", error)
             self._unnoted = True
             return
@@ -429,7 +431,8 @@ class Replicator:
             self._journal.prune(state.map, self._servers)
         except InvalidFile as error:
             # It only takes more room until the next time.
-            log.warning("%s", error)
+            if not logged(error):
+                log.warning("%s", error)
 
     def _sharing(self, server: str, ack: Ack) -> list[str]:
         """Other servers with the same store: what one acknowledges, all of them have.

@@ -24,6 +24,7 @@ from mapweave.mapserver.http.live_map import NODE_COLUMNS
 from mapweave.mapserver.http.serving import json_bytes
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.atomic_file import read_whole, write_whole
+from mapweave.storage.full_disks import logged
 
 log = logging.getLogger(__name__)
 
@@ -182,4 +183,5 @@ def write_shown(path: Path, shown: LastShown) -> None:
     try:
         write_whole(path, MAGIC + zlib.compress(content))
     except InvalidFile as error:
-        log.warning("%s; the next start shows no map before it is loaded", error)
+        if not logged(error):
+            log.warning("%s; the next start shows no map before it is loaded", error)

@@ -39,6 +39,7 @@ from mapweave.mapserver.log.puller import Puller
 from mapweave.mapserver.log.recovery import recover
 from mapweave.mapserver.log.store import News, Store
 from mapweave.mapserver.quotas import Quotas
+from mapweave.storage.full_disks import logged
 from mapweave.wire.bus import Bus, Closing, Sample
 from mapweave.wire.codec import MAX_CHANGE_BYTES
 from mapweave.wire.keys import Keys, robot_of
@@ -437,7 +438,7 @@ class Ingest:
     def _commit_failed(self, agent_log: AgentLog, error: MapweaveError) -> None:
         agent_log.commit_failed(time.monotonic(), self._settings.retry_interval)
         self._counters.add(failures=1)
-        if str(error) != self._failure:
+        if not logged(error) and str(error) != self._failure:
             log.error("%s", error)
         self._failure = str(error)
 

@@ -15,6 +15,7 @@ from mapweave.mapserver.log.entry import Position
 from mapweave.mapserver.log.integrity import SCHEMA, Gap, insert, repair
 from mapweave.mapserver.log.store import ID, LogChanges, News, Store, fresh_id
 from mapweave.storage.database import Database
+from mapweave.storage.full_disks import logged
 
 log = logging.getLogger(__name__)
 
@@ -57,7 +58,8 @@ class SqliteStore(Store):
                 self.put_result(ID, self.id.to_bytes(8, "big"))
             except InvalidFile as error:
                 # Such a store cannot be written either, but can be read.
-                log.warning("%s", error)
+                if not logged(error):
+                    log.warning("%s", error)
 
     def follow(self, changed: Callable[[News], None]) -> None:
         """Nothing: no other server writes to the file."""

@@ -10,6 +10,7 @@ import logging
 import secrets
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass
 
 from mapweave.hybridmap.annotation import MAX_ANNOTATIONS
@@ -209,7 +210,7 @@ class Store(SqlSizes):
                 logs = self._begin(runs)
                 return [self._apply(run, logs) for run in runs]
         except InvalidFile as error:
-            return [InvalidFile(str(error)) for _ in runs]
+            return [copy(error) for _ in runs]
 
     def replay(self, map_id: MapId, last: int = 0) -> Iterator[Change]:
         """Every change behind `last` that was taken, in order.

@@ -14,6 +14,7 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.restart_record import RestartRecord
 from mapweave.mapserver.merging.verification_cache import VerificationCache
 from mapweave.mapserver.merging.verification_cache_file import load, save
+from mapweave.storage.full_disks import logged
 
 log = logging.getLogger(__name__)
 
@@ -120,7 +121,7 @@ class VerificationCacheKeeper:
         try:
             write()
         except InvalidFile as error:
-            if str(error) != failure:
+            if not logged(error) and str(error) != failure:
                 log.warning("%s; %s", error, otherwise)
             self._failures[otherwise] = str(error), self._clock() + RETRY
             return False

@@ -29,6 +29,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.postgres_server import PostgresServer
+from tests.disks import empty, fill, make_read_only, mount
 from tests.waiting import eventually, free_port
 
 SEED, INTERVAL = 7, 0.1
@@ -39,22 +40,6 @@ FULL = {"sqlite": "the disk is full", "postgresql": "No space left on device"}
 STILL = 3.0
 """s in which an acknowledgement that is wrong would come."""
 SIZES = {"sqlite": "24m", "postgresql": "160m", "log": "64m", "robot": "16m"}
-
-
-def mount(folder: Path, size: str) -> None:
-    """A small disk."""
-    folder.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size},mode=755", "tmpfs", str(folder)], check=True)
-
-
-def fill(folder: Path) -> None:
-    """Leave no room."""
-    with (folder / "ballast").open("wb", buffering=0) as ballast:
-        try:
-            while True:
-                ballast.write(bytes(4096))
-        except OSError:
-            pass
 
 
 class DiskFleet:
@@ -137,6 +122,11 @@ class DiskFleet:
         said = (self.root / f"{name}.log").read_text().splitlines()
         return [one for one in said if self._full[name] in one or one.startswith("Traceback")]
 
+    def room_again(self, name: str) -> list[str]:
+        """What it has said of a disk that has room again."""
+        said = (self.root / f"{name}.log").read_text().splitlines()
+        return [one for one in said if "has room again" in one]
+
     def troubled(self) -> bool:
         """Whether the server's status says that the disk is full."""
         return self._full["server"] in self.event()
@@ -175,12 +165,12 @@ def server_disk(fleet: DiskFleet) -> dict[str, Any]:
     said["event"] = fleet.event()
     said["runs"] = fleet.runs("server")
     said["lines"] = fleet.lines("server")
-    (fleet.disk / "ballast").unlink()
+    empty(fleet.disk)
     if fleet.postgres is not None and fleet.postgres.process.poll() is not None:
         said["postgres ended"] = True
         fleet.postgres.start()
     fleet.wait_more()
-    said["lines after"] = fleet.lines("server")
+    said["lines after"], said["room again"] = fleet.lines("server"), fleet.room_again("server")
     eventually(lambda: not fleet.troubled(), PATIENCE)
 
     fill(fleet.disk)
@@ -190,7 +180,7 @@ def server_disk(fleet: DiskFleet) -> dict[str, Any]:
     fleet.start("server")
     eventually(lambda: not fleet.runs("server") or fleet.event(), PATIENCE)
     said["started full"] = fleet.runs("server") or (fleet.root / "server.log").read_text().splitlines()[-1]
-    (fleet.disk / "ballast").unlink()
+    empty(fleet.disk)
     if fleet.postgres is not None and fleet.postgres.process.poll() is not None:
         fleet.postgres.start()
     if not fleet.runs("server"):
@@ -225,7 +215,7 @@ def log_disk(fleet: DiskFleet) -> dict[str, Any]:
     time.sleep(STILL)
     said = {"acknowledged while full": fleet.acknowledged() - before, "event": fleet.event()}
     said |= {"runs": fleet.runs("server"), "postgres ended": fleet.postgres.process.poll() is not None}
-    (fleet.disk / "log_disk" / "ballast").unlink()
+    empty(fleet.disk / "log_disk")
     if said["postgres ended"]:
         fleet.postgres.start()
     fleet.wait_more()
@@ -238,13 +228,13 @@ def robot_disk(fleet: DiskFleet) -> dict[str, Any]:
     fill(fleet.robot)
     eventually(lambda: fleet.lines("robot"), PATIENCE)
     said["runs"], said["lines"] = fleet.runs("robot"), fleet.lines("robot")
-    (fleet.robot / "ballast").unlink()
+    empty(fleet.robot)
     fleet.wait_more()
-    said["lines after"] = fleet.lines("robot")
+    said["lines after"], said["room again"] = fleet.lines("robot"), fleet.room_again("robot")
     fill(fleet.robot)
     eventually(lambda: len(fleet.lines("robot")) > len(said["lines"]), PATIENCE)
     fleet.kill("robot")
-    (fleet.robot / "ballast").unlink()
+    empty(fleet.robot)
     fleet.start("robot")
     fleet.wait_more()
     return said
@@ -252,7 +242,7 @@ def robot_disk(fleet: DiskFleet) -> dict[str, Any]:
 
 def read_only_disk(fleet: DiskFleet) -> dict[str, Any]:
     """The server is started on a disk that nothing can be written to."""
-    subprocess.run(["mount", "-o", "remount,ro", str(fleet.disk)], check=True)
+    make_read_only(fleet.disk)
     before = (fleet.root / "server.log").read_text()
     fleet.start("server")
     eventually(lambda: not fleet.runs("server"), PATIENCE)
@@ -271,6 +261,7 @@ def main() -> None:
         fleet.start("robot")
         fleet.wait_more()
         said = {"server": server_disk(fleet), "robot": robot_disk(fleet)}
+        said["disks"] = {"server": str(fleet.disk), "robot": str(fleet.robot)}
         if fleet.postgres is not None:
             said["log"] = log_disk(fleet)
         (root / ENOUGH).touch()

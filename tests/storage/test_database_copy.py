@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 import sqlite3
 import subprocess
 import sys
@@ -18,6 +17,7 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.database import Database
 from mapweave.storage.database_copy import copying
 from mapweave.storage.file_owner import is_owned, lock_of, owning
+from tests.disks import own_mounts
 
 SCHEMA = "CREATE TABLE line (number INTEGER PRIMARY KEY, body BLOB)"
 OPEN = ("notebook", 77, 1, SCHEMA)
@@ -173,23 +173,10 @@ import json, subprocess, sys
 from pathlib import Path
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.database_copy import copying
+from tests.disks import empty, fill, mount
 from tests.storage.test_database_copy import OPEN, Database, lines, write
 
 root, said = Path(sys.argv[1]), {}
-def full(name, size):
-    folder = root / name
-    folder.mkdir()
-    subprocess.run(["mount", "-t", "tmpfs", "-o", f"size={size}", "tmpfs", str(folder)], check=True)
-    return folder
-
-def fill(folder):
-    with (folder / "ballast").open("wb", buffering=0) as ballast:
-        try:
-            while True:
-                ballast.write(bytes(4096))
-        except OSError:
-            pass
-
 def refused(source, target):
     try:
         with copying(source, target):
@@ -199,10 +186,10 @@ def refused(source, target):
 
 notes = Database(root / "notes.sqlite", *OPEN)
 write(notes, 5000)
-small = full("small", "1m")
+small = mount(root / "small", "1m")
 said["small"], said["left"] = refused(notes.path, small / "copy"), [p.name for p in small.iterdir()]
 # The disk fills up amid the copy.
-large, steps = full("large", "16m"), []
+large, steps = mount(root / "large", "16m"), []
 def progress(done, of):
     steps.append(done)
     fill(large)
@@ -213,7 +200,7 @@ except InvalidFile as error:
     said["large"] = str(error)
 said["left there"] = [p.name for p in large.iterdir()]
 # A file on a disk without room for what is shared with readers is opened, and belongs to its owner alone.
-crowded = full("crowded", "8m")
+crowded = mount(root / "crowded", "8m")
 own = Database(crowded / "own.sqlite", *OPEN)
 write(own, 3)
 own.close()
@@ -229,7 +216,7 @@ program = (
 )
 command = [sys.executable, "-c", program, str(own.path), str(root / "copy")]
 said["others"] = subprocess.run(command, capture_output=True, text=True, check=True).stdout.splitlines()
-(crowded / "ballast").unlink()
+empty(crowded)
 write(own, 1)
 own.close()
 said["after"] = lines(own.path)
@@ -239,9 +226,7 @@ print(json.dumps(said))
 
 @pytest.mark.slow
 def test_full_disks_are_named_and_left_as_they_were(tmp_path: Path) -> None:
-    unshare = ["unshare", "--user", "--map-root-user", "--mount"]
-    if not shutil.which("unshare") or subprocess.run([*unshare, "true"], capture_output=True).returncode:
-        pytest.skip("needs user namespaces with mounts of their own (unshare --user --mount)")
+    unshare = own_mounts()
     ran = subprocess.run(
         [*unshare, sys.executable, "-c", FULL, str(tmp_path)],
         capture_output=True,

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 
+from tests.disks import own_mounts
+
 pytestmark = pytest.mark.slow
 
-UNSHARE = ["unshare", "--user", "--map-root-user", "--mount"]
-
 PROGRAM = """
-import json, logging, subprocess, sys
+import json, logging, sys
 from pathlib import Path
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
@@ -28,29 +27,18 @@ from mapweave.mapserver.log.ingest_settings import IngestSettings
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.disks import empty, fill, make_read_only, mount
 from tests.waiting import eventually
 
 root, said = Path(sys.argv[1]), {}
 logging.basicConfig(filename=root / "log", level=logging.WARNING, format="%(message)s")
-
-def mount(folder, options):
-    folder.mkdir(exist_ok=True)
-    subprocess.run(["mount", "-t", "tmpfs", "-o", options, "tmpfs", str(folder)], check=True)
-
-def fill(folder):
-    with (folder / "ballast").open("wb", buffering=0) as ballast:
-        try:
-            while True:
-                ballast.write(bytes(4096))
-        except OSError:
-            pass
 
 def bodies(first, last):
     return [NodeRetired(NodeId("r0", 1, number)) for number in range(first, last + 1)]
 
 robot, server = root / "robot", root / "server"
 for folder in (robot, server):
-    mount(folder, "size=16m")
+    mount(folder, "16m")
 hub, keys = MemoryHub(), Keys("fleet")
 bus, server_bus = MemoryBus(hub), MemoryBus(hub)
 store = SqliteStore(server / "s0.sqlite")
@@ -70,7 +58,7 @@ while not agent.status().failure:
     agent.flush(0.1)
 said["agent full"] = agent.status().failure
 said["waiting"] = agent.status().waiting
-(robot / "ballast").unlink()
+empty(robot)
 assert agent.flush(30) and agent.wait_acknowledged(30)
 said["agent after"] = agent.status().failure
 
@@ -83,11 +71,13 @@ said["server full"] = ingest.failure
 said["unacknowledged"] = agent.unacknowledged()
 acknowledged = journal.acknowledged(MapId("r0", 1))["s0"]
 said["kept"] = store.watermark(MapId("r0", 1)) >= acknowledged
-(server / "ballast").unlink()
+empty(server)
 assert agent.wait_acknowledged(30)
 said["server after"] = ingest.failure
 said["same"] = [c.sequence for c in store.replay(MapId("r0", 1))] == list(range(1, count + 1))
-said["lines"] = [line for line in (root / "log").read_text().splitlines() if "full" in line]
+lines = (root / "log").read_text().splitlines()
+said["lines"] = [line for line in lines if "full" in line]
+said["room again"] = [line for line in lines if "has room again" in line]
 agent.close()
 ingest.close()
 journal.close()
@@ -98,7 +88,7 @@ for name, folder, opens in (
     ("store", server, lambda: SqliteStore(server / "s0.sqlite")),
     ("new store", server, lambda: SqliteStore(server / "s1.sqlite")),
 ):
-    subprocess.run(["mount", "-o", "remount,ro", str(folder)], check=True)
+    make_read_only(folder)
     try:
         opens()
     except InvalidFile as error:
@@ -107,7 +97,7 @@ for name, folder, opens in (
 reader = Journal(robot / "r0.sqlite")
 said["read"] = reader.head(MapId("r0", 1)) == count
 reader.close()
-mount(root / "full", "size=8k")
+mount(root / "full", "8k")
 fill(root / "full")
 try:
     SqliteStore(root / "full" / "s0.sqlite")
@@ -120,10 +110,9 @@ print(json.dumps(said))
 @pytest.fixture(scope="module")
 def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
     """What agent and server have said on disks that were full, and then read-only."""
-    if not shutil.which("unshare") or subprocess.run([*UNSHARE, "true"], capture_output=True).returncode:
-        pytest.skip("needs user namespaces with mounts of their own (unshare --user --mount)")
+    unshare = own_mounts()
     folder = tmp_path_factory.mktemp("disks")
-    command = [*UNSHARE, sys.executable, "-c", PROGRAM, str(folder)]
+    command = [*unshare, sys.executable, "-c", PROGRAM, str(folder)]
     ran = subprocess.run(
         command,
         capture_output=True,
@@ -148,10 +137,12 @@ def test_on_a_full_disk_a_server_acknowledges_nothing_more_and_loses_nothing(sai
     assert (said["kept"], said["server after"], said["same"]) == (True, "", True)
 
 
-def test_a_full_disk_is_one_line(said: dict[str, object]) -> None:
-    lines = said["lines"]
-    assert isinstance(lines, list)
-    assert len(lines) == 2, lines
+def test_a_full_disk_is_one_line_and_so_is_that_it_has_room(said: dict[str, object]) -> None:
+    for kind in ("lines", "room again"):
+        lines = said[kind]
+        assert isinstance(lines, list)
+        assert len(lines) == 2, lines
+        assert "robot/r0.sqlite: " in lines[0] and "server/s0.sqlite: " in lines[1]
 
 
 @pytest.mark.parametrize("name", ["journal", "store", "new store"])
