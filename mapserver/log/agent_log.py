@@ -192,7 +192,12 @@ class AgentLog:
         self.pull_at = now + self._pause
 
     def commit_failed(self, now: float, wait: float) -> None:
-        """The commit failed: drop the changes ahead, they will be pulled."""
+        """The commit failed: drop the changes ahead, they will be pulled.
+
+        One is enough to find out whether the disk takes them again; more would be pulled in vain, and spend
+        what the robot may send.
+        """
         self.forget_ahead()
+        self.chunk = 1
         self._pause = wait
         self.pull_at = now + wait

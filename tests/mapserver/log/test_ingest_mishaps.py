@@ -13,6 +13,7 @@ from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import InvalidFile, MapweaveError
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.store import LogChanges
+from mapweave.mapserver.quotas import BURST, Quotas, QuotaSettings
 from mapweave.wire.bus import Request
 from mapweave.wire.codec import MAX_CHANGE_BYTES
 from mapweave.wire.log_messages import LogAnswer, LogRequest, Mark, Refusal
@@ -146,6 +147,24 @@ def test_a_consumer_that_fails_on_a_change_gets_the_next(
         agent.publish(2)
         eventually(lambda: server.sequences == [1, 2])
     assert "choked" in caplog.text
+
+
+def test_a_disk_that_is_full_for_long_takes_nothing_from_what_a_robot_may_send(
+    hub: MemoryHub, agent: HandAgent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # The clock stands: 1000 changes may come in all, those that are pulled in vain included.
+    quotas = Quotas(QuotaSettings(changes=1000.0 / BURST), lambda: 0.0)
+    server = Server(hub, tmp_path / "full.sqlite", quotas=quotas)
+    try:
+        agent.serve(600)
+        with monkeypatch.context() as patched:
+            patched.setattr(server.store, "apply_all", lambda runs: [InvalidFile("full") for _ in runs])
+            agent.beacon(600)
+            eventually(lambda: server.ingest.counters().failures >= 20)
+        eventually(lambda: server.store.watermark(MAP) == 600)
+        assert quotas.totals() == {}
+    finally:
+        server.end()
 
 
 def test_a_disk_that_is_full_for_a_while(
