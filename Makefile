@@ -16,7 +16,7 @@ COMPILE := $(BIN)/python -c 'import mapweave.agent.runner; from mapweave.hybridm
 # pytest keeps what it has read of the tests: else each of its processes reads all of them anew the first time.
 READ_TESTS := $(BIN)/python -m pytest --collect-only --quiet > /dev/null 2>&1
 
-.PHONY: setup demo test check docs bench slow scenarios sbom audit clean
+.PHONY: setup demo test check docs bench slow slow-waits slow-most scenarios sbom audit clean
 
 setup: $(STAMP)
 
@@ -47,8 +47,15 @@ test: setup
 
 slow: setup $(AUDIT)/.installed
 	@$(COMPILE)
-	$(BIN)/python -m pytest -m "slow and not alone" -n 2 --dist worksteal
+	@$(MAKE) --no-print-directory -j 2 slow-waits slow-most
 	$(BIN)/python -m pytest -m "slow and alone"
+
+# Beside two workers: these wait for time-outs of other programs, and need a tenth to a third of a core.
+slow-waits:
+	$(BIN)/python -m pytest -m "slow and waits"
+
+slow-most:
+	$(BIN)/python -m pytest -m "slow and not alone and not waits" -n 2 --dist worksteal
 
 # About three quarters of an hour on two cores: every scenario, in real processes, and the longest tests.
 scenarios: setup
@@ -64,12 +71,15 @@ check: setup
 docs: setup
 	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
 
-# The tools of `make sbom` and `make audit`, apart from all else: what they bring for checking addresses takes 1.6 s to
-# import, and each process of a Ray cluster would import it.
+# The tools of `make sbom` and `make audit`, and axe-core for the page's tests, without the browsers that its package would
+# bring. Apart from all else: what the tools bring for checking addresses takes 1.6 s to import, and each process of a
+# Ray cluster would import it.
 $(AUDIT)/.installed: constraints.txt | $(STAMP)
 	@$(BIN)/python -m venv $(AUDIT)
 	@$(AUDIT)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile -c constraints.txt \
 	  cyclonedx-bom pip-audit
+	@$(AUDIT)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps -c constraints.txt \
+	  axe-playwright-python
 	@touch $@
 
 # What Mapweave is installed with, exactly, as CycloneDX: the same file each time.
