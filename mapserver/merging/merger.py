@@ -50,9 +50,9 @@ class Merger:
     With four exceptions the result depends on the maps, not on the order of changes. New nodes are not
     compared with nodes superseded on another day. Which of two nodes of one place supersedes the other
     depends on what was superseded before (docs/decisions/life-of-a-map.md says how much that is); a
-    RestartRecord passes that on to the next process. In a large place database cells are searched, which
-    depend on what was there when they were learned (see LandmarkIndexSettings). Decisions on a large island
-    stay until much of it has changed (see Islands).
+    RestartRecord passes that on to the next process, and a map that goes has no share in it. In a large
+    place database cells are searched, which depend on what was there when they were learned (see
+    LandmarkIndexSettings). Decisions on a large island stay until much of it has changed (see Islands).
     """
 
     def __init__(

@@ -14,6 +14,7 @@ from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.merging.verification_cache import RecentComparisons
 from mapweave.merge.map_maintenance.node_superseding import Superseding
+from mapweave.merge.map_maintenance.superseding_log import SupersedingLog
 from mapweave.merge.pose_graph.candidates import Pair
 
 
@@ -27,6 +28,7 @@ class RestartRecord:
         superseded: nodes, and why.
         linked: pairs of nodes with a link.
         unsure: maps that may not be right.
+        log: what the last merges changed; it may name nodes that are gone.
     """
 
     recent: RecentComparisons = field(default_factory=RecentComparisons)
@@ -34,6 +36,7 @@ class RestartRecord:
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
     linked: Set[Pair] = frozenset()
     unsure: Set[MapId] = frozenset()
+    log: SupersedingLog = field(default_factory=SupersedingLog)
 
     @staticmethod
     def of(superseding: Superseding, recent: RecentComparisons) -> RestartRecord:
@@ -41,7 +44,7 @@ class RestartRecord:
         judged = frozenset(superseding.judged.keys() & recent.prints.keys())
         superseded = {n: s for n, s in superseding.superseded.items() if n in judged and s.by in judged}
         linked = frozenset(pair for pair in superseding.linked if judged.issuperset(pair))
-        return RestartRecord(recent, judged, superseded, linked, superseding.unsure)
+        return RestartRecord(recent, judged, superseded, linked, superseding.unsure, superseding.log)
 
     def unchanged(self, prints: Mapping[NodeId, bytes]) -> Set[NodeId]:
         """The nodes that were there and are just as they were.
@@ -61,4 +64,4 @@ class RestartRecord:
         nodes = ((node_id, node_of(node_id)) for node_id in self.judged & unchanged)
         judged = {node_id: node for node_id, node in nodes if node is not None}
         superseded = {n: s for n, s in self.superseded.items() if n in judged and s.by in judged}
-        return Superseding(superseded, judged, self.linked, self.unsure)
+        return Superseding(superseded, judged, self.linked, self.unsure, self.log)

@@ -1,7 +1,8 @@
 """The restart record as a file (see mapweave.mapserver.checksummed_file), so that a restarted server
 supersedes the nodes that it had superseded.
 
-header (JSON), agents (JSON), nodes, prints, what is known of each, superseded, links, overlaps, unsure maps
+header (JSON), agents (JSON), nodes, prints, what is known of each, superseded, links, overlaps, unsure maps,
+log: its nodes, what superseded them before, judged, linked, maps that are joined
 """
 
 from __future__ import annotations
@@ -22,10 +23,11 @@ from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.checksummed_file import json_part, read_json, read_sealed, seal, sealed
 from mapweave.mapserver.merging.restart_record import RestartRecord
 from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, RecentComparisons
+from mapweave.merge.map_maintenance.superseding_log import MOST, Changes, SupersedingLog
 from mapweave.merge.pose_graph.candidates import Pair
 
 MAGIC = b"mapweave superseded\n"
-FORMAT = 1
+FORMAT = 2
 JUDGED, COMPARED = 1, 2
 """What is known of a node: bits."""
 
@@ -70,11 +72,13 @@ def _parts(record: RestartRecord, made_by: str) -> Iterator[NDArray[Any]]:
     recent = record.recent
     nodes = sorted(recent.prints)
     row = {node: k for k, node in enumerate(nodes)}
-    agents = sorted({node.agent for node in nodes} | {map_id.agent for map_id in record.unsure})
+    logged = _nodes_of(record.log)
+    joined = {map_id for part in record.log.joined for map_id in part}
+    agents = sorted({n.agent for n in (*nodes, *logged)} | {m.agent for m in (*record.unsure, *joined)})
     number = {agent: k for k, agent in enumerate(agents)}
     yield json_part(_header(made_by))
     yield json_part(agents)
-    yield np.array([(number[n.agent], n.epoch, n.number) for n in nodes], np.int64).reshape(-1, 3)
+    yield _ids(nodes, number)
     yield np.frombuffer(b"".join(recent.prints[n] for n in nodes), np.uint8).reshape(-1, PRINT_BYTES)
     yield np.array(
         [JUDGED * (n in record.judged) + COMPARED * (n in recent.compared) for n in nodes], np.uint8
@@ -87,24 +91,57 @@ def _parts(record: RestartRecord, made_by: str) -> Iterator[NDArray[Any]]:
     yield _rows(overlaps, row)
     yield np.fromiter(overlaps.values(), np.float64)
     yield np.array([(number[m.agent], m.epoch) for m in sorted(record.unsure)], np.int64).reshape(-1, 2)
+    yield from _log_parts(record.log, logged, number)
+
+
+def _log_parts(
+    log: SupersedingLog, nodes: Sequence[NodeId], number: Mapping[str, int]
+) -> Iterator[NDArray[Any]]:
+    """The log of superseding; each row but the first kind begins with a step, or a component."""
+    row = {node: k for k, node in enumerate(nodes)}
+    changed = [(k, n, was) for k, step in enumerate(log.steps) for n, was in sorted(step.before.items())]
+    yield _ids(nodes, number)
+    yield np.array(
+        [(k, row[n], *((-1, 0) if was is None else (row[was.by], was.found))) for k, n, was in changed],
+        np.int64,
+    ).reshape(-1, 4)
+    yield np.array(
+        [(0.0, 0.0) if was is None else (was.distance, was.turn) for _, _, was in changed], np.float64
+    ).reshape(-1, 2)
+    yield np.array(
+        [(k, row[n]) for k, step in enumerate(log.steps) for n in sorted(step.judged)], np.int64
+    ).reshape(-1, 2)
+    yield np.array(
+        [(k, row[a], row[b]) for k, step in enumerate(log.steps) for a, b in sorted(step.linked)], np.int64
+    ).reshape(-1, 3)
+    yield np.array(
+        [
+            (k, number[m.agent], m.epoch, step)
+            for k, part in enumerate(log.joined)
+            for m, step in part.items()
+        ],
+        np.int64,
+    ).reshape(-1, 4)
+
+
+def _nodes_of(log: SupersedingLog) -> list[NodeId]:
+    """All nodes that a log names."""
+    nodes: set[NodeId] = set()
+    for step in log.steps:
+        nodes |= {*step.before, *step.judged, *(node for pair in step.linked for node in pair)}
+        nodes |= {was.by for was in step.before.values() if was is not None}
+    return sorted(nodes)
 
 
 def _read(parts: Iterator[NDArray[Any]]) -> RestartRecord:
     agents = [check_name(name) for name in read_json(next(parts))]
-    ids = _whole(next(parts), 3)
-    _in_range(ids, (len(agents), MAX_NUMBER + 1, MAX_NUMBER + 1))
-    nodes = [NodeId(agents[a], epoch, number) for a, epoch, number in ids.tolist()]
-    if not all(a < b for a, b in pairwise(nodes)):
-        raise InvalidValue("nodes are not in the order of ids")
+    nodes = _nodes(next(parts), agents)
     prints = {n: one.tobytes() for n, one in zip(nodes, _of(next(parts), np.uint8, PRINT_BYTES), strict=True)}
     known = dict(zip(nodes, _of(next(parts), np.uint8).tolist(), strict=True))
     judged = frozenset(node for node, bits in known.items() if bits & JUDGED)
     compared = frozenset(node for node, bits in known.items() if bits & COMPARED)
-    rows, poses = _whole(next(parts), 3), _of(next(parts), np.float64, 2)
+    rows, poses = _whole(next(parts), 3), _poses(next(parts))
     _in_range(rows, (len(nodes), len(nodes), MAX_LANDMARKS + 1))
-    # Written so that NaN fails.
-    if not ((poses >= 0.0) & (poses <= (4.0 * MAX_POSITION, math.pi))).all():
-        raise InvalidValue("a distance or a turn is out of range")
     superseded = {
         nodes[a]: Superseded(nodes[by], found, *pose)
         for (a, by, found), pose in zip(rows.tolist(), poses.tolist(), strict=True)
@@ -119,7 +156,60 @@ def _read(parts: Iterator[NDArray[Any]]) -> RestartRecord:
     maps = _whole(next(parts), 2)
     _in_range(maps, (len(agents), MAX_NUMBER + 1))
     unsure = frozenset(MapId(agents[a], epoch) for a, epoch in maps.tolist())
-    return RestartRecord(RecentComparisons(prints, compared, overlaps), judged, superseded, linked, unsure)
+    recent = RecentComparisons(prints, compared, overlaps)
+    return RestartRecord(recent, judged, superseded, linked, unsure, _read_log(parts, agents))
+
+
+def _read_log(parts: Iterator[NDArray[Any]], agents: Sequence[str]) -> SupersedingLog:
+    nodes = _nodes(next(parts), agents)
+    rows, poses = _whole(next(parts), 4), _poses(next(parts))
+    judged, linked, joined = _whole(next(parts), 2), _whole(next(parts), 3), _whole(next(parts), 4)
+    # No step is empty.
+    count = 1 + max((int(part[:, 0].max()) for part in (rows, judged, linked) if len(part)), default=-1)
+    _in_range(rows, (MOST, len(nodes), len(nodes), MAX_LANDMARKS + 1), (0, 0, -1, 0))
+    _in_range(judged, (MOST, len(nodes)))
+    _in_range(linked, (MOST, len(nodes), len(nodes)))
+    if not (linked[:, 1] < linked[:, 2]).all():
+        raise InvalidValue("a pair is not in the order of ids")
+    _in_range(joined, (len(joined), len(agents), MAX_NUMBER + 1, count + 1), (0, 0, 0, -1))
+    before: list[dict[NodeId, Superseded | None]] = [{} for _ in range(count)]
+    for (k, node, by, found), pose in zip(rows.tolist(), poses.tolist(), strict=True):
+        before[k][nodes[node]] = None if by < 0 else Superseded(nodes[by], found, *pose)
+    come: list[set[NodeId]] = [set() for _ in range(count)]
+    for k, node in judged.tolist():
+        come[k].add(nodes[node])
+    pairs: list[set[Pair]] = [set() for _ in range(count)]
+    for k, a, b in linked.tolist():
+        pairs[k].add((nodes[a], nodes[b]))
+    together: dict[int, dict[MapId, int]] = {}
+    for part, agent, epoch, step in joined.tolist():
+        together.setdefault(part, {})[MapId(agents[agent], epoch)] = step
+    steps = (Changes(*each) for each in zip(before, map(frozenset, come), map(frozenset, pairs), strict=True))
+    return SupersedingLog(tuple(steps), tuple(together.values()))
+
+
+def _ids(nodes: Sequence[NodeId], number: Mapping[str, int]) -> NDArray[np.int64]:
+    """Nodes as rows."""
+    return np.array([(number[n.agent], n.epoch, n.number) for n in nodes], np.int64).reshape(-1, 3)
+
+
+def _nodes(part: NDArray[Any], agents: Sequence[str]) -> list[NodeId]:
+    """Nodes of rows, in the order of ids."""
+    ids = _whole(part, 3)
+    _in_range(ids, (len(agents), MAX_NUMBER + 1, MAX_NUMBER + 1))
+    nodes = [NodeId(agents[a], epoch, number) for a, epoch, number in ids.tolist()]
+    if not all(a < b for a, b in pairwise(nodes)):
+        raise InvalidValue("nodes are not in the order of ids")
+    return nodes
+
+
+def _poses(part: NDArray[Any]) -> NDArray[Any]:
+    """Distances and turns, m and rad."""
+    poses = _of(part, np.float64, 2)
+    # Written so that NaN fails.
+    if not ((poses >= 0.0) & (poses <= (4.0 * MAX_POSITION, math.pi))).all():
+        raise InvalidValue("a distance or a turn is out of range")
+    return poses
 
 
 def _rows(pairs: Iterable[Pair], row: Mapping[NodeId, int]) -> NDArray[np.int32]:
@@ -146,6 +236,6 @@ def _of(part: NDArray[Any], kind: type[np.generic], columns: int | None = None) 
     return part
 
 
-def _in_range(rows: NDArray[Any], ends: Sequence[int]) -> None:
-    if not ((rows >= 0) & (rows < ends)).all():
+def _in_range(rows: NDArray[Any], ends: Sequence[int], least: Sequence[int] | int = 0) -> None:
+    if not ((rows >= least) & (rows < ends)).all():
         raise InvalidValue("a number is out of range")

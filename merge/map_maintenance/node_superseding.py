@@ -46,6 +46,7 @@ from mapweave.hybridmap.superseding import (
 from mapweave.merge.map_maintenance.adjacency import Adjacency
 from mapweave.merge.map_maintenance.comparisons import Comparisons
 from mapweave.merge.map_maintenance.node_age import is_older
+from mapweave.merge.map_maintenance.superseding_log import SupersedingLog
 from mapweave.merge.map_maintenance.traversability import ForeignEdges, Traversability
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link
@@ -65,12 +66,14 @@ class Superseding:
         judged: nodes that were evaluated, as they were then.
         linked: pairs of nodes with a link.
         unsure: maps that may not be right.
+        log: what the last merges changed.
     """
 
     superseded: Mapping[NodeId, Superseded] = field(default_factory=dict)
     judged: Mapping[NodeId, Node] = field(default_factory=dict)
     linked: Set[Pair] = frozenset()
     unsure: Set[MapId] = frozenset()
+    log: SupersedingLog = field(default_factory=SupersedingLog)
 
 
 class NodeSuperseder:
@@ -95,12 +98,14 @@ class NodeSuperseder:
         self._blocking: dict[NodeId, NodeId] = {}
         self._unsure: Set[MapId] = frozenset()
         self._linked: Set[Pair] = frozenset()
+        self._log = SupersedingLog()
 
     @property
     def state(self) -> Superseding:
         """What it knows after the newest merged map."""
         linked = frozenset(link.pair for link in self._links)
-        return Superseding(dict(self._superseded), dict(self._nodes_seen), linked, frozenset(self._unsure))
+        unsure = frozenset(self._unsure)
+        return Superseding(dict(self._superseded), dict(self._nodes_seen), linked, unsure, self._log)
 
     def resume(self, state: Superseding) -> None:
         """Go on from what another superseder knew, with the next merged map.
@@ -111,7 +116,7 @@ class NodeSuperseder:
             state: of merged maps of the same fleet.
         """
         self._superseded, self._nodes_seen = dict(state.superseded), dict(state.judged)
-        self._linked, self._unsure = state.linked, state.unsure
+        self._linked, self._unsure, self._log = state.linked, state.unsure, state.log
 
     def renewed(self, merged: MergedMap, unsure: Set[MapId] = frozenset()) -> MergedMap:
         """The same map with the nodes that are superseded.
@@ -121,13 +126,18 @@ class NodeSuperseder:
             unsure: maps that may not be right: their nodes and those of other robots do not supersede each
                 other.
         """
-        differ, self._unsure = self._unsure ^ unsure, unsure
+        doubted, differ, self._unsure = unsure - self._unsure, self._unsure ^ unsure, unsure
         nodes = self._changed(merged, differ)
         changed = {node for node, content in nodes.items() if self._nodes_seen.get(node) is not content}
         self._nodes_seen |= nodes
-        come = [link.pair for link in self._links.follow(merged.links)]
-        fresh = {node for pair in come if pair not in self._linked for node in pair}
+        come = {link.pair for link in self._links.follow(merged.links)} - self._linked
         self._linked = frozenset()
+        # How others have superseded each other does not depend on a map that is no longer with them.
+        self._log, undone = self._log.followed(merged, doubted, self._superseded, nodes)
+        changed |= undone.judged
+        come |= {pair for pair in undone.linked if self._links.between(*pair) is not None}
+        before = dict(self._superseded)
+        fresh = {node for pair in come for node in pair}
         fresh = changed | fresh & nodes.keys() | {node for node in nodes if node.map in differ}
         # A node that was written again is judged again, with those that it covers.
         for node, successor in tuple(self._superseded.items()):
@@ -155,6 +165,7 @@ class NodeSuperseder:
                 unsure,
             )
             round_.update(fresh | round_.reinstate())
+        self._log = self._log.noted(before, self._superseded, changed, come)
         return replace(merged, superseded=dict(sorted(self._superseded.items())))
 
     def _changed(self, merged: MergedMap, differ: Set[MapId]) -> dict[NodeId, Node]:

@@ -36,6 +36,7 @@ from mapweave.mapserver.merging.verification_cache_keeper import (
     made_by,
 )
 from mapweave.merge.map_maintenance import comparisons
+from mapweave.merge.map_maintenance.superseding_log import Changes, SupersedingLog
 from mapweave.merge.pose_graph import verification
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdict
@@ -189,16 +190,17 @@ def test_a_restarted_server_supersedes_what_it_had(before: Server, tmp_path: Pat
     kills=st.lists(st.integers(1, 72), min_size=1, max_size=3, unique=True),
     step=st.integers(4, 20),
     saved=st.sampled_from([0.0, 0.3, 1e9]),
-    gone=st.booleans(),
+    gone=st.none() | st.tuples(st.integers(0, 3), st.integers(0, 1), st.integers(1, 3)),
 )
 def test_a_killed_server_ends_as_one_that_goes_on(
-    seed: int, kills: list[int], step: int, saved: float, gone: bool
+    seed: int, kills: list[int], step: int, saved: float, gone: tuple[int, int, int] | None
 ) -> None:
-    """Also if its verification cache is older than its last merge, and a person retires a map."""
+    """Also if its verification cache is older than its last merge, and a person retires a map meanwhile."""
     log = drives(seed)
     bounds = [0, *sorted(kills), len(log)]
     parts = [log[a:b] for a, b in pairwise(bounds)]
-    constraints = retired(MapId("r0", 1)) if gone else None
+    when, robot, day = gone or (0, 0, 0)
+    constraints = None
     with TemporaryDirectory() as folder, pytest.MonkeyPatch.context() as patch:
         patch.setattr(verification_cache_keeper, "WORTHWHILE", saved)
         on, killed, done = Server(Path(folder) / "on", ()), Server(Path(folder) / "killed", ()), 0
@@ -206,7 +208,8 @@ def test_a_killed_server_ends_as_one_that_goes_on(
             on.take(part, step)
             killed.take(part, step)
             done += len(part)
-            if k == 0 and constraints is not None:
+            if gone and k == min(when, len(parts) - 1):
+                constraints = retired(MapId(f"r{robot}", day))
                 on.merger.constrain(constraints)
                 on.merge()
             killed = Server(Path(folder) / "killed", log[:done], constraints)
@@ -241,7 +244,23 @@ def random_record(rng: np.random.Generator) -> RestartRecord:
     overlaps = {pair: float(rng.uniform(3, 30)) for pair in pairs if compared & {*pair}}
     recent = RecentComparisons({node: rng.bytes(PRINT_BYTES) for node in nodes}, compared, overlaps)
     unsure = frozenset({MapId("other", 3), MapId("r0", 1)})
-    return RestartRecord(recent, judged, superseded, frozenset(pairs[::2]), unsure)
+    return RestartRecord(recent, judged, superseded, frozenset(pairs[::2]), unsure, random_log(rng, nodes))
+
+
+def random_log(rng: np.random.Generator, nodes: Sequence[NodeId]) -> SupersedingLog:
+    """Of these nodes, and of one that is gone."""
+    gone = NodeId("gone", 1, 7)
+    was = [None, Superseded(gone, 20, 0.1, 0.2), Superseded(nodes[1], 30, 0.3, 0.4)]
+    steps = tuple(
+        Changes(
+            {node: was[int(rng.integers(3))] for node in nodes if rng.random() < 0.2},
+            frozenset({gone} | {node for node in nodes if rng.random() < 0.2}),
+            frozenset((a, b) for a in nodes for b in nodes if a < b and rng.random() < 0.1),
+        )
+        for _ in range(4)
+    )
+    parts = {MapId("r0", 1): -1, MapId("r1", 2): 0}, {MapId("r2", 1): 4, MapId("far", 9): 2}
+    return SupersedingLog(steps, parts)
 
 
 @pytest.mark.parametrize("seed", range(5))
@@ -262,6 +281,15 @@ def _superseded(**fields: Any) -> Mapping[str, Any]:
     return {"superseded": {**record.superseded, node: replace(one, **fields)}}
 
 
+def _by(agent: str, **fields: Any) -> Superseded:
+    return replace(Superseded(NodeId(agent, 1, -1 if agent == "a" else 1), 20, 0.1, 0.2), **fields)
+
+
+def _logged(**fields: Any) -> Mapping[str, Any]:
+    log = random_record(np.random.default_rng(1)).log
+    return {"log": replace(log, steps=(replace(log.steps[0], **fields), *log.steps[1:]))}
+
+
 BAD: dict[str, Any] = {
     "negative count": lambda record: _superseded(found=-1),
     "large count": lambda record: _superseded(found=10**6),
@@ -276,6 +304,16 @@ BAD: dict[str, Any] = {
     "pair with itself": lambda record: {"linked": {(a, a) for a, _ in record.linked}},
     "name": lambda record: {"unsure": frozenset({MapId("R 0", 1)})},
     "epoch": lambda record: {"unsure": frozenset({MapId("r0", -1)})},
+    "log: by a node before all": lambda record: _logged(before={min(record.judged): _by("a")}),
+    "log: large count": lambda record: _logged(before={min(record.judged): _by("r0", found=10**6)}),
+    "log: no distance": lambda record: _logged(before={min(record.judged): _by("r0", distance=np.nan)}),
+    "log: pair the other way": lambda record: _logged(
+        linked={pair[::-1] for pair in record.log.steps[0].linked}
+    ),
+    "log: joined later": lambda record: {"log": SupersedingLog(record.log.steps, ({MapId("r0", 1): 5},))},
+    "log: joined before all": lambda record: {
+        "log": SupersedingLog(record.log.steps, ({MapId("r0", 1): -2},))
+    },
     "overlap": lambda record: {
         "recent": replace(record.recent, overlaps=dict.fromkeys(record.recent.overlaps, np.inf))
     },
@@ -291,14 +329,14 @@ def test_what_cannot_be_is_refused(bad: str, tmp_path: Path) -> None:
         load(tmp_path / "x", "me")
 
 
-@pytest.mark.parametrize("part", range(11))
+@pytest.mark.parametrize("part", range(17))
 @pytest.mark.parametrize("how", ["short", "kind", "shape", "numbers"])
 def test_parts_that_do_not_fit_are_refused(
     part: int, how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     record = random_record(np.random.default_rng(1))
     parts = list(restart_record_file._parts(record, "me"))
-    assert len(parts) == 11
+    assert len(parts) == 17
     array = parts[part]
     if how == "numbers":
         # Fingerprints and what is known of nodes may be any.
@@ -308,7 +346,7 @@ def test_parts_that_do_not_fit_are_refused(
         array = {
             "short": array[:-1], "kind": array.astype(np.complex128), "shape": array[..., None]
         }[how]  # fmt: skip
-        harmless = (how == "short" and part in (7, 10)) or (how == "shape" and part < 2)
+        harmless = (how == "short" and part in (7, 10, 14, 15, 16)) or (how == "shape" and part < 2)
     monkeypatch.setattr(restart_record_file, "_parts", lambda *_: [*parts[:part], array, *parts[part + 1 :]])
     save(tmp_path / "x", record, "me")
     if harmless:
