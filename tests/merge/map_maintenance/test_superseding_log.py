@@ -1,0 +1,242 @@
+"""What a map has superseded among others' nodes is undone when it goes, parts, or becomes unsure."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Iterator, Mapping, Sequence
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from mapweave.hybridmap.change import Change, ChangeBody
+from mapweave.hybridmap.constraint_subject import Apart, RetiredMap, Subject
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
+from mapweave.hybridmap.node import Node
+from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.pruned_node import PrunedNode, PrunedNodes
+from mapweave.hybridmap.superseded import Superseded
+from mapweave.mapserver.merging import node_comparisons
+from mapweave.mapserver.merging.merger import Merger
+from mapweave.merge.map_maintenance import comparisons, superseding_log
+from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
+from mapweave.merge.map_maintenance.superseding_log import SupersedingLog, Undone
+from mapweave.merge.pose_graph import verification
+from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.merge.pose_graph.verdicts import Verdict
+from synthetic.maps import changes_of
+from synthetic.world import room, take_map
+
+HOUR_NS = 3_600_000_000_000
+HONEST = [MapId(f"r{k}", 1) for k in range(4)]
+ANOTHER = MapId("x", 1)
+SEEDS = (31, 32, 33, 34)
+_found: dict[tuple[str, int, int], tuple[Node, Node, Verdict]] = {}
+
+
+def once(kind: str, a: Node, b: Node) -> Verdict:
+    """Each pair is compared once for all mergers: drives are drawn once, so nodes are the same objects."""
+    key = kind, id(a), id(b)
+    if key not in _found:
+        found = (
+            next(iter(node_comparisons.compare([(a, b)]))) if kind == "merge" else verification.verify(a, b)
+        )
+        _found[key] = a, b, found
+    return _found[key][2]
+
+
+def compare(pairs: Sequence[tuple[Node, Node]]) -> Iterator[Verdict]:
+    return (once("merge", a, b) for a, b in pairs)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def each_pair_once() -> Iterator[None]:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(comparisons, "verify", lambda a, b: once("superseding", a, b))
+        yield
+
+
+@cache
+def drives(seed: int) -> Mapping[MapId, Sequence[ChangeBody]]:
+    """Five robots in one room, hour by hour."""
+    rng = np.random.default_rng(seed)
+    world = room(0, 0, 6, 4, 700, rng)
+    out: dict[MapId, list[ChangeBody]] = {}
+    for k, map_id in enumerate((*HONEST, ANOTHER)):
+        around = rng.normal(0.0, [0.6, 0.4, 0.2], (6, 3))
+        tour = [Pose2(2.8 + x, 2.0 + y, 0.7 * n + turn) for n, (x, y, turn) in enumerate(around)]
+        nodes, edges = take_map(world, map_id, tour, rng)
+        nodes = [replace(node, stamp_ns=node.stamp_ns + k * HOUR_NS) for node in nodes]
+        out[map_id] = changes_of(nodes, edges)
+    return out
+
+
+def feed(merger: Merger, seed: int, which: MapId, bounds: Collection[int] = ()) -> MergedMap:
+    """Take a map in, with a merge after some numbers of changes, and one in the end."""
+    bodies = drives(seed)[which]
+    for a, b in pairwise(sorted({0, *bounds, len(bodies)})):
+        for k, body in enumerate(bodies[a:b], a + 1):
+            merger.on_change(Change(which, k, 0, body))
+        merger.merged()
+    return merger.merged()
+
+
+def constrained(*about: Subject) -> ManualConstraints:
+    return ManualConstraints(
+        [ManualConstraint(one, True, "anna", k, "why") for k, one in enumerate(about, 1)]
+    )
+
+
+def with_another(seed: int) -> tuple[MergedMap, Merger]:
+    """The merge of the honest maps, and one that another map has come to since then."""
+    merger = Merger(compare=compare)
+    for which in HONEST:
+        before = feed(merger, seed, which)
+    joined = feed(merger, seed, ANOTHER, range(4, 100, 4))
+    assert joined.joined(ANOTHER, HONEST[0]), "it was joined"
+    assert joined.superseded != before.superseded, "and has superseded some"
+    return before, merger
+
+
+def restarted(merger: Merger, seed: int, maps: Sequence[MapId]) -> Merger:
+    """Another process that goes on from the record of this one."""
+    again = Merger(compare=compare)
+    again.recollect(merger.findings(), merger.record())
+    again.read([(which, body) for which in maps for body in drives(seed)[which]])
+    again.constrain(merger.constraints)
+    assert again.merged().superseded == merger.merged().superseded
+    return again
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_retired_map_leaves_what_was_superseded_as_it_was(seed: int) -> None:
+    before, merger = with_another(seed)
+    merger.constrain(constrained(RetiredMap(ANOTHER)))
+    assert merger.merged().superseded == before.superseded
+    # What is taken in again can be taken out again.
+    merger.constrain(ManualConstraints())
+    assert merger.merged().joined(ANOTHER, HONEST[0])
+    merger.constrain(constrained(RetiredMap(ANOTHER)))
+    assert merger.merged().superseded == before.superseded
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+@settings(max_examples=6, deadline=None)
+@given(
+    order=st.permutations(HONEST),
+    bounds=st.sets(st.integers(1, 10)),
+    restarts=st.lists(st.booleans(), min_size=7, max_size=7),
+)
+def test_so_it_does_whatever_came_when_and_across_restarts(
+    seed: int, order: Sequence[MapId], bounds: set[int], restarts: list[bool]
+) -> None:
+    """Also if the person retires it while no server runs, takes it in again, and retires it again."""
+    merger, maps, points = Merger(compare=compare), [*order], iter(restarts)
+
+    def go_on() -> None:
+        nonlocal merger
+        if next(points):
+            merger = restarted(merger, seed, maps)
+
+    for which in order:
+        before = feed(merger, seed, which, bounds)
+    go_on()
+    feed(merger, seed, ANOTHER, bounds)
+    maps.append(ANOTHER)
+    go_on()
+    for constraints in (constrained(RetiredMap(ANOTHER)), ManualConstraints()) * 2:
+        merger.constrain(constraints)
+        go_on()
+        merged = merger.merged()
+        assert merged.superseded == before.superseded or not constraints.retired
+    go_on()
+    assert not list(points)
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_map_that_is_no_longer_joined_does_too(seed: int) -> None:
+    before, merger = with_another(seed)
+    merger.constrain(constrained(*(Apart((which, ANOTHER)) for which in HONEST)))
+    after = merger.merged()
+    assert not after.joined(ANOTHER, HONEST[0])
+    honest = {node: one for node, one in after.superseded.items() if node.map != ANOTHER}
+    assert honest == before.superseded
+
+
+def followed(superseder: NodeSuperseder, merged: MergedMap, unsure: Collection[MapId] = ()) -> MergedMap:
+    return superseder.renewed(replace(merged, superseded={}), frozenset(unsure))
+
+
+@pytest.mark.parametrize("seed", SEEDS[:2])
+def test_a_map_that_becomes_unsure_does_too(seed: int) -> None:
+    """The rest is superseded as if it had been unsure from the first."""
+    before, merger = with_another(seed)
+    first, late = NodeSuperseder(), NodeSuperseder()
+    both = merger.merged()
+    for superseder in (first, late):
+        followed(superseder, before)
+    at_once = followed(first, both, [ANOTHER])
+    followed(late, both)
+    assert followed(late, both, [ANOTHER]).superseded == at_once.superseded
+
+
+def test_maps_that_came_behind_it_are_judged_again() -> None:
+    """They are superseded by none of the map that is gone, and by nodes that are active."""
+    seed = SEEDS[0]
+    merger = Merger(compare=compare)
+    for which in (*HONEST[:2], ANOTHER, *HONEST[2:]):
+        feed(merger, seed, which)
+    merger.constrain(constrained(RetiredMap(ANOTHER)))
+    merged = merger.merged()
+    assert all(one.by.map != ANOTHER for one in merged.superseded.values())
+    assert merged.superseded.keys().isdisjoint(one.by for one in merged.superseded.values())
+    # What came before it is gone on from, and so it is the next time.
+    merger.constrain(ManualConstraints())
+    merger.merged()
+    merger.constrain(constrained(RetiredMap(ANOTHER)))
+    assert merger.merged().superseded == merged.superseded
+
+
+def test_what_superseded_a_node_before_may_be_superseded_itself() -> None:
+    """By a node that is not undone: the first one is judged again."""
+    before, _ = with_another(SEEDS[0])
+    a, b, c = (NodeId("r0", 1, k) for k in range(3))
+    by = {n: Superseded(n, 20, 0.1, 0.1) for n in (b, c)}
+    log = SupersedingLog((), ({HONEST[0]: 0, ANOTHER: 0},)).noted({a: by[b]}, {b: by[c]}, [], [])
+    superseded = {b: by[c]}
+    _, undone = log.followed(before, frozenset(), superseded, {a})
+    assert superseded == {b: by[c]} and undone.judged == {a}
+
+
+def test_pruned_maps_and_what_is_forgotten_are_not_undone(monkeypatch: pytest.MonkeyPatch) -> None:
+    before, merger = with_another(SEEDS[0])
+    both = merger.merged()
+    nodes = both.poses.keys()
+    node = min(merger.maps[ANOTHER].nodes)
+    pruned = PrunedNodes({node: PrunedNode(min(merger.maps[HONEST[0]].nodes), Pose2(), 1)})
+
+    def log_of(*maps: MergedMap) -> tuple[SupersedingLog, dict[NodeId, Superseded]]:
+        log, table = SupersedingLog(), dict[NodeId, Superseded]()
+        for merged in maps:
+            was = dict(table)
+            log, undone = log.followed(merged, frozenset(), table, nodes)
+            assert undone == Undone()
+            table = dict(merged.superseded)
+            log = log.noted(was, table, [], [])
+        return log, table
+
+    log, table = log_of(before, both)
+    _, undone = log.followed(replace(before, pruned=pruned), frozenset(), table, nodes)
+    assert undone == Undone() and table == both.superseded
+    # The same without pruning goes back to before it came.
+    log.followed(before, frozenset(), table, nodes)
+    assert table == before.superseded
+    monkeypatch.setattr(superseding_log, "MOST", 1)
+    log, table = log_of(before, both, both)
+    assert log.steps == ()
+    log.followed(before, frozenset(), table, nodes)
+    assert table == both.superseded
