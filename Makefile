@@ -50,7 +50,7 @@ slow: setup $(AUDIT)/.installed
 	@$(MAKE) --no-print-directory -j 2 slow-waits slow-most
 	$(BIN)/python -m pytest -m "slow and alone"
 
-# Beside two workers: these wait for time-outs of other programs, and need a tenth to a third of a core.
+# Beside two workers: these wait for time-outs, or drive in real time, and need a third of a core at most.
 slow-waits:
 	$(BIN)/python -m pytest -m "slow and waits"
 

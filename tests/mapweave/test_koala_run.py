@@ -71,7 +71,7 @@ wheel_noise = {d.wheel_noise}
     ("kind", "least_nodes"),
     # Sensors that reach 20 cm find no way from the start to another place.
     [
-        pytest.param(Koala25InSimulation, 10, marks=pytest.mark.slow),
+        pytest.param(Koala25InSimulation, 10, marks=(pytest.mark.slow, pytest.mark.waits)),
         pytest.param(KoalaSilverInSimulation, 5, marks=pytest.mark.scenario),
     ],
 )

@@ -85,6 +85,7 @@ def stored(cluster: PatroniCluster) -> dict[MapId, list[tuple[int, bytes]]]:
 
 
 @pytest.mark.slow
+@pytest.mark.waits
 @pytest.mark.timeout(900)
 def test_a_fleet_outlives_its_primaries_and_nothing_acknowledged_is_lost(tmp_path: Path) -> None:
     with patroni_cluster() as cluster, Children(tmp_path / "logs") as servers:

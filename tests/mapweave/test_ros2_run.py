@@ -116,6 +116,7 @@ def robot() -> Iterator[RosInSimulation]:
 
 
 @pytest.mark.slow
+@pytest.mark.waits
 @pytest.mark.timeout(400)
 def test_a_ros2_robot_maps_is_lifted_and_begins_a_new_map(robot: RosInSimulation, tmp_path: Path) -> None:
     d = robot.simulation.describe("r0")

@@ -22,6 +22,7 @@ from tests.waiting import eventually
 
 
 @pytest.mark.slow
+@pytest.mark.waits
 @pytest.mark.parametrize(
     ("loss", "words"),
     [(PostgresServer.kill, "Connection refused"), (PostgresServer.freeze, "connection timeout expired")],
