@@ -121,7 +121,6 @@ def test_20_000_nodes_are_smooth(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.alone
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 def test_a_map_file_of_20_000_nodes_is_opened_and_shown(tmp_path: Path) -> None:
     """By `mapweave open` as a process."""
