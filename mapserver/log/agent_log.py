@@ -194,8 +194,8 @@ class AgentLog:
     def commit_failed(self, now: float, wait: float) -> None:
         """The commit failed: drop the changes ahead, they will be pulled.
 
-        One is enough to find out whether the disk takes them again; more would be pulled in vain, and spend
-        what the robot may send.
+        One is enough to find out whether the disk takes them again; more would be pulled for nothing, and
+        spend what the robot may send.
         """
         self.forget_ahead()
         self.chunk = 1

@@ -152,7 +152,7 @@ def test_a_consumer_that_fails_on_a_change_gets_the_next(
 def test_a_disk_that_is_full_for_long_takes_nothing_from_what_a_robot_may_send(
     hub: MemoryHub, agent: HandAgent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    # The clock stands: 1000 changes may come in all, those that are pulled in vain included.
+    # The clock stands: 1000 changes may come in all, those that are pulled and not stored included.
     quotas = Quotas(QuotaSettings(changes=1000.0 / BURST), lambda: 0.0)
     server = Server(hub, tmp_path / "full.sqlite", quotas=quotas)
     try:
