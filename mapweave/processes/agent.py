@@ -44,7 +44,9 @@ from mapweave.processes.agent_files import (
 from mapweave.processes.learned_geometry import GeometryKeeper
 from mapweave.processes.portal_command import PortalCommand
 from mapweave.processes.server_watch import ServerWatch
+from mapweave.storage.full_disks import FullDisk, logged
 from mapweave.storage.map_file import MapFile, write_map_file
+from mapweave.storage.os_errors import DISK_FULL
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
 from mapweave.wire.ros2.settings import Ros2Link
@@ -55,6 +57,8 @@ if TYPE_CHECKING:
 
 FIRST_PATIENCE = 3.0
 """How long a robot that remembers no map asks the server for the number of its next one, s."""
+DISK_PAUSE = 1.0
+"""s between two attempts to begin a map on a full disk."""
 RECORDED = "a recording takes no orders"
 
 
@@ -198,8 +202,10 @@ class Agent:
             self.journal.close()
             raise
 
-    def _begin(self, calibration: OnlineCalibration | None = None) -> None:
-        """A fresh map, whose number no map of this robot has had."""
+    def _begin(
+        self, calibration: OnlineCalibration | None = None, stop: threading.Event | None = None
+    ) -> None:
+        """A fresh map, whose number no map of this robot has had; a full disk is waited for until `stop`."""
         options = self._options
         taken = [known_map.epoch for known_map in self.journal.maps()]
         taken += epochs_of_files(options.data, options.name)
@@ -215,11 +221,21 @@ class Agent:
                 # The same recording is the same map, down to its number.
                 stored = stored or 0
             epoch = next_epoch(taken, stored)
-        map_id = self.journal.open_map(epoch)
+        map_id = self._opened(epoch, stop)
         pipeline = Pipeline(
             map_id, self._description, self._settings, calibration=calibration, released=self._released
         )
         self._start(map_id, pipeline)
+
+    def _opened(self, epoch: int, stop: threading.Event | None) -> MapId:
+        while True:
+            try:
+                return self.journal.open_map(epoch)
+            except FullDisk as error:
+                if stop is None or stop.is_set():
+                    raise
+                logged(error)
+                stop.wait(DISK_PAUSE)
 
     def _resume(self, map_id: MapId, calibration: OnlineCalibration | None) -> None:
         kept = RetainedMap.of(self.journal, map_id)
@@ -314,18 +330,27 @@ class Agent:
         """The map that it makes."""
         return self.replicator.map_id
 
-    def begin_new_map(self) -> None:
-        """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one."""
+    def begin_new_map(self, stop: threading.Event | None = None) -> None:
+        """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one.
+
+        Args:
+            stop: until it is set, the robot stands as long as the disk is full: what it has mapped waits in
+                memory, and would be lost. None: it does not wait.
+        """
         mission, old, calibration = self.pipeline.mission, self.map_id, self.pipeline.calibration
         cause = "was lifted" if self.pipeline.put_elsewhere else f"cannot find itself on map {old}"
         self.finish()
+        while stop is not None and not stop.is_set() and not self.replicator.flush(DISK_PAUSE):
+            if DISK_FULL not in self.replicator.status().failure:
+                break
         self._leave()
         try:
             self.write_map()
         except InvalidFile as error:
             # The journal has it all.
-            self._say(str(error))
-        self._begin(calibration)
+            if not logged(error):
+                self._say(str(error))
+        self._begin(calibration, stop)
         self.pipeline.set_mission(mission)
         self._say(f"{cause}; it begins map {self.map_id}, and the old one stays")
 
@@ -342,7 +367,7 @@ class Agent:
             self.runner.run(robot, stop)
             if stop.is_set() or not self.pipeline.lost:
                 return
-            self.begin_new_map()
+            self.begin_new_map(stop)
 
     def sources(self) -> AgentSources:
         """What it knows of itself."""
