@@ -102,7 +102,10 @@ def run(arguments: argparse.Namespace) -> int:
         from mapweave.mapserver.log.opening import is_postgres
 
         if not is_postgres(arguments.store):
-            raise UsageError("--store is a PostgreSQL address: postgresql://USER@HOST/DATABASE")
+            raise UsageError(
+                f"--store {arguments.store}: give a PostgreSQL address, postgresql://USER@HOST/DATABASE; "
+                "a file needs no --store: it is in the folder of --data"
+            )
     need("server")
 
     # Modules stay: looking among them for garbage took a sixth of the start.

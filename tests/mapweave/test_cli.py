@@ -106,6 +106,18 @@ def test_scenarios_that_cannot_be_run(arguments, words, capfd, closed, tmp_path)
     assert not (tmp_path / "out" / "agents").exists()
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ("server --store maps.sqlite", "a file needs no --store: it is in the folder of --data"),
+        ("place add hall r0.1.1 --radius nan", "--radius nan: give metres, more than 0 and less than 10000"),
+        ("place add hall r0.1.1 --radius -1", "--radius -1: give metres, more than 0 and less than 10000"),
+    ],
+)
+def test_a_wrong_value_is_answered_with_what_is_right(arguments, words, capfd):
+    assert complaint(capfd, *arguments.split(), status=USAGE).endswith(words)
+
+
 @pytest.mark.slow
 def test_a_batch_names_its_failures(capfd, tmp_path):
     path = tmp_path / "two.toml"

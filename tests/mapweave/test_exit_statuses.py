@@ -108,7 +108,8 @@ CASES: dict[str, list[tuple[int, str]]] = {
     "closures": [(USAGE, "--timeout 3"), (FAILED, "--map {tmp}/none.mapweave")],
     "floor": [
         (USAGE, "ground"), (USAGE, "'' r0.1.1 --map {map}"), (USAGE, "ground r0.1 --map {map}"),
-        (NO, "ground r9.1.1 --map {map} -o {out}"),
+        (NO, "ground r9.1.1 --map {map} -o {out}"), (USAGE, "ground 0,0 --near r0.1 --map {map}"),
+        (NO, "ground 0,0 --near r9.1.1 --map {map}"), (NO, "ground 0,0 --plan none --map {map}"),
     ],
     "portal done": [(USAGE, "R0"), (FAILED, "r0 --connect {at}")],
     "keys init": [
@@ -157,7 +158,8 @@ CASES: dict[str, list[tuple[int, str]]] = {
     ],
     "map route": [
         (USAGE, "r0.1.1"), (USAGE, "r0.1.1 r0.1.3 --draw x.gif"), (NO, "r0.1.1 r9.1.1 --map {map}"),
-        (FAILED, "r0.1.1 r0.1.3 --connect {at}"),
+        (FAILED, "r0.1.1 r0.1.3 --connect {at}"), (USAGE, "0,0 r0.1.3 --near r0.1 --map {map}"),
+        (NO, "0,0 r0.1.3 --near nowhere --map {map}"),
     ],
     "map history": [(USAGE, "--most 0 --map {map}"), (FAILED, "--connect {at}")],
     "map link": [
@@ -181,6 +183,8 @@ CASES: dict[str, list[tuple[int, str]]] = {
     "map portal list": [(FAILED, "--map {tmp}/none.mapweave")],
     "map portal add": [
         (USAGE, "lift r0.1.1 r1.1.1 --kind nosuch"), (USAGE, "lift r0.1.1 r0.1.1 --kind lift --map {map}"),
+        (NO, "lift 0,0 r1.1.1 --kind lift --near nowhere --map {map}"),
+        (NO, "lift 0,0 r1.1.1 --kind lift --plan none --map {map}"),
         (USAGE, "'' r0.1.1 r1.1.1 --kind lift --map {map}"), (USAGE,
         "lift r0.1 r1.1.1 --kind lift --map {map}"),
         (USAGE, "lift r0.1.1 r1.1.1 --kind lift --note {long} --map {map}"),
