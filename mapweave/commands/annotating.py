@@ -105,7 +105,9 @@ def area_fields(arguments: argparse.Namespace) -> dict[str, object]:
     if arguments.radius is not None:
         # Written so that NaN fails.
         if not 0.0 < arguments.radius < FARTHEST:
-            raise UsageError(f"--radius {arguments.radius:g}: give metres, more than 0 and less than {FARTHEST:g}")
+            raise UsageError(
+                f"--radius {arguments.radius:g}: give metres, more than 0 and less than {FARTHEST:g}"
+            )
         fields["radius"] = arguments.radius
     if arguments.corners:
         corners = [two_numbers(word) for word in arguments.corners]
