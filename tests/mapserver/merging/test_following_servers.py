@@ -250,8 +250,8 @@ def test_a_follower_whose_merge_is_damaged_merges_itself_and_says_so(
             people.execute("DELETE FROM mapweave.result WHERE name = %s", (name,))
         else:
             people.execute("UPDATE mapweave.result SET value = %s WHERE name = %s", (damaged, name))
-    monkeypatch.setattr(merge_adoption, "PATIENCE", 1.0)
-    monkeypatch.setattr(merge_adoption, "FIRST", 1.0)
+    monkeypatch.setattr(merge_adoption, "PATIENCE", 0.1)
+    monkeypatch.setattr(merge_adoption, "FIRST", 0.1)
     servers.start("s2")
     eventually(lambda: servers["s2"].status()["merges_itself"], PATIENCE)
     assert "merge" in str(servers["s2"].status()["merges_itself"])
@@ -270,7 +270,7 @@ def test_a_follower_whose_merge_is_damaged_merges_itself_and_says_so(
 def test_a_server_with_other_settings_merges_itself(
     servers: Servers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(merge_adoption, "PATIENCE", 1.0)
+    monkeypatch.setattr(merge_adoption, "PATIENCE", 0.1)
     servers.start("s0")
     servers.start("s1", merging=MergeSettings(exclusion=ExclusionSettings(doubt=0.01)))
     servers.send(numbered(drives(1))[:24])
