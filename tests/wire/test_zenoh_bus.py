@@ -103,6 +103,7 @@ def test_a_taken_port_is_reported_in_one_line() -> None:
 
 
 @pytest.mark.slow
+@pytest.mark.waits
 def test_idle_connections_block_no_other() -> None:
     port = free_port()
     endpoints = (f"tcp/127.0.0.1:{port}",)
