@@ -111,7 +111,7 @@ class AnnotationMethods(ABC):
         *,
         radius: float | None = None,
         corners: Corners | None = None,
-        near: str = "",
+        near: NodeWord = "",
         plan: str | None = None,
         because: str = "",
         check: bool = False,
@@ -128,7 +128,7 @@ class AnnotationMethods(ABC):
             because: why.
             check: only say what it would do.
         """
-        fields = _given(node=_word(node), radius=radius, corners=corners, near=near, plan=plan)
+        fields = _given(node=_word(node), radius=radius, corners=corners, near=_word(near), plan=plan)
         return self.annotate("place", name, because, check=check, **fields)
 
     def close_way(
@@ -140,7 +140,7 @@ class AnnotationMethods(ABC):
         node: NodeWord = "",
         radius: float | None = None,
         corners: Corners | None = None,
-        near: str = "",
+        near: NodeWord = "",
         plan: str | None = None,
         begin: Time | None = None,
         end: Time | None = None,
@@ -177,7 +177,7 @@ class AnnotationMethods(ABC):
         node: NodeWord = "",
         radius: float | None = None,
         corners: Corners | None = None,
-        near: str = "",
+        near: NodeWord = "",
         plan: str | None = None,
         because: str = "",
         check: bool = False,
@@ -205,7 +205,7 @@ class AnnotationMethods(ABC):
         node: NodeWord,
         label: str,
         *,
-        near: str = "",
+        near: NodeWord = "",
         plan: str | None = None,
         because: str = "",
         check: bool = False,
@@ -224,8 +224,8 @@ class AnnotationMethods(ABC):
         if plan is not None:
             from mapweave.mapserver.plan_answers import off_plan
 
-            words = off_plan(words, self.plans().plan(plan), near, self.resolve)
-        (own,) = ids_of(words, self.resolve, near)
+            words = off_plan(words, self.plans().plan(plan), _word(near), self.resolve)
+        (own,) = ids_of(words, self.resolve, _word(near))
         name = str(NodeId.parse(own).map)
         return self.annotate("floor", name, because, check=check, node=own, label=label)
 
@@ -237,7 +237,7 @@ class AnnotationMethods(ABC):
         means: Literal["lift", "ramp", "door"],
         note: str = "",
         *,
-        near: str = "",
+        near: NodeWord = "",
         plan: str | None = None,
         because: str = "",
         check: bool = False,
@@ -255,7 +255,7 @@ class AnnotationMethods(ABC):
             because: why.
             check: only say what it would do.
         """
-        given = _given(near=near, plan=plan)
+        given = _given(near=_word(near), plan=plan)
         fields = {"a": _word(a), "b": _word(b), "means": str(means), "note": note, **given}
         return self.annotate("portal", name, because, check=check, **fields)
 
@@ -267,7 +267,7 @@ class AnnotationMethods(ABC):
         *,
         metres_per_pixel: float | None = None,
         origin: Pose2 | None = None,
-        near: str = "",
+        near: NodeWord = "",
         because: str = "",
         check: bool = False,
     ) -> str:
@@ -284,7 +284,7 @@ class AnnotationMethods(ABC):
             check: only say what it would do.
         """
         clicked = [{"at": _word(at), "u": u, "v": v} for at, u, v in pairs]
-        given = _given(metres_per_pixel=metres_per_pixel, near=near)
+        given = _given(metres_per_pixel=metres_per_pixel, near=_word(near))
         if origin is not None:
             given["origin"] = packed(origin)
         fields = {"pairs": clicked, "image": packed(image), **given}
@@ -313,10 +313,12 @@ def _where(
     node: NodeWord,
     radius: float | None,
     corners: Corners | None,
-    near: str,
+    near: NodeWord,
     plan: str | None,
 ) -> dict[str, Any]:
-    fields = _given(place=place, node=_word(node), radius=radius, corners=corners, near=near, plan=plan)
+    fields = _given(
+        place=place, node=_word(node), radius=radius, corners=corners, near=_word(near), plan=plan
+    )
     return fields if edge is None else {**fields, "edge": [_word(end) for end in edge]}
 
 

@@ -266,7 +266,7 @@ class Map(ABC):
         blocked: Iterable[tuple[NodeName, NodeName]] = (),
         via: Iterable[NodeName] = (),
         plan: str | None = None,
-        near: str = "",
+        near: NodeName = "",
     ) -> RouteExplanation:
         """The way that a robot would drive, step by step, or why there is none.
 
@@ -291,8 +291,8 @@ class Map(ABC):
         if plan is not None:
             from mapweave.mapserver.plan_answers import off_plan
 
-            words = [*off_plan(map(str, words), self.plans().plan(plan), near, self.resolve)]
-        nodes = self._named(*words, near=near)
+            words = [*off_plan(map(str, words), self.plans().plan(plan), str(near), self.resolve)]
+        nodes = self._named(*words, near=str(near))
         stopping, closed = nodes[: len(stops)], nodes[len(stops) :]
         pairs = tuple(zip(closed[::2], closed[1::2], strict=True))
         legs = []

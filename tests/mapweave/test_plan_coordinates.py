@@ -228,6 +228,15 @@ def test_positions_are_in_the_part_of_the_map_that_near_names(
     assert far["start"].startswith("r0.") and far["goal"].startswith("r0.")
     way = room.route(start, goal, near=ids[last])
     assert (str(way.start), str(way.goal)) == (ids[first], ids[last])
+    node = mapweave.NodeId.parse(ids[last])
+    assert room.route(start, goal, near=node) == way
+    for say in (
+        lambda: room.floor(start, "2", near=node, check=True),
+        lambda: room.place("there", start, near=node, check=True),
+        lambda: room.portal("gate", start, goal, "door", near=node, check=True),
+        lambda: room.close_way("wet", node=start, radius=1.0, near=node, check=True),
+    ):
+        assert say().startswith("only checked, nothing is changed: ")
     assert main([*command, "--near", "nowhere"]) == NO
     assert "'nowhere' is no place of this map" in capsys.readouterr().err
     path = tmp_path / "copy.mapweave"
