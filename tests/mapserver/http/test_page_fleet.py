@@ -28,8 +28,9 @@ PATIENCE = 120.0
 FLEET = "watched"
 ROBOTS = ("r0", "r1")
 SEEN = """
-window.seen = {};
+window.seen = {}; window.ways = {};
 setInterval(() => {
+  for (const { robot, ahead } of mapweave.page.robots) if (ahead.length) window.ways[robot] = ahead.at(-1);
   for (const { name, x, y, heading, ellipse, doing } of mapweave.painter.robots) {
     const one = window.seen[name] ||= { poses: [], doing: [], sigmas: [] }, pose = [x, y, heading].join();
     if (one.poses.at(-1) !== pose) one.poses.push(pose);
@@ -132,6 +133,7 @@ def test_robots_that_drive_are_watched_and_sent(fleet: Fleet, browser: Browser) 
     browser.type("#goal", f"{goal}\n")
     eventually(lambda: facts(browser)["mission"].startswith(f"go to {goal}, running"))
     eventually(lambda: facts(browser)["mission"].startswith(f"go to {goal}, done: at the goal"), PATIENCE)
+    assert browser.run("return window.ways.r0") == str(goal), "its way there was known while it drove"
     eventually(
         lambda: (
             f"go to {goal}, done" in browser.run("return document.querySelector('#selected p').textContent")
