@@ -78,6 +78,7 @@ def test_a_cut_link_breaks_and_accepts_no_connection_until_restored(cable):
 
 
 @pytest.mark.slow
+@pytest.mark.waits
 def test_a_bad_network_is_slow_but_loses_nothing(cable):
     cable.worsen(loss=0.5, delay=0.02)
     with socket.create_connection(("127.0.0.1", cable.port), 2) as one:
@@ -127,6 +128,7 @@ def test_a_slow_link_takes_its_time(cable):
 
 
 @pytest.mark.slow
+@pytest.mark.waits
 def test_a_lossy_link_stalls_and_carries_little_but_loses_nothing(cable):
     """As TCP does: after a time that doubles with each loss, and with the throughput of Mathis' formula."""
     cable.lose_segments(0.2, 0.02)
