@@ -91,6 +91,8 @@ METHODS = {
     **dict.fromkeys(("/constraints", "/annotations", "/plans"), "GET or POST"),
     **dict.fromkeys(("/relocalize", MISSION, *OF_ROBOTS, "/stop", "/login", "/logout"), "POST"),
 }
+PACKING = 120.0
+"""Time limit for the map as a file, s, as over Zenoh: a large one takes much longer than other answers."""
 CONTENT_TYPE = "text/plain; version=0.0.4; charset=utf-8"
 """Of the text format of Prometheus."""
 GIVEN = "goal", "via", "by", "id", "plan", "because"
@@ -314,7 +316,11 @@ class Questions:
         return await run_in_threadpool(annotate, self._server, body, by, request.scope[PERSON].name)
 
     async def _map(self, _: Request) -> Response:
-        data = await self._result(self._server.map_file)
+        try:
+            data = await self._result(self._server.map_file, PACKING)
+        except TimeoutError:
+            words = f"the map is not packed after {PACKING:g} s; the server goes on: ask again"
+            raise HTTPException(HTTPStatus.REQUEST_TIMEOUT, words) from None
         headers = {"Content-Disposition": 'attachment; filename="merged.mapweave"'}
         return Response(data, headers=headers, media_type="application/octet-stream")
 
@@ -403,9 +409,9 @@ class Questions:
         answer = await self._result(lambda: self._server.locate(photo.view, ticket))
         return json_values(answer if plan is None else answer_on_plan(answer, plan))
 
-    async def _result(self, ask: Callable[[], Future[Any]]) -> Any:
+    async def _result(self, ask: Callable[[], Future[Any]], patience: float | None = None) -> Any:
         """Ask on a thread, since in lock-step the asking thread does the work; then wait for the answer."""
-        async with asyncio.timeout(self._patience):
+        async with asyncio.timeout(self._patience if patience is None else patience):
             return await asyncio.wrap_future(await run_in_threadpool(ask))
 
 

@@ -7,9 +7,11 @@ import math
 import re
 import socket
 import struct
+import threading
 import time
 import tracemalloc
 import zlib
+from concurrent.futures import Future
 from itertools import pairwise
 
 import numpy as np
@@ -18,6 +20,7 @@ import pytest
 from mapweave.hybridmap.annotation import Annotation, Annotations, Place
 from mapweave.hybridmap.errors import Busy
 from mapweave.hybridmap.ids import MapId
+from mapweave.mapserver.http import web
 from mapweave.mapserver.http.web import Web
 from tests.mapserver.http.client import ask, post
 from tests.mapserver.stub_services import ANSWER, StubServices, picture, two_maps
@@ -366,3 +369,20 @@ def test_pages_load_nothing_but_files_of_this_server(served: Web) -> None:
         assert (headers["X-Content-Type-Options"], headers["Cache-Control"]) == ("nosniff", "no-store")
         assert headers["Server"] == "Mapweave"
         assert not re.search(rb"<script(?! src=)|<style| on[a-z]+=|javascript:", content)
+
+
+def test_a_large_map_may_take_longer_than_other_answers(
+    services: StubServices, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Packing 20 000 nodes takes minutes: over HTTP it was given up after 10 s, over Zenoh after 120 s."""
+    packed: Future[bytes] = Future()
+    monkeypatch.setattr(services, "map_file", lambda: packed, raising=False)
+    with Web(("127.0.0.1", 0), services, patience=0.2) as served:
+        threading.Timer(1.0, packed.set_result, [b"MAPWEAVE"]).start()
+        status, headers, content = ask(served, "GET", "/map")
+        assert (status, content) == (200, b"MAPWEAVE") and "merged.mapweave" in headers["Content-Disposition"]
+        packed = Future()
+        monkeypatch.setattr(web, "PACKING", 0.2)
+        status, _, content = ask(served, "GET", "/map")
+        words = "the map is not packed after 0.2 s; the server goes on: ask again"
+        assert (status, json.loads(content)) == (408, {"error": words})
