@@ -12,7 +12,7 @@ from pathlib import Path
 import networkx as nx
 
 from mapweave.agent.fleet_client import FleetClient
-from mapweave.agent.mission import Explore, GoTo, Idle, Mission
+from mapweave.agent.mission import Explore, GoTo, Idle, MayIDrive, Mission
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
@@ -22,6 +22,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.pose import Pose2, wrap_angle
+from mapweave.hybridmap.query import MAX_LEGS
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
 
@@ -35,19 +36,26 @@ BATTERY_LIFE = 7200.0
 """s."""
 CLOSE = 0.02
 """m, within which a node is reached."""
+ASK_EVERY = 1.0
+"""s, as robots ask for the right of way."""
 
 
 @dataclass
 class _Motion:
-    """Where it is in its own map, and the nodes that it still drives to."""
+    """Where it is in its own map, the nodes that it still drives to, and what it must pass before that."""
 
     pose: Pose2
     way: list[NodeId]
     length: float = 0.0
+    via: tuple[NodeId, ...] = ()
 
 
 class ReplayedRobot:
-    """Announced on a bus until closed. Call `step` again and again."""
+    """Announced on a bus until closed. Call `step` again and again.
+
+    Attributes:
+        name: of the robot.
+    """
 
     def __init__(
         self,
@@ -70,11 +78,11 @@ class ReplayedRobot:
             later: the rest, in the order in which it was made.
             journal: its file.
         """
-        self._name, self._map, self._later = map_id.agent, HybridMap(known), list(later)
+        self.name, self._map, self._later = map_id.agent, HybridMap(known), list(later)
         self._began = time.monotonic()
-        self._journal = Journal(journal, self._name)
+        self._journal = Journal(journal, self.name)
         self._replicator = Replicator(bus, keys, self._journal, map_id, servers=(server,))
-        self._control = MissionControl(self._name)
+        self._control = MissionControl(self.name)
         self._control.unknown_goal = self._unknown
         self._client = FleetClient(
             bus, keys, map_id, self._control,
@@ -83,6 +91,7 @@ class ReplayedRobot:
         first = next(iter(self._map.nodes.values()))
         self._motion = _Motion(first.map_from_robot.mean, [])
         self._mission: Mission = Explore()
+        self._number, self._asking, self._ask_at = 0, False, 0.0
         self._control.begin(MissionKind.EXPLORE)
 
     def step(self, seconds: float) -> None:
@@ -91,12 +100,15 @@ class ReplayedRobot:
         if mission is not None:
             self._mission = mission
             self._motion.way = []
+            self._motion.via = ()
             if isinstance(mission, GoTo):
-                self._motion.way = self._way_to(mission.node)
+                self._motion.via = mission.via[mission.passed :]
+                self._motion.way = self._way_over(*self._motion.via, mission.node)
             self._motion.length = self._left() or 1.0
         if isinstance(self._mission, Explore) and not self._motion.way:
             self._motion.way = self._explore()
         self._drive(seconds)
+        self._tell_way()
         status = self._status()
         self._control.follow(status)
         elapsed = time.monotonic() - self._began
@@ -130,15 +142,30 @@ class ReplayedRobot:
     def _unknown(self, node: NodeId) -> str:
         if node in self._map.nodes:
             return ""
-        if node.agent == self._name:
+        if node.agent == self.name:
             # A copy, since the robot may map one meanwhile.
             nearest = min(list(self._map.nodes), key=lambda one: abs(one.number - node.number))
             return f"there is no node {node}; the nearest is {nearest}"
-        return f"{self._name} is a recording and knows its own map alone"
+        return f"{self.name} is a recording and knows its own map alone"
 
-    def _way_to(self, goal: NodeId) -> list[NodeId]:
-        way: list[NodeId] = nx.shortest_path(self._map.graph(), self._nearest(), goal)
+    def _way_over(self, *stops: NodeId) -> list[NodeId]:
+        graph, way = self._map.graph(), [self._nearest()]
+        for stop in stops:
+            way += nx.shortest_path(graph, way[-1], stop)[1:]
         return way
+
+    def _tell_way(self) -> None:
+        """Ask for the right of way as robots do, so that the server knows the way; it never waits."""
+        if self._client.answers():
+            self._asking = False
+        now, way = time.monotonic(), tuple(self._motion.way[:MAX_LEGS])
+        going = isinstance(self._mission, GoTo) and way
+        if not going or self._asking or now < self._ask_at or not self._client.server_in_reach():
+            return
+        self._asking, self._ask_at = True, now + ASK_EVERY
+        self._number += 1
+        fix = self._nearest()
+        self._client.ask(MayIDrive(self._number, fix, self._at(fix).inverse() @ self._motion.pose, way))
 
     def _nearest(self) -> NodeId:
         here = self._motion.pose
@@ -154,7 +181,9 @@ class ReplayedRobot:
             goal, pose = self._at(motion.way[0]), motion.pose
             distance = math.hypot(goal.x - pose.x, goal.y - pose.y)
             if distance < CLOSE:
-                motion.way.pop(0)
+                passed = motion.way.pop(0)
+                while motion.via and passed == motion.via[0]:
+                    motion.via = motion.via[1:]
                 continue
             course = math.atan2(goal.y - pose.y, goal.x - pose.x)
             turn = wrap_angle(course - pose.heading)
@@ -185,6 +214,7 @@ class ReplayedRobot:
         return Status(
             doing, detail, len(self._map.nodes), 40, motion.pose, going and not motion.way,
             "goto" if going else "idle" if isinstance(self._mission, Idle) else "explore",
+            passed=len(self._mission.via) - len(motion.via) if isinstance(self._mission, GoTo) else 0,
             fix_node=fix, node_from_robot=self._at(fix).inverse() @ motion.pose,
             progress=1.0 - min(self._left() / motion.length, 1.0) if going else 0.0, located=True,
             covariance=(variance, 0.4 * variance, 0.5 * variance, HEADING_SIGMA**2),

@@ -18,6 +18,7 @@ from websockets.sync.client import connect
 
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionState
 from mapweave.hybridmap.node import Node
 from mapweave.mapserver.http.last_shown import NOTHING
@@ -25,8 +26,9 @@ from mapweave.mapserver.http.live import NOT_THERE
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.node_comparisons import compare
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
+from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.verdicts import Verdict
-from mapweave.recorded_fleet.fleet import RecordedFleet, prepare, split
+from mapweave.recorded_fleet.fleet import RecordedFleet, prepare, replayed_robots, split
 from mapweave.recorded_fleet.recording import RECORDING, recorded_maps
 from mapweave.wire.codec import encode_body
 from mapweave.wire.keys import Keys
@@ -134,6 +136,37 @@ def test_a_goal_that_is_not_there_is_refused_with_the_reason(tmp_path: Path) -> 
         (MissionState.REFUSED, "ada is a recording and knows its own map alone"),
     ]
     assert taken.state is MissionState.RUNNING
+
+
+def test_a_robot_drives_over_what_it_must_pass_and_shows_its_way(tmp_path: Path) -> None:
+    """It left out `--via`, and the page showed no way of any robot of the demo."""
+    prepare(tmp_path, tmp_path / "s0.sqlite", NOTHING)
+    via, goal = NodeId.parse("bo.1.33"), NodeId.parse("bo.1.9")
+    with (
+        closing(MemoryBus(MemoryHub())) as bus,
+        MapServer(bus, Keys("demo"), tmp_path / "s0.sqlite", "s0") as server,
+    ):
+        assert server.settle(60.0)
+        robots = {one.name: one for one in replayed_robots(bus, Keys("demo"), "s0", tmp_path)}
+        bo = robots.pop("bo")
+        for other in robots.values():
+            other.close()
+        with closing(bo), Fleet(bus=bus, by="anna") as fleet:
+            bo.step(0.2)
+            assert fleet.go("bo", str(goal), via=[str(via)]).state is MissionState.RUNNING
+
+            def way() -> tuple[NodeId, ...]:
+                bo.step(0.2)
+                (entry,) = (one for one in fleet.status().robots if one.robot == "bo")
+                return entry.ahead
+
+            eventually(lambda: goal in way() and via in way())
+            ahead = way()
+            assert ahead[-1] == goal and ahead.index(via) < len(ahead) - 1
+            for _ in range(1000):
+                bo.step(0.5)
+            (report,) = fleet.missions("bo")[-1:]
+            assert (report.state, report.passed) == (MissionState.DONE, 1)
 
 
 def test_the_recording_is_small_and_whole() -> None:
