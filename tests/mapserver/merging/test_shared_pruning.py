@@ -15,9 +15,11 @@ import pytest
 from mapweave.agent.replication.merged_poses import MergedPoses
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.ids import NodeId
+from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.store import PRUNING, PRUNING_MARK, News, Store
+from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging import merge_adoption, pruning
 from mapweave.mapserver.merging.pruning_record import PruningRecord
@@ -260,6 +262,62 @@ def test_a_change_that_waited_while_its_node_was_pruned_brings_nothing_back(
         worker.close()
     assert fresh in merged.poses, "it was sent again"
     assert gone not in merged.poses and gone in merged.pruned
+
+
+def hash_of(server: MapServer) -> str:
+    return content_hash(map_file_of(server.merged()))
+
+
+def test_a_server_that_follows_has_the_pruned_map_and_the_merges_after_it(
+    logs: Logs, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Just the leader's, without a merge of its own."""
+    for patience in ("PATIENCE", "FIRST"):
+        monkeypatch.setattr(merge_adoption, patience, 1000.0)
+    hub = MemoryHub()
+    with ExitStack() as stack:
+
+        def start(name: str) -> MapServer:
+            bus = stack.enter_context(closing(MemoryBus(hub)))
+            return stack.enter_context(MapServer(bus, KEYS, address, name, cache=tmp_path / name))
+
+        leader = start("s0")
+        eventually(lambda: leader.status()["leads"])
+        follower = start("s1")
+
+        def same() -> bool:
+            settled = leader.settle(PATIENCE) and follower.settle(PATIENCE)
+            return settled and hash_of(follower) == hash_of(leader)
+
+        feeder = stack.enter_context(closing(PostgresStore(address, "feeder")))
+        for map_id in MAPS:
+            send(feeder, logs.changes[map_id])
+        nodes = {c.body.node.id for log in logs.changes.values() for c in log if isinstance(c.body, NodePut)}
+        eventually(lambda: {*leader.merged().poses} == nodes and same())
+        assert follower.merged().superseded and not follower.merged().pruned.nodes
+
+        with monkeypatch.context() as patch:
+            patch.setattr(pruning, "DAY_NS", 1)
+
+            def pruned() -> bool:
+                leader._constrain()
+                return leader.settle(PATIENCE) and bool(leader.merged().pruned.nodes)
+
+            eventually(pruned)
+            eventually(same)
+        merged, gone = follower.merged(), {*leader.merged().pruned.nodes}
+        assert gone == {*merged.pruned.nodes} == nodes - {*merged.poses}
+        assert not any(node in follower._worker._merger.places for node in gone)
+        assert marginals(merged) == marginals(leader.merged())
+
+        # The next merge has what comes, and not what has left.
+        node = max(merged.poses)
+        again = replace(merged.maps[node.map].nodes[node], stamp_ns=BEGIN + 7)
+        send(feeder, [Change(node.map, len(logs.changes[node.map]) + 1, BEGIN, NodePut(again))])
+        eventually(lambda: leader.merged().maps[node.map].nodes[node].stamp_ns == BEGIN + 7 and same())
+        merged, counters = follower.merged(), follower._worker.counters()
+        assert merged.maps[node.map].nodes[node].stamp_ns == BEGIN + 7 and gone.isdisjoint(merged.poses)
+        assert (counters.merges, counters.verified, follower.status()["merges_itself"]) == (0, 0, "")
 
 
 CHILD = """
