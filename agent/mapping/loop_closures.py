@@ -61,13 +61,13 @@ class LoopClosures:
         recognition = register(earlier, node, None, self._rng)
         if recognition is None or recognition.evidence["sigma_xy"] >= LOOP_SIGMA:
             return None
-        if not _credible(earlier, node, recognition.node_from_robot):
+        if not agrees_with_way(earlier, node, recognition.node_from_robot):
             return None
         pose, pairs, evidence = recognition.node_from_robot, recognition.pairs, recognition.evidence
         return Edge(self._new_id(), earlier.id, node.id, pose, EdgeKind.LOOP, pairs, evidence)
 
 
-def _credible(earlier: Node, later: Node, measured: PoseGaussian) -> bool:
+def agrees_with_way(earlier: Node, later: Node, measured: PoseGaussian) -> bool:
     """Whether a recognition agrees with the robot's own way from the earlier node to the later one.
 
     The later pose is the earlier one and the way, L = E W; so the way's covariance is

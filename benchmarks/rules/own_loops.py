@@ -7,6 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapweave.agent.mapping.loop_closures import LoopClosures, agrees_with_way
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import EdgeId
@@ -59,12 +60,22 @@ def draw(
     return fleet, out, true
 
 
+def would_send(own: HybridMap, loop: Edge) -> bool:
+    """Whether a robot with this map compares the two nodes at all, and believes such a loop closure.
+
+    What the map server is given here is drawn from everywhere, so that its own rules have something to do.
+    """
+    earlier, later = own.nodes[loop.a], own.nodes[loop.b]
+    tried = LoopClosures(own, lambda: later.id).nearby(later, None)
+    return earlier in tried and agrees_with_way(earlier, later, loop.a_from_b)
+
+
 def own_loops(seed: int, count: int) -> dict[str, dict[str, dict[str, float]]]:
     """What comes of so many maps of each share of false loop closures: by whether resumed, and by share."""
     out: dict[str, dict[str, dict[str, float]]] = {}
     for name, resumed in RESUMED.items():
         for share in SHARES:
-            errors, false, kept, of = [], 0, 0, 0
+            errors, false, kept, of, sent = [], 0, 0, 0, {True: 0, False: 0}
             for run in range(count):
                 fleet, own, true = draw(seed, run, share, resumed)
                 merged = merge_maps({next(iter(fleet.maps)): own}, [])
@@ -73,11 +84,15 @@ def own_loops(seed: int, count: int) -> dict[str, dict[str, dict[str, float]]]:
                 false += sum(not right and edge not in refused for edge, right in true.items())
                 kept += sum(right and edge not in refused for edge, right in true.items())
                 of += sum(true.values())
+                for edge, right in true.items():
+                    sent[right] += own.edges[edge].kind is EdgeKind.LOOP and would_send(own, own.edges[edge])
             out.setdefault(name, {})[str(share)] = {
                 "error_m_median": round(statistics.median(errors), 4),
                 "error_m_mean": round(statistics.mean(errors), 4),
                 "false_loops": false,
                 "true_loops": kept,
                 "of_true": of,
+                "true_loops_sent": sent[True],
+                "false_loops_sent": sent[False],
             }
     return out

@@ -11,7 +11,7 @@ from benchmarks.rules.drives import mapped, recorded
 from benchmarks.rules.fleets import single_links
 from benchmarks.rules.frame_faults import FAULTS, Drive
 from benchmarks.rules.look_alikes import PAIRS, look_alikes
-from benchmarks.rules.own_loops import draw, own_loops
+from benchmarks.rules.own_loops import draw, own_loops, would_send
 from benchmarks.rules.switches import (
     ALL,
     FRAME_RULES,
@@ -27,6 +27,7 @@ from benchmarks.rules.switches import (
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.node import EdgeKind
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
@@ -66,6 +67,17 @@ def test_own_loop_closures_are_drawn_as_they_are_called() -> None:
         edge = own.edges[edge_id]
         off = (fleet.truth[edge.a].inverse() @ fleet.truth[edge.b]).inverse() @ edge.a_from_b.mean
         assert right == (np.hypot(off.x, off.y) < 0.2)
+
+
+def test_a_robot_sends_no_loop_closure_to_where_it_was_not() -> None:
+    """Nor one that is measured 10 m further on than its own poses say."""
+    _, own, true = draw(seed=3, run=0, share=50, resumed=3)
+    loops = [edge for edge in own.edges.values() if edge.kind is EdgeKind.LOOP]
+    sent = [edge for edge in loops if would_send(own, edge)]
+    assert sent and all(true[edge.id] for edge in sent)
+    for edge in sent:
+        further = PoseGaussian(edge.a_from_b.mean @ Pose2(10.0), edge.a_from_b.covariance)
+        assert not would_send(own, replace(edge, a_from_b=further))
 
 
 def test_without_a_rule_on_own_loop_closures_more_is_wrong() -> None:
