@@ -7,7 +7,6 @@ by `python -m benchmarks.train_cells --write`.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import resources
@@ -119,12 +118,6 @@ def probing(count: int, within: Any = None) -> Any:
 
     parameters: Any = faiss.SearchParametersIVF
     return parameters(nprobe=count, quantizer_params=within)
-
-
-def widened(codes: Codes) -> Iterator[Vectors]:
-    """(N, 32) codes as floats, block by block."""
-    for start in range(0, max(len(codes), 1), BLOCK):
-        yield codes[start : start + BLOCK].astype(np.float32)
 
 
 def nearest(vectors: Vectors, centres: Vectors) -> Ids:
