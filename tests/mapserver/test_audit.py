@@ -102,8 +102,9 @@ def test_the_records_name_the_holder_of_the_key(
             Fleet(endpoint, "demo", "bob", anna_key)
         with Fleet(endpoint, "demo", keys=vera_key) as vera:
             assert len(vera.constraints()) == 3
-            with pytest.raises(InvalidValue, match="key of a viewer: missions and corrections need"):
-                vera.retire(str(NODES[0]))
+            for change in (vera.retire, lambda node: vera.place("attic", node)):
+                with pytest.raises(InvalidValue, match="key of a viewer: missions and corrections need"):
+                    change(str(NODES[0]))
 
         shutil.copy(anna_key, tmp_path / "old.key.toml")
         folder.revoke("anna", "left")
