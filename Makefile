@@ -45,14 +45,17 @@ test: setup
 	@$(COMPILE)
 	$(BIN)/python -m pytest -m "not slow and not scenario" -n $(WORKERS) --maxprocesses 4 --dist worksteal
 
+# The files that have tests of a mark: to read all takes six seconds of processor time.
+marked = $$(grep -rl --include='*.py' 'mark\.$1\b' tests)
+
 slow: setup $(AUDIT)/.installed
 	@$(COMPILE)
 	@$(MAKE) --no-print-directory -j 2 slow-waits slow-most
-	$(BIN)/python -m pytest -m "slow and alone"
+	$(BIN)/python -m pytest -m "slow and alone" $(call marked,alone)
 
 # Beside two workers: these wait for time-outs, or drive in real time, and need a third of a core at most.
 slow-waits:
-	$(BIN)/python -m pytest -m "slow and waits"
+	$(BIN)/python -m pytest -m "slow and waits" $(call marked,waits)
 
 slow-most:
 	$(BIN)/python -m pytest -m "slow and not alone and not waits" -n 2 --dist worksteal
