@@ -77,6 +77,16 @@ class MappingState:
         covariance[:3, :] = covariance[:, :3] = 0.0
         return MappingState(np.zeros(3), self.rays, covariance)
 
+    def pitched(self, pitch: float) -> MappingState:
+        """The state with landmarks as a camera sees them that looks up by so much more, rad: they move down.
+
+        How uncertain they are changes by a share of the pitch only.
+        """
+        rays = self.rays.copy()
+        rays[:, 1] += pitch
+        rays /= 1.0 - pitch * self.rays[:, 1:2]
+        return MappingState(self.pose_vector, rays, self.covariance)
+
     def corrected(
         self, slots: NDArray[np.intp], residual: Array, whitening: Array
     ) -> tuple[MappingState, float]:

@@ -1,4 +1,4 @@
-"""A camera that nods: over a kerb, on a rough floor, or braking hard, all that it sees moves up or down.
+"""A camera that nods, over a kerb, on a rough floor or where a road bends: all that it sees moves up or down.
 
 The filter models motion in the plane only. A pitch of half a degree moves every landmark by several pixels in
 the same direction, and precise landmarks then fail each other's gates, or refute the wheels. Pitch differs
@@ -6,6 +6,8 @@ from wrong landmarks and wheels in one way: no motion in the plane moves everyth
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,7 +20,20 @@ SIGMAS = 4.0
 """A nod is evident if it is so many times what the filter expects the landmarks to move together."""
 
 
-def pitch_offset(innovations: Array, covariance: Array, slopes: Array) -> Array | None:
+class Nod(NamedTuple):
+    """By how much the camera looks further up than the filter's landmarks say.
+
+    Attributes:
+        pitch: rad.
+        offsets: (N, 2) to subtract from the slopes: the derivative of a pinhole camera's slopes (a, b) with
+            respect to pitch, (a b, 1 + b^2), times the pitch.
+    """
+
+    pitch: float
+    offsets: Array
+
+
+def pitch_offset(innovations: Array, covariance: Array, slopes: Array) -> Nod | None:
     """What a nod of the camera has made of the innovations, if one is evident.
 
     Args:
@@ -27,14 +42,18 @@ def pitch_offset(innovations: Array, covariance: Array, slopes: Array) -> Array 
         slopes: (N, 2) as they are measured.
 
     Returns:
-        (N, 2) to subtract from the slopes: the derivative of a pinhole camera's slopes (a, b) with respect to
-        pitch, (a b, 1 + b^2), times the median of the landmarks' pitch estimates; None if the filter may be
-        wrong by as much in the plane.
+        The median of the landmarks' pitch estimates; None if the filter may be wrong by as much in the plane.
     """
     if len(innovations) < LEAST:
         return None
     by_pitch = np.stack([slopes[:, 0] * slopes[:, 1], 1.0 + slopes[:, 1] ** 2], axis=1)
-    pitch = median(innovations[:, 1] / by_pitch[:, 1])
-    mean = 1.0 / (len(slopes) * by_pitch[:, 1])
-    expected = float(mean @ covariance[1::2, 1::2] @ mean)
-    return pitch * by_pitch if pitch**2 > SIGMAS**2 * expected else None
+    covariances = covariance[1::2, 1::2] / np.outer(by_pitch[:, 1], by_pitch[:, 1])
+    # Landmarks of unknown depth move up or down by themselves while the robot drives. So it is read off the
+    # surest, as many as make the variance of their mean least.
+    order = covariances.diagonal().argsort(kind="stable")
+    sums = covariances[np.ix_(order, order)].cumsum(axis=0).cumsum(axis=1).diagonal()
+    expected = (sums / np.arange(1, len(order) + 1) ** 2)[LEAST - 1 :]
+    more = int(expected.argmin())
+    surest = order[: LEAST + more]
+    pitch = median(innovations[surest, 1] / by_pitch[surest, 1])
+    return Nod(pitch, pitch * by_pitch) if pitch**2 > SIGMAS**2 * float(expected[more]) else None
