@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from mapweave.hybridmap.agent_status import MAX_ROBOTS, AgentStatus, FleetStatus
+from mapweave.hybridmap.agent_status import MAX_ROBOTS, MOST_AHEAD, AgentStatus, FleetStatus
 from mapweave.hybridmap.annotation import Annotation, AnnotationRequest, Annotations
 from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
@@ -138,8 +138,8 @@ LIMITS: dict[type, Limit] = {
     AgentStatus: Limit("agent status", 2**15),
     DriveRequest: Limit("drive request", 512),
     DriveAnswer: Limit("drive answer", 2**15 + 256),
-    # 300 values a robot: its mission may have 16 places on its way.
-    FleetStatus: Limit("fleet status", 2**24, 300 * MAX_ROBOTS),
+    # 300 values a robot: its mission may have 16 places on its way. A node of the way ahead is four.
+    FleetStatus: Limit("fleet status", 2**24, (300 + 4 * MOST_AHEAD) * MAX_ROBOTS),
     MissionOrder: Limit("mission", 4096),
     MissionReport: Limit("mission report", 2**15),
     MissionRequest: Limit("mission request", 4096),

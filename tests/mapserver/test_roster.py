@@ -17,6 +17,7 @@ from mapweave.hybridmap.agent_status import (
     FIRST_STATUS_PERIOD,
     LONGEST_STATUS_PERIOD,
     MAX_ROBOTS,
+    MOST_AHEAD,
     SILENT,
     AgentStatus,
     FleetStatus,
@@ -171,7 +172,10 @@ def test_one_answer_holds_all_robots_whatever_they_do() -> None:
     report = MissionReport(order, MissionState.RUNNING, portal=wait)
     status = Status("waiting", "", 7, 0, Pose2(), False, "goto", fix_node=node, portal=wait)
     said = AgentStatus(status, 1, "r0", 1, mission=report, battery=0.5)
-    entries = tuple(RobotEntry(f"r{k}", True, 0.0, said, Pose2(), 0, newest=node) for k in range(MAX_ROBOTS))
+    ahead = MOST_AHEAD * (node,)
+    entries = tuple(
+        RobotEntry(f"r{k}", True, 0.0, said, Pose2(), 0, newest=node, ahead=ahead) for k in range(MAX_ROBOTS)
+    )
     assert decode(encode(FleetStatus(entries)), FleetStatus).robots == entries
 
 
@@ -185,7 +189,9 @@ def test_a_robot_that_is_alive_under_many_maps_is_named_and_harms_itself_alone()
         bus.announce(KEYS.agent_alive(MapId("r1", 1)))
         eventually(lambda: roster.alive("r1"))
         eventually(lambda: quotas.over() == {"r3": "over its quota: 32 liveliness tokens"})
-        assert roster.robots(PlaceResolver(Router(MergedMap.empty()), Annotations())).robots[1].over_quota
+        places, way = PlaceResolver(Router(MergedMap.empty()), Annotations()), 100 * (NodeId("r3", 1, 1),)
+        entries = roster.robots(places, {"r3": way}).robots
+        assert entries[1].over_quota and [len(one.ahead) for one in entries] == [0, MOST_AHEAD]
         assert roster.alive("r3") and len(roster._alive["r3"]) == MOST_ALIVE
         for token in tokens:
             token.close()
