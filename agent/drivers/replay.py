@@ -50,7 +50,11 @@ class Replay:
         settings = options.camera if options is not None and options.camera is not None else None
         given = read_geometry(settings or folder / "camera.toml")
         self._geometry = DriveGeometry(**given) if given else None
-        self._frames = frames or read_split(folder / "splits.toml", robot, len(self.recording))
+        try:
+            self._frames = frames or read_split(folder / "splits.toml", robot, len(self.recording))
+        except DeviceError as error:
+            # Images may be too few since what follows cannot be read.
+            raise DeviceError("; ".join((str(error), *self.recording.damage))) from None
         if not 0 <= self._frames[0] <= self._frames[-1] < len(self.recording):
             raise DeviceError(f"{path}: {self._frames} is not within the {len(self.recording)} images")
         self._position = 0

@@ -19,7 +19,7 @@ from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.settings import AgentSettings
 from mapweave.drawing.map_picture import MapPicture, draw_map
 from mapweave.evaluation.map_score import FALSE_LINK, FALSE_LINK_TURN, link_recall, pose_error, score_map
-from mapweave.evaluation.pieces import pieces
+from mapweave.evaluation.pieces import pieces, say
 from mapweave.evaluation.truth import Truth
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import DeviceError, InvalidFile
@@ -186,6 +186,7 @@ def evaluate_merging(
         DeviceError: the folder lacks what is needed, or a file is wrong.
     """
     cut = pieces(folder, robots)
+    say((note for robot in cut.values() for note in robot.recording.notes), console)
     truth = Truth.read(folder / "truth.csv")
     merger = Merger(settings=merge)
     images = {}
@@ -194,6 +195,7 @@ def evaluate_merging(
         for change in tracked(changes(name, robot, settings), f"{name} maps", len(robot), console=console):
             for part in change:
                 merger.on_change(part)
+    say((line for robot in cut.values() for line in robot.damage), console)
     console.print("merging")
     began = time.perf_counter()
     merged = merger.merged()

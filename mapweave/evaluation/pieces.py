@@ -6,6 +6,8 @@ import re
 from collections.abc import Iterable
 from pathlib import Path
 
+from rich.console import Console
+
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.recordings.image_folder import images_of
 from mapweave.agent.recordings.splits import robots_of
@@ -18,6 +20,12 @@ LEAST_IMAGES = 20
 """A piece with fewer maps nothing."""
 MOST_ROBOTS = 26
 """Pieces are named by letters."""
+
+
+def say(lines: Iterable[str], console: Console) -> None:
+    """Print what is wrong with a recording, a line each; what several robots have in common once."""
+    for line in dict.fromkeys(lines):
+        console.print(line, highlight=False, markup=False)
 
 
 def pieces(folder: Path, robots: int | None) -> dict[str, Replay]:

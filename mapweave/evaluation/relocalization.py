@@ -18,7 +18,7 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.asking_again import LostDrive, trial_figures
 from mapweave.evaluation.drive import DriveMap
 from mapweave.evaluation.photographs import AppearanceMap, Photographs, photograph_trials
-from mapweave.evaluation.pieces import check_folder
+from mapweave.evaluation.pieces import check_folder, say
 from mapweave.evaluation.truth import Truth
 from mapweave.evaluation.verdict import JudgedAnswer, figures
 from mapweave.hybridmap.camera import Camera
@@ -107,9 +107,12 @@ def _examine_drive(folder: Path, settings: AgentSettings, console: Console) -> R
         )
     truth = Truth.read(folder / "truth.csv")
     mapping, asking = Replay(folder, names[0]), [Replay(folder, name) for name in names[1:]]
+    say(mapping.recording.notes, console)
     ticks = tracked(range(len(mapping)), f"{names[0]} maps", console=console)
     drive = DriveMap.of_pass(mapping, truth, settings, ticks)
-    return _ask(folder, drive, asking, truth, console)
+    evaluation = _ask(folder, drive, asking, truth, console)
+    say((line for robot in (mapping, *asking) for line in robot.damage), console)
+    return evaluation
 
 
 def evaluate_map(
@@ -128,7 +131,11 @@ def evaluate_map(
         DeviceError: the folder lacks what is needed, or a file is wrong.
     """
     truth = Truth.read(folder / "truth.csv")
-    return _ask(folder, DriveMap.of_map(merged, truth), [Replay(folder, robot)], truth, console)
+    asking = Replay(folder, robot)
+    say(asking.recording.notes, console)
+    evaluation = _ask(folder, DriveMap.of_map(merged, truth), [asking], truth, console)
+    say(asking.damage, console)
+    return evaluation
 
 
 def _ask(

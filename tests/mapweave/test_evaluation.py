@@ -311,3 +311,20 @@ def test_drives_that_are_none(drive: Path, capfd, tmp_path: Path) -> None:
     assert "there is only 1" in complaint(capfd, folder)
     (folder / "splits.toml").write_text("[[robot")
     assert "splits.toml" in complaint(capfd, folder)
+
+
+def test_what_of_a_drive_cannot_be_read_is_said(drive: Path, capfd, tmp_path: Path) -> None:
+    """An image that is left out, once for each robot; and why so few images are left that none fits."""
+    folder = Path(shutil.copytree(drive, tmp_path / "spoilt"))
+    whole = (folder / "images" / "38.png").read_bytes()
+    (folder / "images" / "38.png").write_bytes(whole[: len(whole) // 2])
+    assert main(["eval", "relocalize", str(folder), "--json"]) == 0
+    said = capfd.readouterr()
+    assert json.loads(said.out.strip().splitlines()[-1])["queries"] == 11
+    assert "38.png: not an image" in said.err and "(left out, 1 of 12 images)" in said.err
+    assert said.err.count("left out") == 1
+    lines = (folder / "odometry.csv").read_text().splitlines()
+    lines[20] = "nan,0"
+    (folder / "odometry.csv").write_text("\n".join(lines))
+    words = complaint(capfd, folder)
+    assert "frames 0 to 35 are not within the 19 images; " in words and "odometry.csv: line 21: " in words

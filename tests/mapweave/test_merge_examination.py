@@ -181,3 +181,14 @@ def test_an_unusable_recording_is_reported_in_one_line(
     output = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mapweave: ")]
     assert len(output) == 1 and words in output[0]
     assert not (tmp_path / "out").exists()
+
+
+def test_an_image_that_cannot_be_read_is_named(
+    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    folder = Path(shutil.copytree(recording, tmp_path / "spoilt"))
+    image = sorted((folder / "images").iterdir())[3]
+    image.write_bytes(image.read_bytes()[:200])
+    assert main(["eval", "merge", str(folder), "--out", str(tmp_path / "out"), "--json"]) == 0
+    said = capsys.readouterr().err
+    assert f"{image.name}: not an image" in said and "(left out, 1 of " in said
