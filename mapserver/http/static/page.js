@@ -36,7 +36,8 @@ const moved = () => painter.ask();
 const selection = new Selection(model), drawing = new Drawing(viewport, corners => selection.enclose(corners));
 const planEditor = new PlanEditor(model, viewport, moved);
 const panel = new EditPanel(model, selection, drawing, { moved, planning: openPlan });
-const page = { robots: [], commands: false, whyNot: "", node: "", robot: "", photo: [], places: [], readOnly: false, loading: true };
+const page = { robots: [], goals: [], commands: false, whyNot: "", node: "", robot: "", photo: [], places: [],
+  readOnly: false, loading: true };
 // For tests and measurements.
 window.mapweave = { model, viewport, painter, page, selection, drawing, planEditor };
 
@@ -196,7 +197,7 @@ function drawLegend() {
 }
 painter.underlays.push(drawPlans);
 // Where the photo may have been taken.
-painter.overlays.push((c, v, _, labels) => drawGoals(c, v, goalsOf(page.robots, painter.robots, model), labels), drawAnnotations,
+painter.overlays.push((c, v, _, labels) => drawGoals(c, v, page.goals, labels), drawAnnotations,
 (c, v) => {
   if (isOpen("edit")) selection.draw(c, v);
   drawing.draw(c, v);
@@ -232,6 +233,7 @@ watch({
     const selected = painter.selected >= 0 ? page.node : "";
     page.bytes = bytes;
     model.apply(message);
+    page.goals = goalsOf(page.robots, painter.robots, model);
     byId("empty").hidden = model.order.length > 0;
     if (!viewport.touched) viewport.fit(extent());
     if (selected) painter.selected = model.rowOf(selected) ?? -1;
@@ -270,6 +272,7 @@ function showRobots(robots) {
   page.robots = robots;
   const before = painter.robots;
   painter.robots = robots.map(robot => poseOf(robot, model)).filter(Boolean);
+  page.goals = goalsOf(robots, painter.robots, model);
   follow(before, painter.robots);
   if (!viewport.touched && painter.robots.some(({ x, y }) => !viewport.holds(x, y, EDGE))) viewport.fit(extent());
   listRobots(robots, name => selectRobot(name), page.readOnly ? "A map file has none." : "None has been heard of.");

@@ -10,9 +10,10 @@ from pathlib import Path
 
 import pytest
 
-from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
+from mapweave.hybridmap.agent_status import MOST_AHEAD, AgentStatus, FleetStatus, RobotEntry, Status
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.http.web import Web
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -82,7 +83,13 @@ class DrivenServices(StubServices):
         share = driven % 1.0
         at = Pose2(a.x + share * (b.x - a.x), a.y + share * (b.y - a.y), a.heading)
         status = Status("travelling", "", 3, 40, Pose2(), False, covariance=(0.01, 0.0, 0.02, 0.001))
-        return RobotEntry(f"r{k}", True, 0.1, AgentStatus(status, int(1e9 * driven), f"r{k}", 1), at, 0)
+        # Each has a long way before it.
+        ahead = tuple(NodeId(f"r{k}", 1, (int(driven) + step) % 500) for step in range(1, MOST_AHEAD + 1))
+        order = MissionOrder("m1", f"r{k}", MissionKind.GO, 1, "anna", ahead[-1])
+        said = AgentStatus(
+            status, int(1e9 * driven), f"r{k}", 1, mission=MissionReport(order, MissionState.RUNNING)
+        )
+        return RobotEntry(f"r{k}", True, 0.1, said, at, 0, ahead=ahead)
 
 
 @pytest.mark.slow
