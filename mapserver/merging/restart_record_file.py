@@ -2,13 +2,13 @@
 supersedes the nodes that it had superseded.
 
 header (JSON), agents (JSON), nodes, prints, what is known of each, superseded, links, overlaps, unsure maps,
-log: its nodes, what superseded them before, judged, linked, maps that are joined
+log: its nodes, what superseded them before, judged, linked, maps that are joined, cut, maps that have parted
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -73,7 +73,8 @@ def _parts(record: RestartRecord, made_by: str) -> Iterator[NDArray[Any]]:
     nodes = sorted(recent.prints)
     row = {node: k for k, node in enumerate(nodes)}
     logged = _nodes_of(record.log)
-    joined = {map_id for part in record.log.joined for map_id in part}
+    parted = (part for step in record.log.steps for part in step.parted)
+    joined = {map_id for part in (*record.log.joined, *parted) for map_id in part}
     agents = sorted({n.agent for n in (*nodes, *logged)} | {m.agent for m in (*record.unsure, *joined)})
     number = {agent: k for k, agent in enumerate(agents)}
     yield json_part(_header(made_by))
@@ -111,9 +112,7 @@ def _log_parts(
     yield np.array(
         [(k, row[n]) for k, step in enumerate(log.steps) for n in sorted(step.judged)], np.int64
     ).reshape(-1, 2)
-    yield np.array(
-        [(k, row[a], row[b]) for k, step in enumerate(log.steps) for a, b in sorted(step.linked)], np.int64
-    ).reshape(-1, 3)
+    yield _stepped([step.linked for step in log.steps], row)
     yield np.array(
         [
             (k, number[m.agent], m.epoch, step)
@@ -122,13 +121,29 @@ def _log_parts(
         ],
         np.int64,
     ).reshape(-1, 4)
+    yield _stepped([step.cut for step in log.steps], row)
+    yield np.array(
+        [
+            (k, group, number[m.agent], m.epoch, since)
+            for k, step in enumerate(log.steps)
+            for group, part in enumerate(step.parted)
+            for m, since in part.items()
+        ],
+        np.int64,
+    ).reshape(-1, 5)
+
+
+def _stepped(steps: Sequence[Iterable[Pair]], row: Mapping[NodeId, int]) -> NDArray[np.int64]:
+    """Pairs of each step."""
+    rows = [(k, row[a], row[b]) for k, pairs in enumerate(steps) for a, b in sorted(pairs)]
+    return np.array(rows, np.int64).reshape(-1, 3)
 
 
 def _nodes_of(log: SupersedingLog) -> list[NodeId]:
     """All nodes that a log names."""
     nodes: set[NodeId] = set()
     for step in log.steps:
-        nodes |= {*step.before, *step.judged, *(node for pair in step.linked for node in pair)}
+        nodes |= {*step.before, *step.judged, *(node for pair in (*step.linked, *step.cut) for node in pair)}
         nodes |= {was.by for was in step.before.values() if was is not None}
     return sorted(nodes)
 
@@ -164,28 +179,40 @@ def _read_log(parts: Iterator[NDArray[Any]], agents: Sequence[str]) -> Supersedi
     nodes = _nodes(next(parts), agents)
     rows, poses = _whole(next(parts), 4), _poses(next(parts))
     judged, linked, joined = _whole(next(parts), 2), _whole(next(parts), 3), _whole(next(parts), 4)
+    cut, apart = _whole(next(parts), 3), _whole(next(parts), 5)
     # No step is empty.
-    count = 1 + max((int(part[:, 0].max()) for part in (rows, judged, linked) if len(part)), default=-1)
+    stepped = [part[:, 0] for part in (rows, judged, linked, cut, apart) if len(part)]
+    count = 1 + max((int(steps.max()) for steps in stepped), default=-1)
     _in_range(rows, (MOST, len(nodes), len(nodes), MAX_LANDMARKS + 1), (0, 0, -1, 0))
     _in_range(judged, (MOST, len(nodes)))
-    _in_range(linked, (MOST, len(nodes), len(nodes)))
-    if not (linked[:, 1] < linked[:, 2]).all():
-        raise InvalidValue("a pair is not in the order of ids")
     _in_range(joined, (len(joined), len(agents), MAX_NUMBER + 1, count + 1), (0, 0, 0, -1))
+    _in_range(apart, (MOST, len(apart), len(agents), MAX_NUMBER + 1, count + 1), (0, 0, 0, 0, -1))
     before: list[dict[NodeId, Superseded | None]] = [{} for _ in range(count)]
     for (k, node, by, found), pose in zip(rows.tolist(), poses.tolist(), strict=True):
         before[k][nodes[node]] = None if by < 0 else Superseded(nodes[by], found, *pose)
     come: list[set[NodeId]] = [set() for _ in range(count)]
     for k, node in judged.tolist():
         come[k].add(nodes[node])
-    pairs: list[set[Pair]] = [set() for _ in range(count)]
-    for k, a, b in linked.tolist():
-        pairs[k].add((nodes[a], nodes[b]))
     together: dict[int, dict[MapId, int]] = {}
     for part, agent, epoch, step in joined.tolist():
         together.setdefault(part, {})[MapId(agents[agent], epoch)] = step
-    steps = (Changes(*each) for each in zip(before, map(frozenset, come), map(frozenset, pairs), strict=True))
+    parted: list[dict[int, dict[MapId, int]]] = [{} for _ in range(count)]
+    for k, group, agent, epoch, since in apart.tolist():
+        parted[k].setdefault(group, {})[MapId(agents[agent], epoch)] = since
+    pairs = _pairs_of_steps(linked, nodes, count), _pairs_of_steps(cut, nodes, count)
+    groups = (tuple(each.values()) for each in parted)
+    steps = (Changes(*each) for each in zip(before, map(frozenset, come), *pairs, groups, strict=True))
     return SupersedingLog(tuple(steps), tuple(together.values()))
+
+
+def _pairs_of_steps(rows: NDArray[Any], nodes: Sequence[NodeId], count: int) -> list[Set[Pair]]:
+    _in_range(rows, (MOST, len(nodes), len(nodes)))
+    if not (rows[:, 1] < rows[:, 2]).all():
+        raise InvalidValue("a pair is not in the order of ids")
+    pairs: list[set[Pair]] = [set() for _ in range(count)]
+    for k, a, b in rows.tolist():
+        pairs[k].add((nodes[a], nodes[b]))
+    return [frozenset(each) for each in pairs]
 
 
 def _ids(nodes: Sequence[NodeId], number: Mapping[str, int]) -> NDArray[np.int64]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Iterator
 
 from mapweave.hybridmap.ids import NodeId
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link
 
 
@@ -13,11 +14,13 @@ class Adjacency:
 
     Attributes:
         touched: nodes at which links have come or gone with the last merged map.
+        cut: pairs that were linked before it; some may be linked again.
     """
 
     def __init__(self) -> None:
         """No links yet."""
         self.touched: set[NodeId] = set()
+        self.cut: list[Pair] = []
         self._links: dict[int, Link] = {}
         self._at: dict[NodeId, dict[NodeId, Link]] = {}
 
@@ -35,6 +38,7 @@ class Adjacency:
         removed = [link for key, link in self._links.items() if key not in now]
         come = [link for key, link in now.items() if key not in self._links]
         fresh = [link for link in come if self.between(link.a, link.b) is None]
+        self.cut = [link.pair for link in removed]
         self.touched = {node for link in (*removed, *come) for node in link.pair}
         for link in removed:
             for a, b in (link.pair, link.pair[::-1]):

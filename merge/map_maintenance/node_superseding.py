@@ -131,12 +131,18 @@ class NodeSuperseder:
         changed = {node for node, content in nodes.items() if self._nodes_seen.get(node) is not content}
         self._nodes_seen |= nodes
         come = {link.pair for link in self._links.follow(merged.links)} - self._linked
+        cut = {pair for pair in (*self._links.cut, *self._linked) if self._links.between(*pair) is None}
         self._linked = frozenset()
         # How others have superseded each other does not depend on a map that is no longer with them.
         self._log, undone = self._log.followed(merged, doubted, self._superseded, nodes)
         changed |= undone.judged
-        come |= {pair for pair in undone.linked if self._links.between(*pair) is not None}
-        before = dict(self._superseded)
+        come = {
+            pair for pair in come - undone.known | undone.linked if self._links.between(*pair) is not None
+        }
+        cut |= {pair for pair in undone.known if self._links.between(*pair) is None}
+        noted = frozenset(changed), frozenset(come), cut - undone.linked
+        changed |= undone.parted_judged
+        come |= {pair for pair in undone.parted_linked if self._links.between(*pair) is not None}
         fresh = {node for pair in come for node in pair}
         fresh = changed | fresh & nodes.keys() | {node for node in nodes if node.map in differ}
         # A node that was written again is judged again, with those that it covers.
@@ -165,7 +171,7 @@ class NodeSuperseder:
                 unsure,
             )
             round_.update(fresh | round_.reinstate())
-        self._log = self._log.noted(before, self._superseded, changed, come)
+        self._log = self._log.noted(self._superseded, undone, *noted)
         return replace(merged, superseded=dict(sorted(self._superseded.items())))
 
     def _changed(self, merged: MergedMap, differ: Set[MapId]) -> dict[NodeId, Node]:

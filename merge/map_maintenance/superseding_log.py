@@ -3,13 +3,14 @@
 Which of two nodes of one place supersedes the other depends on what was superseded before, so a map has a
 share in which nodes of other maps supersede each other. When it is retired, set apart, no longer joined with
 others, or found to be one that may not be right, that is undone: the nodes that it was joined with are
-superseded as they were before it came, and what has come since is judged again.
+superseded as they were before it came, and what has come since is judged again. Where maps part that are all
+there still, that is a change like others: a map that is retired later may have been the cause of it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Collection, Container, Mapping, Set
-from dataclasses import dataclass, replace
+from collections.abc import Container, Mapping, Set
+from dataclasses import dataclass, field, replace
 from itertools import accumulate
 
 from mapweave.hybridmap.ids import MapId, NodeId
@@ -31,28 +32,44 @@ class Changes:
         before: what superseded the nodes before, of those of which that has changed.
         judged: nodes that had come, or had been written again.
         linked: pairs of nodes that had been linked.
+        cut: pairs of nodes that were linked no more.
+        parted: components before that were no longer one; each map with the number of the step before which
+            it had been joined.
     """
 
     before: Mapping[NodeId, Superseded | None]
     judged: Set[NodeId]
     linked: Set[Pair]
+    cut: Set[Pair] = frozenset()
+    parted: tuple[Mapping[MapId, int], ...] = ()
 
     def __len__(self) -> int:
         """How much there is to keep."""
-        return len(self.before) + len(self.judged) + len(self.linked)
+        lists = (self.before, self.judged, self.linked, self.cut, *self.parted)
+        return sum(map(len, lists))
 
 
 @dataclass(frozen=True)
 class Undone:
-    """What is to be judged again.
+    """What was undone before a merge.
 
     Attributes:
-        judged: nodes that had come since, or had been written again.
-        linked: pairs of nodes that had been linked since.
+        before: what was superseded then; `noted` keeps what has changed since.
+        judged: nodes that had come since, or had been written again; they are judged again.
+        linked: pairs of nodes that had been linked since, likewise.
+        known: pairs that had been linked before, and cut since: a link between them is nothing new.
+        parted_judged: the same as `judged`, of maps that have parted: the log has them where they came.
+        parted_linked: likewise.
+        parted: see `Changes`.
     """
 
+    before: Table = field(default_factory=dict)
     judged: Set[NodeId] = frozenset()
     linked: Set[Pair] = frozenset()
+    known: Set[Pair] = frozenset()
+    parted_judged: Set[NodeId] = frozenset()
+    parted_linked: Set[Pair] = frozenset()
+    parted: tuple[Mapping[MapId, int], ...] = ()
 
 
 @dataclass(frozen=True)
@@ -89,18 +106,49 @@ class SupersedingLog:
             The log without what was undone, and that.
         """
         parts = [graph.maps for graph in merged.graphs if len(graph.maps) > 1]
+        there = {which for graph in merged.graphs for which in graph.maps}
         since = {which: step for part in self.joined for which, step in part.items()}
-        bad = (since.keys() - merged.pruned.maps).difference(*parts) | doubted
+        left = (since.keys() - merged.pruned.maps).difference(*parts)
         starts: dict[MapId, int] = {}
+        for which in ((left - there) | doubted) & since.keys():
+            step = since[which]
+            for other in self._together(which, step) if step >= 0 else ():
+                starts[other] = min(starts.get(other, step), step)
+        log, undone = self._undone(starts, superseded, nodes)
+        before, now = dict(superseded), len(self.steps)
+        # They are joined since when they were, as if they had never parted.
+        for k, changes in reversed([*enumerate(self.steps)]):
+            for part in changes.parted:
+                since |= {which: step for which, step in part.items() if starts.get(which, now) <= k}
+        since |= {which: now for which, start in starts.items() if since.get(which, now) >= start}
+        starts = {}
         for part in self.joined:
-            steps = [part[which] for which in bad & part.keys() if part[which] >= 0]
+            steps = [since[which] for which in left & there & part.keys() if since[which] >= 0]
             if steps:
                 starts |= dict.fromkeys(part, min(steps))
-        log, undone = self._undone(starts, superseded, nodes)
-        now = len(self.steps)
-        since |= {which: now for which, start in starts.items() if since[which] >= start}
+        _, again = log._undone(starts, superseded, nodes)
         joined = tuple({which: since.get(which, now) for which in sorted(part)} for part in parts)
-        return replace(log, joined=joined), undone
+        whole = [part.keys() & there for part in self.joined]
+        parted = tuple(
+            {which: since[which] for which in sorted(part)}
+            for part in whole
+            if len(part) > 1 and not any(part <= other for other in parts)
+        )
+        return replace(log, joined=joined), replace(
+            undone, before=before, parted_judged=again.judged, parted_linked=again.linked, parted=parted
+        )
+
+    def _together(self, which: MapId, start: int) -> set[MapId]:
+        """Maps that were in one component with a map, or with one that was, from some step on."""
+        groups = [{*part} for part in self.joined]
+        groups += [{*part} for step in self.steps[start:] for part in step.parted]
+        out, size = {which}, 0
+        while len(out) > size:
+            size = len(out)
+            for group in groups:
+                if not group.isdisjoint(out):
+                    out |= group
+        return out
 
     def _undone(
         self, starts: Mapping[MapId, int], superseded: dict[NodeId, Superseded], nodes: Container[NodeId]
@@ -114,44 +162,50 @@ class SupersedingLog:
         """
         if not starts:
             return self, Undone()
-        steps, judged, linked, restored = list(self.steps), set[NodeId](), set[Pair](), set[NodeId]()
+        steps, judged, restored = list(self.steps), set[NodeId](), set[NodeId]()
+        linked, known = set[Pair](), set[Pair]()
         for k in reversed(range(min(starts.values()), len(steps))):
-            mine = {which for which, start in starts.items() if start <= k}
-            undone = {node for node in steps[k].before if node.map in mine and node in nodes}
+            step, mine = steps[k], {which for which, start in starts.items() if start <= k}
+            undone = {node for node in step.before if node.map in mine and node in nodes}
             for node in undone:
-                before = steps[k].before[node]
+                before = step.before[node]
                 if before is None:
                     superseded.pop(node, None)
                 else:
                     superseded[node] = before
             restored |= undone
-            again = {node for node in steps[k].judged if node.map in mine and node in nodes}
-            pairs = {
-                (a, b) for a, b in steps[k].linked if {a.map, b.map} <= mine and a in nodes and b in nodes
-            }
+            again = {node for node in step.judged if node.map in mine and node in nodes}
+            come, cut = (
+                {(a, b) for a, b in pairs if {a.map, b.map} <= mine and a in nodes and b in nodes}
+                for pairs in (step.linked, step.cut)
+            )
             judged |= again
-            linked |= pairs
-            left = {node: before for node, before in steps[k].before.items() if node not in undone}
-            steps[k] = Changes(left, steps[k].judged - again, steps[k].linked - pairs)
+            linked, known = (linked | come) - cut, (known | cut) - come
+            left = {node: before for node, before in step.before.items() if node not in undone}
+            parted = tuple(part for part in step.parted if not part.keys() <= mine)
+            steps[k] = Changes(left, step.judged - again, step.linked - come, step.cut - cut, parted)
         # What superseded a node then may itself be superseded by one that was not with them.
         stale = {node for node in restored & superseded.keys() if superseded[node].by in superseded}
         for node in stale:
             del superseded[node]
-        return replace(self, steps=tuple(steps)), Undone(judged | stale, linked)
+        return replace(self, steps=tuple(steps)), Undone({}, judged | stale, linked, known)
 
     def noted(
-        self, before: Table, now: Table, judged: Collection[NodeId], linked: Collection[Pair]
+        self, now: Table, undone: Undone, judged: Set[NodeId], linked: Set[Pair], cut: Set[Pair]
     ) -> SupersedingLog:
         """Keep what the next merge has changed.
 
         Args:
-            before: what was superseded.
-            now: what is.
+            now: what is superseded.
+            undone: before it.
             judged: nodes that have come, or were written again.
             linked: pairs that have been linked.
+            cut: pairs that are linked no more.
         """
-        differ = [node for node in before.keys() | now.keys() if before.get(node) != now.get(node)]
-        step = Changes({n: before.get(n) for n in sorted(differ)}, frozenset(judged), frozenset(linked))
+        before = undone.before
+        differ = sorted(node for node in before.keys() | now.keys() if before.get(node) != now.get(node))
+        changes = {node: before.get(node) for node in differ}
+        step = Changes(changes, frozenset(judged), frozenset(linked), frozenset(cut), undone.parted)
         steps = [*self.steps, step]
         size, gone = sum(map(len, steps)), 0
         while size > MOST:
@@ -159,5 +213,9 @@ class SupersedingLog:
             gone += 1
         # All of a step may have been undone.
         numbers = [-1] * gone + list(accumulate((len(one) > 0 for one in steps[gone:]), initial=0))
-        joined = tuple({which: numbers[k] if k >= 0 else k for which, k in p.items()} for p in self.joined)
-        return SupersedingLog(tuple(one for one in steps[gone:] if len(one)), joined)
+
+        def renumbered(parts: tuple[Mapping[MapId, int], ...]) -> tuple[Mapping[MapId, int], ...]:
+            return tuple({which: numbers[k] if k >= 0 else k for which, k in part.items()} for part in parts)
+
+        kept = (replace(one, parted=renumbered(one.parted)) for one in steps[gone:] if len(one))
+        return SupersedingLog(tuple(kept), renumbered(self.joined))

@@ -45,6 +45,7 @@ def test_who_retires_a_lie_that_no_server_can_tell_has_the_map_of_before(tmp_pat
     for name, lie in UNDECIDABLE.items():
         gone = trial.recovery(lie)
         assert gone.max_pose_difference_m <= SAME_M and not gone.links_changed, (name, gone)
+        assert not gone.superseded_otherwise, (name, gone)
         # Both maps are named, and what a person can do; in no words of the shell.
         assert "show the same places" in gone.twins and "retire it" in gone.twins, (name, gone)
         assert str(ODD) in gone.twins and "mapweave" not in gone.twins

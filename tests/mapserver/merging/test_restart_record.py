@@ -256,8 +256,10 @@ def random_log(rng: np.random.Generator, nodes: Sequence[NodeId]) -> Superseding
             {node: was[int(rng.integers(3))] for node in nodes if rng.random() < 0.2},
             frozenset({gone} | {node for node in nodes if rng.random() < 0.2}),
             frozenset((a, b) for a in nodes for b in nodes if a < b and rng.random() < 0.1),
+            frozenset((gone, node) for node in nodes[k:3]),
+            ({MapId("r2", 1): 0, MapId("far", 9): -1}, {MapId("r0", 1): 3, MapId("r1", 1): 2})[:k],
         )
-        for _ in range(4)
+        for k in range(4)
     )
     parts = {MapId("r0", 1): -1, MapId("r1", 2): 0}, {MapId("r2", 1): 4, MapId("far", 9): 2}
     return SupersedingLog(steps, parts)
@@ -310,6 +312,8 @@ BAD: dict[str, Any] = {
     "log: pair the other way": lambda record: _logged(
         linked={pair[::-1] for pair in record.log.steps[0].linked}
     ),
+    "log: cut the other way": lambda record: _logged(cut={pair[::-1] for pair in record.log.steps[0].linked}),
+    "log: parted later": lambda record: _logged(parted=({MapId("r0", 1): 5},)),
     "log: joined later": lambda record: {"log": SupersedingLog(record.log.steps, ({MapId("r0", 1): 5},))},
     "log: joined before all": lambda record: {
         "log": SupersedingLog(record.log.steps, ({MapId("r0", 1): -2},))
@@ -329,14 +333,14 @@ def test_what_cannot_be_is_refused(bad: str, tmp_path: Path) -> None:
         load(tmp_path / "x", "me")
 
 
-@pytest.mark.parametrize("part", range(17))
+@pytest.mark.parametrize("part", range(19))
 @pytest.mark.parametrize("how", ["short", "kind", "shape", "numbers"])
 def test_parts_that_do_not_fit_are_refused(
     part: int, how: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     record = random_record(np.random.default_rng(1))
     parts = list(restart_record_file._parts(record, "me"))
-    assert len(parts) == 17
+    assert len(parts) == 19
     array = parts[part]
     if how == "numbers":
         # Fingerprints and what is known of nodes may be any.
@@ -346,7 +350,7 @@ def test_parts_that_do_not_fit_are_refused(
         array = {
             "short": array[:-1], "kind": array.astype(np.complex128), "shape": array[..., None]
         }[how]  # fmt: skip
-        harmless = (how == "short" and part in (7, 10, 14, 15, 16)) or (how == "shape" and part < 2)
+        harmless = (how == "short" and part in (7, 10, 14, 15, 16, 17, 18)) or (how == "shape" and part < 2)
     monkeypatch.setattr(restart_record_file, "_parts", lambda *_: [*parts[:part], array, *parts[part + 1 :]])
     save(tmp_path / "x", record, "me")
     if harmless:

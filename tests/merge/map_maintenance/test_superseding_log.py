@@ -167,6 +167,26 @@ def test_a_map_that_is_no_longer_joined_does_too(seed: int) -> None:
     assert honest == before.superseded
 
 
+@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize("at_once", [True, False])
+@pytest.mark.parametrize("restart", [True, False])
+def test_maps_that_part_because_of_it_are_joined_as_before(seed: int, at_once: bool, restart: bool) -> None:
+    """Robots that would have been in one place at one time part, and do not once it is retired."""
+    merger = Merger(compare=compare)
+    for which in HONEST:
+        before = feed(merger, seed, which)
+    if not at_once:
+        feed(merger, seed, ANOTHER)
+    merger.constrain(constrained(*(Apart((HONEST[0], which)) for which in (*HONEST[1:], ANOTHER))))
+    parted = feed(merger, seed, ANOTHER) if at_once else merger.merged()
+    assert not parted.joined(HONEST[0], HONEST[1]) and parted.joined(HONEST[1], ANOTHER)
+    assert parted.superseded != before.superseded
+    if restart:
+        merger = restarted(merger, seed, (*HONEST, ANOTHER))
+    merger.constrain(constrained(RetiredMap(ANOTHER)))
+    assert merger.merged().superseded == before.superseded
+
+
 def followed(superseder: NodeSuperseder, merged: MergedMap, unsure: Collection[MapId] = ()) -> MergedMap:
     return superseder.renewed(replace(merged, superseded={}), frozenset(unsure))
 
@@ -206,7 +226,9 @@ def test_what_superseded_a_node_before_may_be_superseded_itself() -> None:
     before, _ = with_another(SEEDS[0])
     a, b, c = (NodeId("r0", 1, k) for k in range(3))
     by = {n: Superseded(n, 20, 0.1, 0.1) for n in (b, c)}
-    log = SupersedingLog((), ({HONEST[0]: 0, ANOTHER: 0},)).noted({a: by[b]}, {b: by[c]}, [], [])
+    log = SupersedingLog((), ({HONEST[0]: 0, ANOTHER: 0},)).noted(
+        {b: by[c]}, Undone({a: by[b]}), frozenset(), frozenset(), frozenset()
+    )
     superseded = {b: by[c]}
     _, undone = log.followed(before, frozenset(), superseded, {a})
     assert superseded == {b: by[c]} and undone.judged == {a}
@@ -222,16 +244,15 @@ def test_pruned_maps_and_what_is_forgotten_are_not_undone(monkeypatch: pytest.Mo
     def log_of(*maps: MergedMap) -> tuple[SupersedingLog, dict[NodeId, Superseded]]:
         log, table = SupersedingLog(), dict[NodeId, Superseded]()
         for merged in maps:
-            was = dict(table)
             log, undone = log.followed(merged, frozenset(), table, nodes)
-            assert undone == Undone()
+            assert undone == Undone(undone.before) and undone.before == table
             table = dict(merged.superseded)
-            log = log.noted(was, table, [], [])
+            log = log.noted(table, undone, frozenset(), frozenset(), frozenset())
         return log, table
 
     log, table = log_of(before, both)
     _, undone = log.followed(replace(before, pruned=pruned), frozenset(), table, nodes)
-    assert undone == Undone() and table == both.superseded
+    assert undone == Undone(both.superseded) and table == both.superseded
     # The same without pruning goes back to before it came.
     log.followed(before, frozenset(), table, nodes)
     assert table == before.superseded
