@@ -50,7 +50,7 @@ def map_file_of(
         "merged",
         merged.summary(),
         tuple(whole.contents()),
-        dict(merged.poses),
+        merged.poses.all() if isinstance(merged.poses, NodePoses) else dict(merged.poses),
         tuple(RefusedPair(r.a, r.b, r.reason, _edge(merged, r)) for r in merged.refused),
         merged.constraints.made,
         merged.superseded,

@@ -78,6 +78,14 @@ class NodePoses(Mapping[NodeId, Placement]):
             raise KeyError(node)
         return Placement(number, self._graphs[number].pose_gaussian(node))
 
+    def all(self) -> dict[NodeId, Placement]:
+        """Those of all nodes: in a large map much quicker than one by one, not to the last bit the same."""
+        return {
+            node: Placement(number, pose)
+            for number, graph in enumerate(self._graphs)
+            for node, pose in graph.poses().items()
+        }
+
     def __contains__(self, node: object) -> bool:
         """Whether a node is there."""
         return isinstance(node, NodeId) and self.number(node) is not None

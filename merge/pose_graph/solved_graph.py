@@ -18,7 +18,8 @@ if TYPE_CHECKING:
     from scipy import sparse
 
 AT_ONCE = 256
-"""Nodes whose marginal covariances are solved for together: all at once would take memory by the square."""
+"""Nodes whose marginal covariances are solved for together: all at once would take memory by the square. In
+graphs of up to FEW nodes; of larger ones they are worked out from each other."""
 
 FEW = 2048
 """Up to as many nodes have their marginal covariances worked out all at once when one is asked for."""
@@ -94,6 +95,14 @@ class PoseGraph:
     def poses(self) -> dict[NodeId, PoseGaussian]:
         """Each node's pose with its marginal covariance."""
         out: dict[NodeId, PoseGaussian] = {}
+        if len(self.nodes) > FEW:
+            from mapweave.merge.pose_graph.marginal_covariances import marginal_covariances
+
+            marginals = marginal_covariances(self.information)
+            return {
+                node: PoseGaussian(Pose2.from_vector(mean), nearest_covariance(covariance))
+                for node, mean, covariance in zip(self.nodes, self.means, marginals, strict=True)
+            }
         for first in range(0, len(self.nodes), AT_ONCE):
             some = self.nodes[first : first + AT_ONCE]
             joint = self.covariance(some)

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from mapweave.mapserver.map_files import map_file_of, merged_of
+from mapweave.merge.pose_graph import solved_graph
+from mapweave.merge.pose_graph.merged_map import NodePoses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
+from mapweave.storage.map_file import pack_map_file
 from tests.mapserver.stub_services import two_maps
 
 
@@ -30,3 +35,27 @@ def test_opening_a_map_solves_for_no_covariance_that_is_not_asked_for(
             rtol=0.05,
             atol=1e-9,
         )
+
+
+def test_a_large_map_is_written_without_solving_for_each_node(monkeypatch: pytest.MonkeyPatch) -> None:
+    """20 000 nodes took two minutes; and the same map gives the same file, whatever was asked before."""
+    merged = two_maps()
+    expected = {node: merged.poses[node].merged_from_robot for node in merged.poses}
+    monkeypatch.setattr(solved_graph, "FEW", 3)
+    large = replace(merged, graphs=tuple(map(fresh, merged.graphs)))
+    large = replace(large, poses=NodePoses(large.graphs))
+    first = pack_map_file(map_file_of(large))
+    large.poses[next(iter(large.poses))]
+    assert pack_map_file(map_file_of(large)) == first
+    monkeypatch.setattr(PoseGraph, "covariance", None)
+    content = map_file_of(large)
+    assert content.poses.keys() == expected.keys()
+    for node, (number, pose) in content.poses.items():
+        assert number == merged.component_of(node)
+        assert np.array_equal(pose.mean.vector, expected[node].mean.vector)
+        assert np.allclose(pose.covariance, expected[node].covariance, rtol=1e-6, atol=1e-12)
+
+
+def fresh(graph: PoseGraph) -> PoseGraph:
+    """The same, of which nothing has been asked yet."""
+    return PoseGraph(graph.anchor, graph.nodes, graph.means, graph.information)

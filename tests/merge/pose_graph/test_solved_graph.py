@@ -3,12 +3,15 @@
 import numpy as np
 import pytest
 import scipy.optimize
+import scipy.sparse
 
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.pose_graph import solved_graph
 from mapweave.merge.pose_graph.component import solve_graph
 from mapweave.merge.pose_graph.factors import LEAST_SIGMAS, RelativePose
+from mapweave.merge.pose_graph.marginal_covariances import marginal_covariances
+from mapweave.merge.pose_graph.solved_graph import PoseGraph
 
 IDS = [NodeId("a", 1, k) for k in range(8)]
 
@@ -132,6 +135,43 @@ def test_marginals_some_at_a_time_are_those_of_all_at_once(monkeypatch: pytest.M
     for k, node in enumerate(IDS):
         assert np.allclose(result[node].covariance, joint[k, :, k, :], rtol=1e-9, atol=1e-14)
         assert np.array_equal(result[node].mean.vector, graph.means[k])
+
+
+@pytest.mark.parametrize("loops", [0, 4, 60])
+def test_marginals_of_a_large_graph_are_those_of_its_dense_inverse(
+    loops: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a large one they were solved for node by node, which took two minutes of 20 000 nodes."""
+    rng = np.random.default_rng(loops)
+    ids = [NodeId("a", 1, k) for k in range(60)]
+    true = [Pose2(*rng.uniform([-9, -9, -3], [9, 9, 3])) for _ in ids]
+    pairs = [(k, k + 1) for k in range(59)] + [tuple(rng.choice(60, 2, replace=False)) for _ in range(loops)]
+    spread = PoseGaussian.from_sigmas(Pose2(), 0.05, 0.02).covariance
+    steps = [
+        RelativePose(ids[i], ids[j], PoseGaussian(true[i].inverse() @ true[j], spread)) for i, j in pairs
+    ]
+    graph = solve_graph(ids[30], true[30], steps)
+    dense = np.linalg.inv(graph.information.toarray()).reshape(60, 3, 60, 3)
+    monkeypatch.setattr(solved_graph, "FEW", 59)
+    monkeypatch.setattr(PoseGraph, "covariance", None)
+    result = graph.poses()
+    assert list(result) == ids
+    for k, node in enumerate(ids):
+        assert np.allclose(result[node].covariance, dense[k, :, k, :], rtol=1e-6, atol=1e-14)
+        assert np.array_equal(result[node].mean.vector, graph.means[k])
+
+
+def test_marginals_of_nodes_that_nothing_joins() -> None:
+    """Each has its own inverse; entries that are zero by chance change nothing."""
+    rng = np.random.default_rng(4)
+    own = np.array([one @ one.T + np.eye(3) for one in rng.normal(size=(4, 3, 3))])
+    own[2] = np.diag([1.0, 2.0, 3.0])
+    information = scipy.sparse.block_diag(own, format="csc")
+    assert np.allclose(marginal_covariances(information), np.linalg.inv(own))
+    joined = information.toarray()
+    joined[0, 9] = joined[9, 0] = joined[4, 8] = joined[8, 4] = 0.1
+    expected = np.linalg.inv(joined).reshape(4, 3, 4, 3)[np.arange(4), :, np.arange(4)]
+    assert np.allclose(marginal_covariances(scipy.sparse.csc_matrix(joined)), expected)
 
 
 @pytest.mark.parametrize("seed", range(20))
