@@ -41,11 +41,8 @@ class RecognitionSettings:
         least_cells: cells of the 6 x 4 grid with an inlier, in either image.
         least_seen: of the landmarks that should be in the image by the pose found, on the side where it
             is more. A poster that hangs in two rooms explains few of what else should be there.
-        most_position_share: largest standard deviation of the position as a share of the median depth of
-            the inliers.
         most_rival: what the pose mirrored in what is seen may explain, as a share of what the best does:
-            a flat thing from afar looks almost the same from two sides. One that is nearer than the
-            position may be uncertain is part of that uncertainty.
+            a flat thing from afar looks almost the same from two sides.
     """
 
     matching: MatchSettings = field(default_factory=MatchSettings)
@@ -53,7 +50,6 @@ class RecognitionSettings:
     least_inliers: int = 10
     least_cells: int = 5
     least_seen: float = 0.12
-    most_position_share: float = 0.06
     most_rival: float = 0.8
 
 
@@ -220,7 +216,7 @@ def _examine(
     inliers = usable[fix.inliers]
     evidence = gather(a, camera_a, b, camera_b, inliers, len(pairs), len(usable), fix)
     evidence["depths"] = depth_agreement(sightings[0], fix)
-    within = fix.rival_distance <= s.most_position_share * evidence["depth"]
+    within = fix.rival_distance <= NEAR_RIVAL * evidence["depth"]
     evidence["rival"] = 0.0 if within else fix.rival
     reason = _objection(evidence, s)
     if reason:
@@ -273,6 +269,8 @@ def _sightings(
     )
 
 
+NEAR_RIVAL = 0.06
+"""Share of the median depth of the inliers: a mirrored pose that is nearer is part of the pose's uncertainty."""
 LEAST_SHARE = 0.35
 """Share of the matches that could have been inliers which must be inliers."""
 LEAST_DEPTHS = 0.5
@@ -296,6 +294,4 @@ def _objection(evidence: dict[str, float], s: RecognitionSettings) -> str:
         return f"only {e['depths']:.0%} of the landmarks that fit lie at the same depth"
     if e["rival"] > s.most_rival:
         return f"a pose on the other side of what is seen explains {e['rival']:.0%} as much"
-    if e["sigma_xy"] > s.most_position_share * e["depth"]:
-        return f"the position is uncertain by {e['sigma_xy']:.2f} m at landmarks {e['depth']:.1f} m away"
     return ""

@@ -139,7 +139,6 @@ OF_RECOGNITION = {
     "landmarks in view": ("picture",),
     "depths": ("larger copy",),
     "mirrored pose": ("poor camera", "flat thing"),
-    "certain position": ("picture",),
 }
 """What shows each rule of recognition."""
 SHOWN_BY: dict[str, tuple[tuple[str, str], ...]] = {

@@ -126,7 +126,6 @@ RECOGNITION_RULES: Mapping[str, tuple[Switch, ...]] = {
     "landmarks in view": _good(seen=1.0),
     "depths": _good(depths=1.0),
     "mirrored pose": _good(rival=0.0),
-    "certain position": _good(sigma_xy=0.0),
     "certain links": (
         (verification, "MOST_SIGMA_XY", math.inf),
         (verification, "MOST_SIGMA_HEADING", math.inf),

@@ -172,7 +172,6 @@ def test_depths_that_do_not_agree_are_refused() -> None:
         ({"least_inliers": 200}, "are needed"),
         ({"least_cells": 24}, "image cells"),
         ({"least_seen": 1.01}, "should be in the image"),
-        ({"most_position_share": 1e-6}, "position is uncertain"),
         ({"LEAST_SHARE": 1.01}, "of the matches agree"),
     ],
 )
