@@ -270,7 +270,7 @@ def _sightings(
 
 
 NEAR_RIVAL = 0.06
-"""Share of the median depth of the inliers: a mirrored pose that is nearer is part of the pose's uncertainty."""
+"""Share of the median depth of the inliers: a mirrored pose that is nearer is part of the uncertainty."""
 LEAST_SHARE = 0.35
 """Share of the matches that could have been inliers which must be inliers."""
 LEAST_DEPTHS = 0.5

@@ -25,8 +25,8 @@ REMEMBERED = 20_000
 """Pairs of nodes whose verdict is kept, the last ones asked about."""
 
 VAGUE: dict[str, Any] = {"least_cells": 2, "most_rival": 1.0}
-"""Looser thresholds for an alias: a poster seen from near fills few cells, and its copy in the next room is an
-alias all the same."""
+"""Looser thresholds for an alias: a poster seen from near fills few cells, and its copy in the next room is
+an alias all the same."""
 
 EXPLAINED_PX = 12.0
 """A match nearer than this to its prediction supports the pose."""
