@@ -62,6 +62,7 @@ class MapMaking:
         self._use(calibration.description, calibration.lens)
         self.mapper = Mapper(map_id, self.description, settings, contents, next_number, self.lens, released)
         self.floor = self._new_floor()
+        self._seen = set(self.mapper.map.nodes)
         self._changes: list[ChangeBody] = []
         self._explorer: Explorer | None = None
         self._carried = CarriedMapping(self.mapper)
@@ -245,11 +246,15 @@ class MapMaking:
         return move
 
     def _see_changes(self) -> None:
-        """Take what was changed in the map; the floor that was seen is fixed to nodes, or seen by them."""
+        """Take what was changed in the map; the floor that was seen is fixed to nodes, or seen by them.
+
+        A node that is put again, known better or with other lengths, shows no more of it.
+        """
         new = self.mapper.take_changes()
         self._changes += new
         for change in new:
-            if isinstance(change, NodePut):
+            if isinstance(change, NodePut) and change.node.id not in self._seen:
+                self._seen.add(change.node.id)
                 self.floor.see_node(change.node)
 
     def _use_calibrated(self) -> None:

@@ -26,6 +26,7 @@ from mapweave.agent.map_making import MapMaking
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mapping.node_retirement import Released, alone
 from mapweave.agent.mapping.view import RawImage
+from mapweave.agent.mapping.way_correction import WayCorrection
 from mapweave.agent.mission import Carried, Driven, Explore, GoTo, Idle, Mission, Question, ServerAnswer
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.navigation.portal_crossing import PortalCrossing
@@ -41,7 +42,7 @@ from mapweave.hybridmap.agent_status import IDENTITY, NOTHING_DRIVEN, Status
 from mapweave.hybridmap.change import ChangeBody
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.vision.lens import NO_DISTORTION, Lens
 
 MOST_ROOM = 3
@@ -60,9 +61,9 @@ class TickResult:
         status: for people.
         fault: the sensor that cannot be believed now, if any.
         images: of the nodes that were made.
-        way_moved: `status.map_from_robot` of all ticks before this one of the same map are to be moved by
-            this from the left, to be one way with those from now on: the geometry was corrected. None if
-            it was not. See `Mapper.take_way_moved`.
+        way_moved: by this `status.map_from_robot` of all ticks before this one of the same map become one
+            way with those from now on: the geometry was corrected. None if it was not. See
+            `Mapper.take_way_moved`.
     """
 
     command: Command
@@ -71,7 +72,7 @@ class TickResult:
     status: Status
     fault: SensorFault | None = None
     images: tuple[tuple[NodeId, RawImage], ...] = ()
-    way_moved: Pose2 | None = None
+    way_moved: WayCorrection | None = None
 
 
 class Pipeline:

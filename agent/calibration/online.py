@@ -79,8 +79,8 @@ class OnlineCalibration:
         lens: of its images now.
         causes: parameters that were found to be declared wrongly, in the order in which they were found.
         contradicted: what of an earlier drive was given up, a line each.
-        pending: what the mapper shall change to with its next node, if anything: the robot, the lens, and
-            `old_from_new` of the robot's frame.
+        pending: what the mapper shall change to with its next node, if anything: the robot, the lens,
+            `old_from_new` of the robot's frame, and by what the wheels' way is longer.
     """
 
     def __init__(self, description: RobotDescription, learned: LearnedGeometry | None = None) -> None:
@@ -98,7 +98,7 @@ class OnlineCalibration:
         self.description, self.lens = corrected(description, self._geometry)
         self.causes: list[Cause] = []
         self.contradicted: list[str] = []
-        self.pending: tuple[RobotDescription, Lens, Pose2] | None = None
+        self.pending: tuple[RobotDescription, Lens, Pose2, float] | None = None
         self._next = self._geometry
         self._correction = OdometryCorrection()
         self._plain = Lens(description.camera, description.distortion)
@@ -214,7 +214,7 @@ class OnlineCalibration:
     def switched(self) -> None:
         """The mapper has changed to what was pending."""
         if self.pending is not None:
-            self.description, self.lens, _ = self.pending
+            self.description, self.lens, *_ = self.pending
             self._geometry, self.pending = self._next, None
 
     def _start(
@@ -295,7 +295,12 @@ class OnlineCalibration:
         along[[*named_only, P.WHEEL_SCALE]] = False
         self._next = DriveGeometry.of(np.where(change | along, estimate.vector, target))
         self._note(change | along, change, target, estimate)
-        self.pending = (*corrected(self._declared, self._next), frame_change(self._geometry, self._next))
+        scale = self._next.wheel_scale / self._geometry.wheel_scale
+        self.pending = (
+            *corrected(self._declared, self._next),
+            frame_change(self._geometry, self._next),
+            scale,
+        )
 
     def _note(self, taken: NDArray[np.bool_], wrong: NDArray[np.bool_], before: Array, now: Estimate) -> None:
         """Note what is used from now on of a solution.

@@ -16,9 +16,11 @@ from mapweave.agent.edge_measurement.traverse import Traverse
 from mapweave.agent.ekf.triangulation import triangulate
 from mapweave.agent.mapping.anchored_keyframe import HERE, AnchoredKeyframe
 from mapweave.agent.mapping.loop_closures import LoopClosures
+from mapweave.agent.mapping.rescaling import rescaled, rescaled_edge, rescaled_node
 from mapweave.agent.mapping.tracking import EpisodeEstimate
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
 from mapweave.agent.mapping.view import PendingKeyframe, RawImage
+from mapweave.agent.mapping.way_correction import WayCorrection
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.edge_limits import unmeasurable
@@ -86,21 +88,49 @@ class KeyframeBuilder:
         self._last: AnchoredKeyframe | None = None
         self._next_number = next_number
         self._new: list[ChangeBody] = []
+        # What was begun by another process may have been measured with other wheels.
+        self._one_scale = not contents
         self._images: list[tuple[NodeId, RawImage]] = []
         self._pending: deque[Callable[[], None]] = deque()
         self._loops = LoopClosures(self.map, self.new_id)
 
-    def recalibrate(self, description: RobotDescription, old_from_new: Pose2) -> None:
+    def recalibrate(
+        self, description: RobotDescription, old_from_new: Pose2, scale: float = 1.0
+    ) -> WayCorrection:
         """Make nodes with another camera from now on; those made before keep theirs.
+
+        All lengths of the map are by the wheels, so it is put again where these went further, or less far,
+        than they said. The robot keeps its place on it, as floor and behaviours around it know that.
 
         Args:
             description: of the robot.
             old_from_new: of its frame.
+            scale: of the wheels: true over assumed way.
+
+        Returns:
+            How poses of before are to be seen from now on; the move by `old_from_new` is no part of it.
         """
         self.finish_pending()
+        way = WayCorrection()
+        if scale != 1.0 and self._one_scale:
+            way = WayCorrection.about(self.map_from_anchor.mean, scale)
+            self._rescale(way)
         clock = self._description.clock
         self._description, self._camera = replace(description, clock=clock), description.camera
         self._move(PoseGaussian(old_from_new, np.zeros((3, 3))))
+        return way
+
+    def _rescale(self, way: WayCorrection) -> None:
+        """Put all nodes and edges again, with other lengths."""
+        self._write(
+            *(rescaled_node(node, way) for node in self.map.nodes.values()),
+            *(rescaled_edge(edge, way.scale) for edge in self.map.edges.values()),
+        )
+        self.map_from_anchor = rescaled(self.map_from_anchor, way)
+        last = self._last
+        if last is not None:
+            last.node = self.map.nodes.get(last.node.id, last.node)
+            last.node_from_anchor = rescaled(last.node_from_anchor, WayCorrection(scale=way.scale))
 
     def forget_clock(self) -> None:
         """The clock has jumped: times of nodes made from now on are not to be compared with other robots'."""

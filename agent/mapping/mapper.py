@@ -19,6 +19,7 @@ from mapweave.agent.mapping.node_retirement import NodeRetirement, Released, alo
 from mapweave.agent.mapping.tracking import Tracking
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
 from mapweave.agent.mapping.view import PendingKeyframe, RawImage
+from mapweave.agent.mapping.way_correction import WayCorrection
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.track_quality import TrackQuality
@@ -62,8 +63,8 @@ class Mapper:
         self._description = description
         self._settings = settings
         self._lens = lens or Lens(description.camera, description.distortion)
-        self._pending: tuple[RobotDescription, Lens, Pose2] | None = None
-        self._way_moved: Pose2 | None = None
+        self._pending: tuple[RobotDescription, Lens, Pose2, float] | None = None
+        self._way_moved: WayCorrection | None = None
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings)
         self._keyframes = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
@@ -201,13 +202,13 @@ class Mapper:
         """The images of the nodes that were made since the last call."""
         return self._keyframes.take_images()
 
-    def take_way_moved(self) -> Pose2 | None:
+    def take_way_moved(self) -> WayCorrection | None:
         """How the way until now continues in that from now on; None unless the geometry has changed since
         the last call.
 
         When it becomes known that the axle is elsewhere below the camera, the camera keeps its place on the
         map, so `map_from_robot` jumps. The way is that of an axle all along: wheels do not go sideways, and
-        the filter let it go as they do. So what came before is moved as a whole, by this from the left.
+        the filter let it go as they do. So what came before is moved as a whole, and scaled as the map is.
         """
         moved, self._way_moved = self._way_moved, None
         return moved
@@ -246,15 +247,18 @@ class Mapper:
         elif self._anchor is not None and not self.doubtful:
             self._trajectory.step(observation, self._tracking.pose.mean)
 
-    def recalibrate(self, description: RobotDescription, lens: Lens, old_from_new: Pose2) -> None:
+    def recalibrate(
+        self, description: RobotDescription, lens: Lens, old_from_new: Pose2, scale: float = 1.0
+    ) -> None:
         """Know the robot's geometry better from the next node on.
 
         Args:
             description: of the robot.
             lens: of its camera.
             old_from_new: of the robot's frame: the axle is elsewhere, as seen from the camera.
+            scale: of the wheels: true over assumed way, since the map was begun or this was last called.
         """
-        self._pending = description, lens, old_from_new
+        self._pending = description, lens, old_from_new, scale
 
     def forget_clock(self) -> None:
         """The clock has jumped: see KeyframeBuilder."""
@@ -379,10 +383,12 @@ class Mapper:
         """Change to another geometry, between two episodes; returns whether there was any."""
         if self._pending is None:
             return False
-        (self._description, self._lens, old_from_new), self._pending = self._pending, None
+        (self._description, self._lens, old_from_new, scale), self._pending = self._pending, None
         self._sift = Sift(self._lens, self._settings.sift)
-        self._keyframes.recalibrate(self._description, old_from_new)
+        way = self._keyframes.recalibrate(self._description, old_from_new, scale)
+        self.typical_depth *= scale
         after = self._keyframes.map_from_anchor.mean
-        self._way_moved = after @ old_from_new @ after.inverse()
+        self._way_moved = WayCorrection(after @ old_from_new @ after.inverse() @ way.moved, way.scale)
+        self._trajectory.rescale(scale)
         self._trajectory.move_anchor(old_from_new)
         return True

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
+from mapweave.agent.mapping.way_correction import scaled
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.hybridmap.ranges import Ranges
@@ -53,6 +54,10 @@ class TrajectoryRecorder:
         """What comes is seen from the next anchor; so must be what was kept."""
         new_from_old = old_from_new.inverse()
         self._poses = [new_from_old @ pose for pose in self._poses]
+
+    def rescale(self, scale: float) -> None:
+        """Wheels have gone further, by a factor, than was assumed since the last node."""
+        self._poses = [scaled(pose, scale) for pose in self._poses]
 
     def segment(self, stamp_ns: int, ranges: Ranges) -> TrajectorySegment:
         """What was kept, for a node at the anchor.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
+from mapweave.agent.mapping.way_correction import WayCorrection
 from mapweave.hybridmap.pose import Pose2
 from mapweave.storage.atomic_file import read_whole, write_whole
 
@@ -38,7 +39,7 @@ class TrajectoryFile:
         self._file = path.open("a", encoding="ascii", newline="\n")
         self._begin = self._file.tell()
         # Where in the file the way before is to be moved, in bytes, and by what.
-        self._moves: list[tuple[int, Pose2]] = []
+        self._moves: list[tuple[int, WayCorrection]] = []
         self._pose = Pose2()
         self._localized: bool | None = None
         # Frames before the first at which the robot is localized, in the frame of the first of them.
@@ -61,10 +62,10 @@ class TrajectoryFile:
             self._write(stamp_ns, carried if pose is None else pose, pose is not None)
         self._pose = carried if pose is None else pose
 
-    def move(self, moved: Pose2) -> None:
-        """Move all poses that were added until now, from the left, at the end: a tick has no time for it."""
+    def move(self, moved: WayCorrection) -> None:
+        """Move all poses that were added until now, at the end: a tick has no time for it."""
         self._moves.append((self._file.tell(), moved))
-        self._pose = moved @ self._pose
+        self._pose = moved.apply(self._pose)
 
     def close(self) -> None:
         """Finish the file.
@@ -78,7 +79,7 @@ class TrajectoryFile:
         if moves:
             self._rewrite(moves)
 
-    def _rewrite(self, moves: list[tuple[int, Pose2]]) -> None:
+    def _rewrite(self, moves: list[tuple[int, WayCorrection]]) -> None:
         at, out = 0, list[bytes]()
         for line in read_whole(self._path).splitlines(keepends=True):
             later = [moved for end, moved in moves if self._begin <= at < end]
@@ -87,7 +88,7 @@ class TrajectoryFile:
                 stamp, x, y, *_, sine, cosine = line.decode("ascii").split()
                 pose = Pose2(float(x), float(y), 2.0 * math.atan2(float(sine), float(cosine)))
                 for moved in later:
-                    pose = moved @ pose
+                    pose = moved.apply(pose)
                 line = _line(stamp, pose).encode("ascii")
             out.append(line)
         write_whole(self._path, b"".join(out))

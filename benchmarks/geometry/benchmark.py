@@ -9,8 +9,8 @@ is that of the trajectory of all images against truth.csv after one rigid alignm
 know where it is the wheels lead on. error_ratio is the worst error over that with the right geometry,
 wheels_ratio the worst error over that of dead reckoning by the wheels with the same declared geometry,
 rpe_m and wheels_rpe_m the error of the motion over each metre, root mean square, diagnosed whether every
-wrong parameter was named while mapping. What was mapped before the wheels' scale is corrected keeps the scale
-(see docs/calibrate-drive.md), and so does the trajectory.
+wrong parameter was named while mapping. When the wheels' scale is corrected, the map is scaled, and the
+trajectory with it; a map that was left before keeps its own.
 
 With --seed the wheels are simulated: the increments of truth.csv with 2 % of noise a step and 1 % a drive on
 the way, 0.15 degrees a step and 0.01 degrees a step all along on the turn.
@@ -102,7 +102,7 @@ def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: fl
     here, first_from_map, maps, nodes, used = Pose2(), Pose2(), 1, 0, 0
     reckoned, correction, declared = Pose2(), OdometryCorrection(), geometry_of(description)
     mapped, by_wheels, true = list[Pose2](), list[Pose2](), list[Pose2]()
-    count = 0
+    count = begun = 0
     while (observation := robot.sense()) is not None:
         count += 1
         here = here @ observation.odometry.motion()
@@ -113,12 +113,15 @@ def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: fl
             maps += 1
             pipeline = Pipeline(MapId("map", maps), description, calibration=pipeline.calibration)
             pipeline.set_mission(Carried())
-            first_from_map = here
+            first_from_map, begun = here, len(mapped)
         step = pipeline.step(observation)
         status = step.status
         if step.way_moved is not None:
-            moved = first_from_map @ step.way_moved @ first_from_map.inverse()
-            mapped = [moved @ pose for pose in mapped]
+            moved = step.way_moved.seen_from(first_from_map)
+            # Maps that were left before keep their lengths, and end where this one begins.
+            along = moved.apply(first_from_map) @ first_from_map.inverse()
+            left = [along @ pose for pose in mapped[:begun]]
+            mapped = left + [moved.apply(pose) for pose in mapped[begun:]]
         if not status.astray and not pipeline.lost and status.doing != "standing still":
             here = first_from_map @ status.map_from_robot
             used += 1

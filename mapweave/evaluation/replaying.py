@@ -14,6 +14,7 @@ import numpy as np
 
 from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.drivers.replay import Replay
+from mapweave.agent.mapping.way_correction import WayCorrection
 from mapweave.agent.mission import Carried
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.pose_files import read_poses
@@ -198,10 +199,10 @@ def evaluate_replay(
     return ReplayEvaluation(str(replay.recording.path), frames, maps, true_poses(truth, stamps), notes)
 
 
-def _moved(frame: ReplayedFrame, moved: Pose2, part: int) -> ReplayedFrame:
+def _moved(frame: ReplayedFrame, moved: WayCorrection, part: int) -> ReplayedFrame:
     """A frame after the geometry was corrected, moved if it is of that map."""
     pose = frame.map_from_robot
-    return frame if pose is None or frame.part != part else replace(frame, map_from_robot=moved @ pose)
+    return frame if pose is None or frame.part != part else replace(frame, map_from_robot=moved.apply(pose))
 
 
 def true_poses(path: Path | None, stamps_ns: Stamps) -> Array:

@@ -13,6 +13,7 @@ from mapweave.agent.mapping import keyframe_builder
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.registration.selection import choose
@@ -197,9 +198,68 @@ def test_a_camera_found_elsewhere_leaves_the_way_without_a_jump(walls, descripti
     assert moved is not None and mapper.take_way_moved() is None
     assert here.distance(way[-1]) > 0.09, "the camera keeps its place, so the axle has another"
     for pose, x in zip(way, positions, strict=True):
-        seen = here.inverse() @ moved @ pose
+        seen = here.inverse() @ moved.apply(pose)
         assert seen.distance(Pose2(x - positions[-1])) < 0.015
         assert seen.heading == pytest.approx(0.0, abs=0.02)
+
+
+def test_wheels_that_went_less_far_than_they_said_make_the_whole_map_smaller(walls, description):
+    """Against the same drive, whose wheels were right: the map and the way are those of that drive."""
+    maps, ways = [], []
+    for assumed in (1.0, 1.1):
+        mapper, way = Mapper(MapId("r0", 1), description), []
+        for start, stretch in enumerate((np.arange(0.0, 0.5, 0.025), np.arange(0.475, 0.9, 0.025))):
+            for tick, (before, x) in enumerate(pairwise(stretch), 2 + 50 * start):
+                observation = walls.observe(Pose2(before), Pose2(x), tick)
+                wheels = replace(observation.odometry, forward=assumed * observation.odometry.forward)
+                last = replace(observation, odometry=wheels)
+                mapper.step(last)
+                if not mapper.started:
+                    mapper.begin(last)
+                way.append(mapper.map_from_robot.mean)
+            if start:
+                mapper.recalibrate(
+                    description, Lens(description.camera, description.distortion), Pose2(), 1.0 / assumed
+                )
+            mapper.finish(last)
+        mapper.finish_pending()
+        moved = mapper.take_way_moved()
+        here = mapper.map_from_robot.mean
+        maps.append(HybridMap(mapper.take_changes()))
+        ways.append([here.inverse() @ moved.apply(pose) for pose in way])
+    true, found = maps
+    assert found.nodes.keys() == true.nodes.keys() and len(true.nodes) == 2
+    assert found.edges.keys() == true.edges.keys()
+    for key, edge in true.edges.items():
+        assert found.edges[key].a_from_b.mean.distance(edge.a_from_b.mean) < 0.01
+        assert np.array_equal(found.edges[key].shared, edge.shared)
+    for key, node in true.nodes.items():
+        ours, theirs = node.landmarks, found.nodes[key].landmarks
+        both = ours.has_depth & theirs.has_depth
+        assert np.array_equal(ours.pixels, theirs.pixels)
+        assert np.median(theirs.depths[both] / ours.depths[both]) == pytest.approx(1.0, abs=0.02)
+        first, other = (m.nodes[min(m.nodes)].map_from_robot.mean.inverse() for m in maps)
+        assert (other @ found.nodes[key].map_from_robot.mean).distance(
+            first @ node.map_from_robot.mean
+        ) < 0.01
+    for mine, its in zip(*ways, strict=True):
+        assert its.distance(mine) < 0.015
+
+
+def test_a_map_that_another_process_began_keeps_its_lengths(walls, description):
+    """Its wheels may have been others."""
+    first = Mapper(MapId("r0", 1), description)
+    first.finish(drive(first, walls, list(np.arange(0.0, 0.51, 0.025))))
+    first.finish_pending()
+    contents = first.take_changes()
+    mapper = Mapper(MapId("r0", 1), description, contents=contents, next_number=9)
+    last = drive(mapper, walls, list(np.arange(0.0, 0.51, 0.025)), start=50)
+    mapper.recalibrate(description, Lens(description.camera, description.distortion), Pose2(), 0.9)
+    mapper.finish(last)
+    moved = mapper.take_way_moved()
+    assert moved.scale == 1.0
+    for change in contents:
+        assert mapper.map.nodes[change.node.id] is change.node
 
 
 def test_a_view_without_features_gives_no_node(walls, description):

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from evo.tools import file_interface
 
+from mapweave.agent.mapping.way_correction import WayCorrection
 from mapweave.agent.recordings.trajectory_file import BY_WHEELS, LOCALIZED, TrajectoryFile
 from mapweave.hybridmap.pose import Pose2
 
@@ -48,10 +49,10 @@ def test_a_way_that_is_moved_is_moved_to_the_place_where_it_was(tmp_path: Path) 
     poses = [Pose2(1.0, 0.0, 0.1), None, Pose2(2.0, 0.0, 0.2), Pose2(9.0, 0.0, 0.3)]
     for k, pose in enumerate(poses):
         if k == 3:
-            file.move(turn)
-            file.move(Pose2(0.5))
+            file.move(WayCorrection(turn))
+            file.move(WayCorrection(Pose2(0.5), 2.0))
         file.add(k * 10**9, STEP, pose)
-    file.move(Pose2(0.0, 5.0))
+    file.move(WayCorrection(Pose2(0.0, 5.0)))
     file.add(4 * 10**9, STEP, None)
     file.close()
     assert [line for line in path.read_text().splitlines() if line.startswith("#")] == [
@@ -59,10 +60,10 @@ def test_a_way_that_is_moved_is_moved_to_the_place_where_it_was(tmp_path: Path) 
     ]  # fmt: skip
     read = file_interface.read_tum_trajectory_file(path)
     assert read.timestamps == pytest.approx([0.5, 0.0, 1.0, 2.0, 3.0, 4.0])
-    # (x, y) turned by a quarter is (-y, x).
-    carried = (1.5 - 0.1 * math.sin(0.1), 8.0 + 0.1 * math.cos(0.1))
+    # (x, y) turned by a quarter is (-y, x); all that is twice as far away then.
+    carried = (2.5 - 0.2 * math.sin(0.1), 11.0 + 0.2 * math.cos(0.1))
     last = (9.0 + 0.1 * math.cos(0.3), 5.0 + 0.1 * math.sin(0.3))
-    there = [(7.0, 0.0), (1.5, 3.0 + 5.0), carried, (1.5, 4.0 + 5.0), (9.0, 5.0), last]
+    there = [(7.0, 0.0), (2.5, 6.0 + 5.0), carried, (2.5, 8.0 + 5.0), (9.0, 5.0), last]
     assert read.positions_xyz[:, :2] == pytest.approx(np.array(there), abs=1e-5)
     headings = 2.0 * np.arctan2(read.orientations_quat_wxyz[:, 3], read.orientations_quat_wxyz[:, 0])
     quarter = math.pi / 2
