@@ -195,3 +195,21 @@ def test_tracks_of_two_images_are_matched_as_by_numpy(mine: int, others: int):
         found = _common(ordered, ids)
         assert np.array_equal(found[0], first)
         assert np.array_equal(found[1], second)
+
+
+def test_a_correction_of_the_wheels_says_by_how_much_the_way_was_longer(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The map that was made by them is scaled by it."""
+    scales, switched = [1.0], OnlineCalibration.switched
+
+    def noted(online: OnlineCalibration) -> None:
+        if online.pending is not None:
+            scales.append(scales[-1] * online.pending[3])
+        switched(online)
+
+    monkeypatch.setattr(OnlineCalibration, "switched", noted)
+    declared = replace(TRUE, wheel_scale=1.05)
+    online = watched(drive(np.random.default_rng(1), TRUE, 40.0), declared, 1)
+    assert scales[-1] == pytest.approx(online.geometry.wheel_scale / 1.05)
+    assert scales[-1] == pytest.approx(1.0 / 1.05, abs=0.02)
