@@ -47,10 +47,12 @@ class Cause:
         """One line."""
         d, e = self.declared, self.estimated
         times = e / d if self.parameter in LOGARITHMIC else 1.0
+        # What makes the floor pass faster than the wheels turn is a longer way, or a camera nearer to it.
+        height = f"{'lower' if times > 1.0 else 'higher'} than declared by as much: measure it"
         seen, instead = {
             Lengths.RANGERS: ("what is ahead comes nearer", " (or its sensors read wrong by as much)"),
             Lengths.BOTH: ("the floor moves, and what is ahead comes nearer,", ""),
-        }.get(self.lengths, ("the floor moves", " (or the camera were lower by as much)"))
+        }.get(self.lengths, ("the floor moves", f" (or the camera were {height})"))
         texts = {
             P.WHEEL_SCALE: f"{seen} as if the wheels went {times:.3f} times as far as they report{instead}",
             P.TURN_SCALE: f"in turns the image turns {times:.3f} times as far as the wheels report: axle or "

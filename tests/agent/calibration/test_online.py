@@ -105,6 +105,15 @@ def test_a_wrong_geometry_is_named_and_mended(parameter: Parameter, amount: floa
     assert np.allclose(online.geometry.vector[kept], TRUE.vector[kept])
 
 
+@pytest.mark.parametrize(("declared_m", "truly"), first_quick([(0.28, "higher"), (0.32, "lower")], 1))
+def test_a_height_that_is_declared_wrongly_is_said_which_way(declared_m: float, truly: str) -> None:
+    """The wheels are right here: only what is said in brackets is true."""
+    run = drive(np.random.default_rng(1), TRUE, 40.0)
+    (cause,) = watched(run, replace(TRUE, height=declared_m), 1).causes
+    assert cause.parameter is Parameter.WHEEL_SCALE
+    assert f"the camera were {truly} than declared" in str(cause)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("amount", [math.log(1.05), -math.log(1.06)])
 def test_wheels_that_floor_and_rangers_contradict_are_corrected(amount: float) -> None:
