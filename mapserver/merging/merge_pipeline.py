@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Container, Mapping, Sequence, Set
+from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 
 import numpy as np
@@ -13,6 +13,7 @@ from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.limits import MAX_POSITION
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.hybridmap.pin import Pin
+from mapweave.hybridmap.pruned_node import PrunedNodes
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.mapserver.plausibility import fragments
 from mapweave.merge.islands import Islands
@@ -67,7 +68,7 @@ class MergePipeline:
         constraints: ManualConstraints,
         pins: Sequence[Pin] = (),
         implausible: Callable[[MergedMap], Mapping[MapId, str]] = lambda merged: {},
-        pruned: Container[MapId] = (),
+        pruned: PrunedNodes | None = None,
     ) -> MergedMap:
         """See `Islands.merge`; components are where pins hold them, oldest first.
 
@@ -78,7 +79,7 @@ class MergePipeline:
             constraints: manual constraints.
             pins: hold frames.
             implausible: gives the implausible maps of the merged map.
-            pruned: maps that had more nodes, which newer ones have superseded.
+            pruned: nodes that newer ones have superseded, and that have left their maps.
 
         Raises:
             InvalidValue: a node's pose is out of the range of messages.
@@ -88,8 +89,8 @@ class MergePipeline:
         odd = implausible(merged)
         merged = self._frames.moved(self._staged.solved(merged, odd.keys()), pins)
         _check_range(merged)
-        merged = replace(merged, implausible=odd)
-        unsure = {*merged.implausible, *fragments(maps, pruned)}
+        merged = replace(merged, implausible=odd, pruned=pruned or PrunedNodes())
+        unsure = {*merged.implausible, *fragments(maps, merged.pruned.maps)}
         return self._remover.fade(self._superseder.renewed(merged, unsure))
 
 

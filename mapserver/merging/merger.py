@@ -350,8 +350,8 @@ class Merger:
         use: Callable[[MergedMap], object] | None,
     ) -> MergedMap:
         kept = {map_id: self._kept[map_id] for map_id in maps}
-        pruned = self.pruning.pruned.maps
-        odd = partial(self._implausible.of, pruned=pruned)
+        pruned = self.pruning.pruned
+        odd = partial(self._implausible.of, pruned=pruned.maps)
         merged = pipeline.merged(kept, verdicts, touched, self._constraints, self._pins, odd, pruned)
         merged = replace(
             merged,
@@ -360,7 +360,6 @@ class Merger:
             wrong=self._wrong,
             refused_changes={m: why for m, why in self._implausible.refused.items() if m in kept},
             disbelieved={m: why for m, why in self._implausible.disbelieved.items() if m in self._kept},
-            pruned=self.pruning.pruned,
         )
         if use is not None:
             use(merged)

@@ -127,7 +127,7 @@ class NodeSuperseder:
                 other.
         """
         doubted, differ, self._unsure = unsure - self._unsure, self._unsure ^ unsure, unsure
-        nodes = self._changed(merged, differ)
+        nodes, gone = self._changed(merged, differ)
         changed = {node for node, content in nodes.items() if self._nodes_seen.get(node) is not content}
         self._nodes_seen |= nodes
         come = {link.pair for link in self._links.follow(merged.links)} - self._linked
@@ -171,12 +171,13 @@ class NodeSuperseder:
                 unsure,
             )
             round_.update(fresh | round_.reinstate())
-        self._log = self._log.noted(self._superseded, undone, *noted)
+        pruned = {node for node in gone if node in merged.pruned.nodes}
+        self._log = self._log.noted(self._superseded, undone, *noted, pruned)
         return replace(merged, superseded=dict(sorted(self._superseded.items())))
 
-    def _changed(self, merged: MergedMap, differ: Set[MapId]) -> dict[NodeId, Node]:
-        """Nodes of components that were solved again, or with maps that became unsure, or sure; removed nodes
-        are forgotten.
+    def _changed(self, merged: MergedMap, differ: Set[MapId]) -> tuple[dict[NodeId, Node], Set[NodeId]]:
+        """Nodes of components that were solved again, or with maps that became unsure, or sure; and those
+        that have gone, which are forgotten.
         """
         solved = {id(graph) for graph in self._graphs}
         remaining = {id(graph) for graph in merged.graphs}
@@ -197,12 +198,13 @@ class NodeSuperseder:
         if gone:
             self._comparisons.forget(gone)
         self._graphs = merged.graphs
-        return {
+        nodes = {
             node: merged.maps[node.map].nodes[node]
             for graph in merged.graphs
             if id(graph) not in solved or not graph.maps.isdisjoint(differ)
             for node in graph.nodes
         }
+        return nodes, gone
 
 
 GATE = 16.3

@@ -48,6 +48,14 @@ class Changes:
         lists = (self.before, self.judged, self.linked, self.cut, *self.parted)
         return sum(map(len, lists))
 
+    def without(self, pruned: Set[NodeId]) -> Changes:
+        """Without nodes that have left for good; one that such a node superseded before is to be judged."""
+        here = {node: was for node, was in self.before.items() if node not in pruned}
+        again = {node for node, was in here.items() if was is not None and was.by in pruned}
+        linked, cut = ({p for p in pairs if pruned.isdisjoint(p)} for pairs in (self.linked, self.cut))
+        judged = (self.judged | again) - pruned
+        return Changes(here | dict.fromkeys(again), judged, linked, cut, self.parted)
+
 
 @dataclass(frozen=True)
 class Undone:
@@ -191,7 +199,13 @@ class SupersedingLog:
         return replace(self, steps=tuple(steps)), Undone({}, judged | stale, linked, known)
 
     def noted(
-        self, now: Table, undone: Undone, judged: Set[NodeId], linked: Set[Pair], cut: Set[Pair]
+        self,
+        now: Table,
+        undone: Undone,
+        judged: Set[NodeId],
+        linked: Set[Pair],
+        cut: Set[Pair],
+        pruned: Set[NodeId] = frozenset(),
     ) -> SupersedingLog:
         """Keep what the next merge has changed.
 
@@ -201,12 +215,15 @@ class SupersedingLog:
             judged: nodes that have come, or were written again.
             linked: pairs that have been linked.
             cut: pairs that are linked no more.
+            pruned: nodes that have left the merged map for good; nothing is remembered of them.
         """
         before = undone.before
         differ = sorted(node for node in before.keys() | now.keys() if before.get(node) != now.get(node))
         changes = {node: before.get(node) for node in differ}
         step = Changes(changes, frozenset(judged), frozenset(linked), frozenset(cut), undone.parted)
         steps = [*self.steps, step]
+        if pruned:
+            steps = [one.without(pruned) for one in steps]
         size, gone = sum(map(len, steps)), 0
         while size > MOST:
             size -= len(steps[gone])

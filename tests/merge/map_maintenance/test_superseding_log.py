@@ -22,9 +22,10 @@ from mapweave.hybridmap.pruned_node import PrunedNode, PrunedNodes
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.merging import node_comparisons
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.pruning import PrunePlan
 from mapweave.merge.map_maintenance import comparisons, superseding_log
 from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
-from mapweave.merge.map_maintenance.superseding_log import SupersedingLog, Undone
+from mapweave.merge.map_maintenance.superseding_log import Changes, SupersedingLog, Undone
 from mapweave.merge.pose_graph import verification
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verdicts import Verdict
@@ -122,6 +123,32 @@ def test_a_retired_map_leaves_what_was_superseded_as_it_was(seed: int) -> None:
     assert merger.merged().joined(ANOTHER, HONEST[0])
     merger.constrain(constrained(RetiredMap(ANOTHER)))
     assert merger.merged().superseded == before.superseded
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_a_map_that_is_pruned_as_a_whole_has_not_gone(seed: int) -> None:
+    """Newer nodes have taken its place: nothing is undone, and nothing is remembered of it."""
+    _, merger = with_another(seed)
+    both, log = merger.merged(), merger.record().log
+    gone = set(merger.maps[HONEST[0]].nodes)
+    left = PrunedNode(min(merger.maps[ANOTHER].nodes), Pose2(), 1)
+    merger.prune(PrunePlan(dict.fromkeys(gone, left), (), (), frozenset()))
+    merged, kept = merger.merged(), merger.record().log
+    assert HONEST[0] not in merged.maps and any(len(step.without(gone)) < len(step) for step in log.steps)
+    expected = [step for step in (step.without(gone) for step in log.steps) if len(step)]
+    assert list(kept.steps[: len(expected)]) == expected
+    stays = {n: s for n, s in both.superseded.items() if n not in gone and s.by not in gone}
+    assert stays and stays.items() <= merged.superseded.items()
+
+
+def test_a_node_that_a_pruned_one_superseded_before_is_judged_again() -> None:
+    a, b, c = (NodeId("r0", 1, k) for k in range(3))
+    by_b = Superseded(b, 20, 0.1, 0.1)
+    step = Changes(
+        {a: by_b, b: None, c: None}, frozenset({b}), frozenset({(a, b), (a, c)}), frozenset({(b, c)})
+    )
+    assert step.without({b}) == Changes({a: None, c: None}, frozenset({a}), frozenset({(a, c)}))
+    assert step.without(frozenset()) == step
 
 
 @pytest.mark.parametrize("seed", SEEDS)
