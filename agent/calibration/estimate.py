@@ -79,6 +79,21 @@ class Estimate:
         return shown
 
     @property
+    def contradiction(self) -> tuple[Array, Array]:
+        """(10,) how far the values are from the declared ones, and (10,) the sigmas by which that is named.
+
+        Where only the floor shows the wheels' scale, floor and wheels show its ratio to the height. That the
+        ratio is wrong is surer than which of the two: what the height may be off is no part of its sigma.
+        """
+        off, variances = self.vector - self.declared, np.diag(self.covariance).copy()
+        if self.lengths in (Lengths.FLOOR, Lengths.CONTRADICT):
+            ratio = np.zeros(len(off))
+            ratio[[P.WHEEL_SCALE, P.HEIGHT]] = 1.0, -1.0
+            off[P.WHEEL_SCALE] = ratio @ off
+            variances[P.WHEEL_SCALE] = ratio @ self.covariance @ ratio
+        return np.abs(off), np.sqrt(variances)
+
+    @property
     def usable(self) -> DriveGeometry:
         """What the drive shows; all else as declared."""
         return DriveGeometry.of(np.where(self.shown, self.vector, self.declared))

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-import numpy as np
-
 from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate, Lengths
 from mapweave.agent.calibration.parameter_sigmas import useful
 from mapweave.agent.drive_geometry import Parameter
@@ -32,7 +30,7 @@ class Cause:
         declared: value in people's units.
         estimated: likewise.
         sigma: of the estimate, likewise.
-        sigmas: how many sigmas the two are apart.
+        sigmas: how many sigmas the two are apart (`Estimate.contradiction`).
         lengths: what shows the wheels' scale.
     """
 
@@ -48,7 +46,8 @@ class Cause:
         d, e = self.declared, self.estimated
         times = e / d if self.parameter in LOGARITHMIC else 1.0
         # What makes the floor pass faster than the wheels turn is a longer way, or a camera nearer to it.
-        height = f"{'lower' if times > 1.0 else 'higher'} than declared by as much: measure it"
+        share = 100.0 * abs(1.0 / times - 1.0)
+        height = f"{share:.1f} % {'lower' if times > 1.0 else 'higher'} than declared: measure it"
         seen, instead = {
             Lengths.RANGERS: ("what is ahead comes nearer", " (or its sensors read wrong by as much)"),
             Lengths.BOTH: ("the floor moves, and what is ahead comes nearer,", ""),
@@ -97,12 +96,12 @@ def readable_sigmas(estimate: Estimate) -> Array:
 
 def causes(estimate: Estimate) -> list[Cause]:
     """Which parameters that the drive shows are declared wrongly, the surest first."""
-    off = np.abs(estimate.vector - estimate.declared)
-    wrong = estimate.shown & (off > SIGNIFICANT * estimate.sigmas) & (off > useful(estimate.declared))
+    off, sigmas = estimate.contradiction
+    wrong = estimate.shown & (off > SIGNIFICANT * sigmas) & (off > useful(estimate.declared))
     value, was, sigma = readable(estimate.vector), readable(estimate.declared), readable_sigmas(estimate)
     lengths = estimate.lengths
     found = [
-        Cause(p, float(was[p]), float(value[p]), float(sigma[p]), float(off[p] / estimate.sigmas[p]), lengths)
+        Cause(p, float(was[p]), float(value[p]), float(sigma[p]), float(off[p] / sigmas[p]), lengths)
         for p in P
         if wrong[p]
     ]

@@ -10,8 +10,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave.agent.calibration.estimate import Lengths
 from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.online import NAMED_ONLY, OnlineCalibration, _common
+from mapweave.agent.calibration.report import causes
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from tests.agent.calibration.room_drive import CAMERA, SIDE, RoomDrive, camera_poses, drive
@@ -111,7 +113,26 @@ def test_a_height_that_is_declared_wrongly_is_said_which_way(declared_m: float, 
     run = drive(np.random.default_rng(1), TRUE, 40.0)
     (cause,) = watched(run, replace(TRUE, height=declared_m), 1).causes
     assert cause.parameter is Parameter.WHEEL_SCALE
-    assert f"the camera were {truly} than declared" in str(cause)
+    assert f"% {truly} than declared" in str(cause)
+
+
+@pytest.mark.parametrize("seed", first_quick([1, 2, 3], 1))
+def test_wheels_and_height_that_contradict_each_other_are_named_and_not_corrected(seed: int) -> None:
+    """That the two do not go together is sure; which of them is wrong is not."""
+    run = drive(np.random.default_rng(seed), TRUE, 60.0)
+    online = watched(run, replace(TRUE, wheel_scale=1.04), seed)
+    assert [cause.parameter for cause in online.causes] == [Parameter.WHEEL_SCALE]
+    assert online.geometry.wheel_scale == 1.04
+
+
+@pytest.mark.parametrize("lengths", [Lengths.RANGERS, Lengths.BOTH])
+def test_wheels_that_proximity_sensors_show_are_named_by_their_own_sigma(lengths: Lengths) -> None:
+    """Then it is not the height that may be wrong instead."""
+    online = watched(drive(np.random.default_rng(2), TRUE, 60.0), replace(TRUE, wheel_scale=1.04), 2)
+    estimate = online.estimate
+    assert estimate is not None
+    assert causes(estimate)
+    assert not causes(replace(estimate, lengths=lengths))
 
 
 @pytest.mark.slow
