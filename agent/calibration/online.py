@@ -63,7 +63,7 @@ by chance, more do not bear out. Without, one of nine simulated robots got three
 WORTH = np.full(COUNT, 2.0)
 """A change is put to use if it is larger than so many useful sigmas, and sure enough to be named."""
 WORTH[P.WHEEL_SCALE] = 1.0
-"""Wheels are corrected as soon as they are named."""
+"""Wheels are corrected as soon as it is sure that it is they, and not the height."""
 
 NAMED_ONLY = [p for p in Parameter if p not in (P.FORWARD, P.HEADING, P.PITCH, P.DELAY)]
 """Named, but not used by themselves. The wheels' scales and drift are what all else is measured by; a camera
