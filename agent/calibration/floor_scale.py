@@ -31,9 +31,7 @@ LEAST_SLOPE, MOST_SLOPE = 0.001, 0.01
 LEAST_SPREAD = 0.4
 """Points of the floor scatter by no less of what is assumed."""
 FLOOR_RANGE = 1.4
-"""Of logarithms of depth ratios over which all else is spread; half of it is above the floor."""
-LOGISTIC = 1.702
-"""Steepness of the logistic function that comes closest to the Gaussian's integral (within 0.01)."""
+"""Of logarithms of depth ratios over which all else is spread."""
 FLOOR_FLAT = 0.03
 """Standard deviation of a floor point's logarithm of depth besides its track's: no floor is quite flat."""
 FLOOR_CONTRAST = 3.0
@@ -68,9 +66,8 @@ def floor_scale(
 ) -> FloorScale | None:
     """Tell the floor from what stands on it.
 
-    Points of the floor scatter about one ratio. Things stand on it: their points are spread evenly from the
-    floor up, as their tracks blur that. False ones are spread evenly. A mixture of three, by expectation
-    maximisation, begun where the density rises. Without the second, what is just above pulls the floor up.
+    Points of the floor scatter about one ratio, all others are spread evenly: a mixture of two, by
+    expectation maximisation, begun where the density rises: things stand on the floor, nothing is below it.
 
     Args:
         logs: (N,) logarithms of the declared over the measured height of the camera.
@@ -94,16 +91,12 @@ def floor_scale(
     mode = float(centres[int((rise * plausible).argmax())])
     numbers, own = np.unique(pairs, return_inverse=True)
     slopes, slope = np.zeros(len(numbers)), SLOPE
-    floor = standing = 1.0 / 3.0
-    scale = 1.0
+    floor, scale = 0.5, 1.0
     for _ in range(FLOOR_STEPS):
         spread, off = scale * sigmas, logs - mode - slopes[own] * flatness
         on = floor * np.exp(-0.5 * (off / spread) ** 2) / (math.sqrt(math.tau) * spread)
-        over = 1.0 / (1.0 + np.exp(-LOGISTIC * off / spread))
-        above = standing * over / (0.5 * FLOOR_RANGE)
-        total = on + above + (1.0 - floor - standing) / FLOOR_RANGE
-        share = on / total
-        floor, standing, pull = float(share.mean()), float((above / total).mean()), share / spread**2
+        share = on / (on + (1.0 - floor) / FLOOR_RANGE)
+        floor, pull = float(share.mean()), share / spread**2
         square = (share * (off / sigmas) ** 2).sum() / max(share.sum(), 1e-9)
         # The mode is common, each pair has a slope: its row of the normal equations is eliminated.
         flat = pull * flatness
@@ -122,9 +115,7 @@ def floor_scale(
     off = logs - mode - slopes[own] * flatness
     blocks = np.bincount(numbers // block, np.bincount(own, pull * off))
     # Where it is not sure what is floor, the mixture is less stiff than its parts.
-    beyond = off / spread
-    doubt = (1.0 - share) * beyond**2 + LOGISTIC * beyond * (1.0 - over) * above / total
-    sure = float((pull * (1.0 - doubt)).sum() / max(pull.sum(), 1e-9))
+    sure = float((pull * (1.0 - (1.0 - share) * (off / spread) ** 2)).sum() / max(pull.sum(), 1e-9))
     stiffness = sure * float(stiff.sum())
     tracks = int(share.sum())
     densest = floor / (math.sqrt(math.tau) * float(np.median(spread)))

@@ -104,22 +104,6 @@ def test_slopes_of_single_pairs_do_not_bend_the_scale():
     assert abs(flat.log - 0.03) > 0.015
 
 
-def test_what_stands_on_the_floor_does_not_pull_it_up():
-    """Feet of walls and boxes, seen from their lowest point on: half as many as points of the floor."""
-    errors = []
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
-        numbers = np.repeat(np.arange(120), 15)
-        above = np.where(rng.random(len(numbers)) < 1 / 3, rng.uniform(0.0, 0.6, len(numbers)), 0.0)
-        logs = 0.03 - np.log(1.0 - above) + rng.normal(0.0, 0.036, len(numbers))
-        sigmas = np.full(len(numbers), 0.02)
-        found = floor_scale(logs, sigmas, rng.uniform(3.0, 8.0, len(numbers)), numbers, 4)
-        assert found is not None
-        errors.append(found.log - 0.03)
-    assert abs(float(np.mean(errors))) < 0.002
-    assert float(np.abs(errors).max()) < 0.006
-
-
 def test_a_robot_that_maps_sees_how_far_it_goes():
     """Wheels that report 4 % too much, over a carpet: each pair tells it."""
     way, pattern, lens = 0.1, carpet(10.0), Lens(CAMERA)
