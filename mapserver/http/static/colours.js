@@ -9,11 +9,14 @@ function read() {
   for (const name of NAMES) colours[name] = style.getPropertyValue("--" + name).trim();
   colours.hues = style.getPropertyValue("--hues").trim().split(/\s+/);
 }
+// Nothing but its changes: Chromium sends none where `matches` of the same list is read before it has sent it.
 const system = matchMedia("(prefers-color-scheme: dark)");
-export const isDark = () => system.matches;
+let dark = false;
+export const isDark = () => dark;
 export function followTheme(changed) {
-  read();
-  system.addEventListener("change", () => { read(); changed(); });
+  const follow = is => { dark = is; read(); };
+  follow(system.matches);
+  system.addEventListener("change", ({ matches }) => { follow(matches); changed(); });
 }
 // A component keeps its colour as long as its anchor stays.
 export function hue(anchor) {

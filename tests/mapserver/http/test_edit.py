@@ -256,8 +256,13 @@ def test_a_plan_is_laid_under_the_map_on_the_page(
             box = browser.run("return mapweave.painter.canvas.getBoundingClientRect().left")
             pixel = grey.format(round(x - box) + 25, y - 49 + 25)
             eventually(lambda pixel=pixel, ink=ink: (browser.run(pixel) == 215) == (ink is not None))
-        # In the dark theme, whose colours could not be read on white paper, black and white are exchanged.
+        # In the dark theme, whose colours could not be read on white paper, black and white are exchanged. The map is
+        # drawn all the time, as while robots drive: what a frame asks of the theme must not hide that it changes.
         person.fill("opacity", 100)
+        browser.run(
+            "window.often = () => { mapweave.painter.ask(); window.again = requestAnimationFrame(window.often) };"
+            "window.often()"
+        )
         browser.look(1280, 800, "dark")
         eventually(lambda: browser.run(pixel) == 255 - 215)
         # As in the pane beside it: what is most there, since a pair may be marked anywhere.
@@ -269,6 +274,8 @@ def test_a_plan_is_laid_under_the_map_on_the_page(
         )
         eventually(lambda: browser.run(paper) == 255 - 215)
         browser.look(1280, 800)
+        eventually(lambda: browser.run(paper) == 215 == browser.run(pixel))
+        browser.run("cancelAnimationFrame(window.again)")
         person.fill("plan-because", "by the architect")
         person.press("plan-save")
         eventually(lambda: "plan map is hall.pgm, 5 pairs" in person.text("plan-answer"))
