@@ -256,12 +256,11 @@ def test_a_plan_is_laid_under_the_map_on_the_page(
             box = browser.run("return mapweave.painter.canvas.getBoundingClientRect().left")
             pixel = grey.format(round(x - box) + 25, y - 49 + 25)
             eventually(lambda pixel=pixel, ink=ink: (browser.run(pixel) == 215) == (ink is not None))
-        # In the dark theme, whose colours could not be read on white paper, black and white are exchanged. The map is
-        # drawn all the time, as while robots drive: what a frame asks of the theme must not hide that it changes.
+        # In the dark theme, whose colours could not be read on white paper, black and white are exchanged.
+        # The map is drawn all the time, as while robots drive: a frame must not hide that the theme changes.
         person.fill("opacity", 100)
         browser.run(
-            "window.often = () => { mapweave.painter.ask(); window.again = requestAnimationFrame(window.often) };"
-            "window.often()"
+            "const go = () => { window.again = requestAnimationFrame(go); mapweave.painter.ask() }; go()"
         )
         browser.look(1280, 800, "dark")
         eventually(lambda: browser.run(pixel) == 255 - 215)
