@@ -24,6 +24,7 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import Compare, compare
 from mapweave.mapserver.merging.pruning_record import PruningRecord
+from mapweave.mapserver.merging.unmerged import Unmerged
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import Job, Schedule
@@ -44,6 +45,11 @@ SHARE, QUICK = 0.05, 0.05
 """Of the time that it may take to hand merges over, where one takes longer than so many seconds."""
 LOOK = 1.0
 """s between two looks for a merge that can be adopted, while there is none."""
+LATE = 2.0
+"""s that something waits for the leader's merge before it is looked whether that one has a trouble ..."""
+SILENT = 60.0
+"""... and so many with no merge before this server says so: a merge of a large map takes half a minute."""
+FAILED = "merging failed: see the server's log"
 MOST_WORDS = 1000
 """Characters of an event in a status message."""
 
@@ -97,7 +103,8 @@ class MergeWorker:
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._unprepared = False
         self._read_all = self._begun = False
-        self._problem = ""
+        self._problem = self._trouble = ""
+        self._unmerged = Unmerged(schedule.monotonic)
         self._merger.suspect(self._history.set_apart)
         for map_id, reason in self._history.disbelieved:
             self._merger.note_disbelief(map_id, reason)
@@ -117,6 +124,11 @@ class MergeWorker:
         return (self._problem or self._history.newest)[:MOST_WORDS]
 
     @property
+    def delay(self) -> str:
+        """What holds up merging, here or on the server that leads; empty if nothing does."""
+        return self._problem[:MOST_WORDS]
+
+    @property
     def begun(self) -> bool:
         """Whether it has merged what it has read, or tried to; until then maps lie apart."""
         return self._begun
@@ -130,6 +142,11 @@ class MergeWorker:
     def behind(self) -> int:
         """Changes that wait for the merge of the server that leads."""
         return self._adoption.behind if self._adoption else 0
+
+    @property
+    def unmerged_seconds(self) -> float:
+        """For how long the oldest of what has come and is not in the merged map has waited; 0: all is."""
+        return self._unmerged.seconds
 
     @property
     def alone(self) -> str:
@@ -237,6 +254,7 @@ class MergeWorker:
         """Post a job after which the merged map is out of date."""
         with self._counting:
             self._came += 1
+            self._unmerged.came(self._came)
 
         def change() -> None:
             try:
@@ -315,7 +333,7 @@ class MergeWorker:
         with self._counting:
             _, change = self._waiting.pop()
         if self._following and self._adoption:
-            self._adoption.hold(change)
+            self._adoption.hold(self._applied + 1, change)
         else:
             self._take(change)
 
@@ -353,15 +371,33 @@ class MergeWorker:
             log.warning("this server merges itself, though it does not lead: %s", self._alone)
             self._go_on()
             return 0.0
-        self._problem = self._adoption.reason
         if self._adoption.in_step(self._merger):
             self._done = self._applied
+            self._unmerged.merged(self._done)
             self._release()
+        problem = self._adoption.reason or self._leaders_trouble()
+        if problem != self._problem and not self._adoption.reason and problem:
+            log.warning("%s", problem)
+        self._problem = problem
         if self._unprepared:
             began = self._schedule.monotonic()
             self._prepare(PREPARED_AT_ONCE)
             return (self._schedule.monotonic() - began) * (1.0 / self._share_of_time - 1.0)
-        return LOOK if self._adoption.reason else None
+        return LOOK if self._adoption.reason or self._unmerged.seconds else None
+
+    def _leaders_trouble(self) -> str:
+        """Why the server that leads, and is there, hands over nothing new though something waits for it."""
+        if self._adoption is None or self._sharing is None or self._unmerged.seconds < LATE:
+            return ""
+        leader = self._sharing.leader or "another server"
+        try:
+            if trouble := self._sharing.trouble:
+                return f"{leader} leads, and says: {trouble}"
+        except InvalidFile:  # the store is away, which is said elsewhere
+            return ""
+        if min(self._unmerged.seconds, self._adoption.unchanged) < SILENT:
+            return ""
+        return f"{leader} leads, and for more than {SILENT:.0f} s has not merged what this server knows"
 
     def _adopt(self) -> None:
         if self._adoption is None:
@@ -377,6 +413,8 @@ class MergeWorker:
             self._adoption.give_up(f"a merge could not be adopted ({type(error).__name__}: {error})")
             return
         self._unprepared, self._begun, self._problem = True, True, ""
+        if (first := self._adoption.first_held) is not None:
+            self._unmerged.merged(first - 1)
         self._follow_history(merged)
 
     @property
@@ -405,7 +443,10 @@ class MergeWorker:
     def _share(self) -> float | None:
         """Hand the newest merge over to the servers that follow, if that takes little of the time."""
         merges = self._merger.counters.merges
-        if self._sharing is None or not self._sharing.followed or merges == self._shared_merges:
+        if self._sharing is None or not self._sharing.followed:
+            return None
+        self._sharing.tell(self._trouble)
+        if merges == self._shared_merges:
             return None
         began = self._schedule.monotonic()
         if began < self._share_at:
@@ -413,8 +454,12 @@ class MergeWorker:
         if not self._dirty:
             try:
                 self._sharing.write(self._merger, self._last, self._pruning.mark if self._pruning else None)
-            except Exception:  # the others merge for themselves
+                self._trouble = ""
+            except Exception as error:  # the next merge is the next chance
                 log.exception("a merge is not handed over")
+                words = f"a merge cannot be handed over ({type(error).__name__}: {error})"
+                self._trouble = words[:MOST_WORDS]
+            self._sharing.tell(self._trouble)
             self._shared_merges = merges
             took = self._schedule.monotonic() - began
             if took > QUICK:
@@ -510,13 +555,14 @@ class MergeWorker:
             self._answers = made[-1] if made else self._answers_from(merged)
         except Exception:  # questions are answered from the map before; the next change is the next chance
             log.exception("merging failed")
-            self._problem = "merging failed: see the server's log"
+            self._problem = self._trouble = FAILED
             self._history.failed(self._problem)
             return
         finally:
             self._done, self._begun = self._applied, self._read_all
             self._observe(self._schedule.monotonic() - began)
-        self._unprepared, self._problem = True, ""
+        self._unprepared, self._problem, self._trouble = True, "", ""
+        self._unmerged.merged(self._applied)
         self._follow_history(merged)
         try:
             now_ns = self._schedule.time_ns()

@@ -93,6 +93,7 @@ class Sources:
         settled: whether everything that came is merged.
         leads: whether this server leads those that share its store; always, if none do.
         merges_itself: whether it merges all the same, though it does not lead.
+        unmerged: for how long the oldest of what came has waited for a merge, s.
     """
 
     store: Path
@@ -111,6 +112,7 @@ class Sources:
     settled: Callable[[], bool]
     leads: Callable[[], bool]
     merges_itself: Callable[[], bool]
+    unmerged: Callable[[], float]
 
 
 class Metrics:
@@ -188,6 +190,8 @@ class _Reader(Collector):
         queues = {**s.queues(), "questions": admission["open"]}
         yield _gauge("queue_length", "What waits in a queue of the server.", queues, "queue")
         yield _gauge("settled", "Whether everything that came is merged.", float(s.settled()))
+        words = "For how long the oldest of what came and is not in the merged map has waited."
+        yield _gauge("unmerged_seconds", words, s.unmerged())
         yield _gauge("leads", "Whether this server leads those that share its store.", float(s.leads()))
         words = "Whether this server merges, though another one leads."
         yield _gauge("merges_itself", words, float(s.merges_itself()))

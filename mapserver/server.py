@@ -297,6 +297,8 @@ class MapServer:
             "commands": self._commands.count,
             "settled": self._worker.settled,
             "merged": self._worker.begun,
+            "unmerged_s": round(self._worker.unmerged_seconds, 1),
+            "delay": self._worker.delay,
             "bytes": traffic.payload_bytes,
             "node_puts": traffic.node_puts,
             "summary": merged.summary(),
@@ -352,7 +354,7 @@ class MapServer:
             self._roster.presence, self._quotas.over, self._damaged,
             lambda: {"ingest": ingest.waiting, **worker.queues()},
             lambda: bool(ingest.failure), lambda: worker.settled,
-            lambda: self._store.leads, lambda: bool(worker.alone),
+            lambda: self._store.leads, lambda: bool(worker.alone), lambda: worker.unmerged_seconds,
         )  # fmt: skip
 
     def _follow(self, news: News) -> None:

@@ -37,6 +37,8 @@ PRUNING_MARK = "pruning_mark"
 MERGE, MERGE_MARK = "merge", "merge_mark"
 """The newest merge, for servers that do not merge themselves, and a digest of it; see
 mapweave.mapserver.merging.merge_sharing."""
+MERGE_TROUBLE = "merge_trouble"
+"""Why the server that leads cannot merge, or hand its merges over, in words (UTF-8); empty if it can."""
 MOST_REFUSED_KEPT = 100
 """Refused changes of a map of which the bytes are kept; of further ones only the reason."""
 MOST_REFUSALS = 1000

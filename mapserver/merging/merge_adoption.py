@@ -70,7 +70,7 @@ class MergeAdoption:
             clock: the time, s.
         """
         self._sharing, self._pruning, self._clock = sharing, pruning, clock
-        self._held: list[Change] = []
+        self._held: list[tuple[int, Change]] = []
         self._mark: bytes | None = None
         self._read_at = -math.inf
         self._newest: _Read | None = None
@@ -83,6 +83,16 @@ class MergeAdoption:
     def behind(self) -> int:
         """Changes that are held back."""
         return len(self._held)
+
+    @property
+    def first_held(self) -> int | None:
+        """The number of the first change that is held back; None if none is."""
+        return self._held[0][0] if self._held else None
+
+    @property
+    def unchanged(self) -> float:
+        """For how long no merge has been handed over, s, as far as this server has looked."""
+        return self._clock() - self._read_at
 
     @property
     def overdue(self) -> bool:
@@ -98,9 +108,9 @@ class MergeAdoption:
         self._adopted, self._again_at = None, self._clock() + AGAIN
         self._fail(reason, 0.0)
 
-    def hold(self, change: Change) -> None:
-        """Hold a change back."""
-        self._held.append(change)
+    def hold(self, number: int, change: Change) -> None:
+        """Hold a change back; numbers grow."""
+        self._held.append((number, change))
 
     def promising(self, merger: Merger) -> bool:
         """Whether a server that merges itself may follow again: there is a merge that it has not tried."""
@@ -195,7 +205,7 @@ class MergeAdoption:
     def release(self) -> list[Change]:
         """What was held back, which the merger takes in now."""
         held, self._held = self._held, []
-        return held
+        return [change for _, change in held]
 
     def _same_pruning(self, merge: SharedMerge) -> bool:
         return self._pruning is None or (self._pruning.mark or b"") == merge.head.mark
@@ -219,15 +229,15 @@ class MergeAdoption:
         except InvalidFile as error:
             self._fail(f"the merge that was handed over {error}", PATIENCE)
 
-    def _covered(self, merge: SharedMerge) -> tuple[list[Change], list[Change]]:
-        """Of what was held back what is in a merge, in order, and the rest."""
+    def _covered(self, merge: SharedMerge) -> tuple[list[Change], list[tuple[int, Change]]]:
+        """Of what was held back what is in a merge, in order, and the rest with its numbers."""
         last = {which: sequence for which, sequence, _ in merge.head.maps}
         nodes = merge.record.recent.prints
-        covered, rest = list[Change](), list[Change]()
-        for change in self._held:
+        covered, rest = list[Change](), list[tuple[int, Change]]()
+        for number, change in self._held:
             body = change.body
             if change.sequence > last.get(change.map, 0):
-                rest.append(change)
+                rest.append((number, change))
             # A merge may have left out a node that was already there once more behind it.
             elif not isinstance(body, NodePut) or nodes.get(body.node.id) == fingerprint_of(body.node):
                 covered.append(change)

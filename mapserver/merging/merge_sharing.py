@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.mapserver.log.store import MERGE, MERGE_MARK, Store
+from mapweave.mapserver.log.store import MERGE, MERGE_MARK, MERGE_TROUBLE, Store
 from mapweave.mapserver.merging import verification_cache_file
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.restart_record import RestartRecord
@@ -52,6 +52,7 @@ class MergeSharing:
         self._full = VerificationCache()
         self._marks: list[bytes] = []
         self._written = 0
+        self._trouble: str | None = None
 
     @property
     def mark(self) -> bytes | None:
@@ -61,6 +62,20 @@ class MergeSharing:
             InvalidFile: the store cannot be read.
         """
         return self._store.result(MERGE_MARK)
+
+    @property
+    def trouble(self) -> str:
+        """Why the server that leads hands over no merge, as it says itself; empty if it does.
+
+        Raises:
+            InvalidFile: the store cannot be read.
+        """
+        return (self._store.result(MERGE_TROUBLE) or b"").decode(errors="replace")
+
+    @property
+    def leader(self) -> str:
+        """The server that leads; empty if that is not known."""
+        return self._store.leader
 
     @property
     def leads(self) -> bool:
@@ -106,6 +121,16 @@ class MergeSharing:
         results |= {MERGE: data, MERGE_MARK: _digest(data)}
         self._store.publish(results)
         return sum(map(len, results.values()))
+
+    def tell(self, trouble: str) -> None:
+        """Tell the servers that follow why no merge is handed over, if they do not know.
+
+        Args:
+            trouble: in words; empty: there is none.
+        """
+        if trouble != self._trouble:
+            self._store.publish({MERGE_TROUBLE: trouble.encode()})
+            self._trouble = trouble
 
     def read(self, mark: bytes, words: str) -> SharedMerge:
         """The merge of a mark.

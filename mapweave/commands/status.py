@@ -44,6 +44,9 @@ TABLE_EVERY = 5.0
 MOST_APART = 10
 """Robots that are listed below the table with the reason why their maps are not merged, or with a trouble."""
 
+LONG_BEHIND = 5.0
+"""s for which a server is behind the one that leads, from which on the time is said."""
+
 
 def add_to(commands: Any) -> None:
     """Declare the command."""
@@ -141,8 +144,15 @@ def leading(servers: Sequence[Mapping[str, Scalar]]) -> list[str]:
         elif one.get("leads") and len(servers) > 1:
             lines.append(f"server {name} leads")
         elif leader and not one.get("leads"):
-            lines.append(f"server {name} follows {leader}, {one.get('behind', 0)} changes behind")
+            lines.append(f"server {name} follows {leader}, {_behind(one)}")
     return lines
+
+
+def _behind(server: Mapping[str, Scalar]) -> str:
+    """How far a server that follows another is behind it."""
+    words, seconds = f"{server.get('behind', 0)} changes behind", float(server.get("unmerged_s", 0.0))
+    since = f" for {seconds:.0f} s" if seconds >= LONG_BEHIND else ""
+    return f"{words}{since}{': ' if server.get('delay') else ''}{server.get('delay', '')}"
 
 
 def apart(status: FleetStatus) -> list[str]:

@@ -15,5 +15,14 @@ def test_it_says_who_leads_who_follows_and_who_merges_itself() -> None:
     ]
 
 
+def test_it_says_for_how_long_a_server_is_behind_and_what_delays_it() -> None:
+    late = FOLLOWS | {"unmerged_s": 75.3, "delay": "s0 leads, and says: merging failed: see the server's log"}
+    assert leading([LEADS, late])[1] == (
+        "server s1 follows s0, 3 changes behind for 75 s: "
+        "s0 leads, and says: merging failed: see the server's log"
+    )
+    assert leading([LEADS, FOLLOWS | {"unmerged_s": 0.4, "delay": ""}])[1].endswith(", 3 changes behind")
+
+
 def test_of_a_server_without_others_it_says_nothing() -> None:
     assert leading([LEADS]) == leading([{"summary": "no nodes"}]) == leading([]) == []

@@ -7,6 +7,7 @@ import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
@@ -23,6 +24,7 @@ from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RelocalizeAnswer, View
+from mapweave.mapserver import merge_worker
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.explainer import ConstraintRecord
 from mapweave.mapserver.log.entry import ReceivedChange
@@ -285,6 +287,67 @@ def test_one_server_alone_hands_nothing_over(servers: Servers) -> None:
     servers.send(numbered(drives(1))[:24])
     servers.settle()
     assert servers["s0"]._store.result(MERGE) is None
+
+
+def failing(merger: Merger, use: object) -> None:
+    raise ZeroDivisionError
+
+
+def test_a_follower_says_that_its_leader_cannot_merge_and_how_old_its_map_is(
+    servers: Servers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    changes = numbered(drives(1))
+    servers.start("s0", "s1")
+    servers.send(changes[:24])
+    assert_follows(servers)
+    (follower,) = servers.followers
+    leader = servers.leader._name
+    eventually(lambda: follower.status()["unmerged_s"] == 0.0)
+    before = hash_of(follower.merged())
+    with monkeypatch.context() as patch:
+        patch.setattr(Merger, "_merge", failing)
+        began = time.monotonic()
+        servers.send(changes[24:30])
+        words = f"{leader} leads, and says: merging failed: see the server's log"
+        eventually(lambda: follower.status()["delay"] == words, PATIENCE)
+        status = follower.status()
+        assert status["event"] == words and status["behind"]
+        assert 0.0 < float(status["unmerged_s"]) <= time.monotonic() - began + 0.05  # It is rounded.
+        assert float(servers.leader.status()["unmerged_s"]) > 0.0
+        # One that comes meanwhile hears it as well.
+        servers.start("s2")
+        eventually(lambda: servers["s2"].status()["delay"], PATIENCE)
+        assert hash_of(follower.merged()) == before and not follower.status()["merges_itself"]
+    servers.send(changes[30:])
+    assert_follows(servers)
+    for server in servers.all:
+        eventually(lambda server=server: server.status()["unmerged_s"] == 0.0, PATIENCE)
+        assert server.status()["delay"] == ""
+
+
+def test_a_follower_says_that_its_leader_stands_still(
+    servers: Servers, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(merge_worker, "SILENT", 3.0)
+    changes = numbered(drives(1))
+    servers.start("s0", "s1")
+    servers.send(changes[:24])
+    assert_follows(servers)
+    (follower,) = servers.followers
+    goes_on = threading.Event()
+
+    def standing(merger: Merger, use: object) -> None:
+        goes_on.wait(PATIENCE)
+        raise ZeroDivisionError
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Merger, "_merge", standing)
+        servers.send(changes[24:30])
+        eventually(lambda: "has not merged" in str(follower.status()["delay"]), PATIENCE)
+        goes_on.set()
+    servers.send(changes[30:])
+    assert_follows(servers)
+    assert follower.status()["delay"] == ""
 
 
 PROCESS = """
