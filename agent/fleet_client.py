@@ -138,6 +138,11 @@ class FleetClient(BusClient):
         if publish:
             self._bus.publish(self._keys.agent_status(self._agent), encode(self.status()))
 
+    def stands(self, why: str) -> None:
+        """Publish that the robot stands, and why, while nothing is sensed: the status of before is old."""
+        self._status = replace(self._status, doing="standing", detail=why, located=False)
+        self._bus.publish(self._keys.agent_status(self._agent), encode(self.status()))
+
     def ask(self, question: Question) -> None:
         """Send a question; its answer comes with a later `answers`."""
         self._open_questions += 1

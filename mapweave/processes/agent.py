@@ -14,7 +14,7 @@ from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission_control import MissionControl
-from mapweave.agent.observation import Observation, RobotDescription
+from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.ranger_monitor import announcement
 from mapweave.agent.recordings.geometry_file import read_geometry
@@ -59,6 +59,7 @@ FIRST_PATIENCE = 3.0
 """How long a robot that remembers no map asks the server for the number of its next one, s."""
 DISK_PAUSE = 1.0
 """s between two attempts to begin a map on a full disk."""
+NO_ROOM_FOR_MAP = "stands: it cannot begin a map before there is room for it"
 RECORDED = "a recording takes no orders"
 
 
@@ -135,6 +136,7 @@ class Agent:
         options: AgentOptions,
         on_step: Callable[[Observation, TickResult], None] = lambda observation, step: None,
         print_line: Callable[[str], None] = lambda line: None,
+        on_wait: Callable[[], None] = lambda: None,
     ) -> None:
         """Open the journal and join the fleet.
 
@@ -146,6 +148,7 @@ class Agent:
             options: how.
             on_step: called after each tick.
             print_line: prints lines for people.
+            on_wait: called about every second while the robot stands without ticks, since its disk is full.
 
         Raises:
             MapweaveError: the journal cannot be used; one line gives the reason.
@@ -156,7 +159,7 @@ class Agent:
         refusal = RECORDED if options.recorded else ""
         self._teleoperation = Teleoperation(refusal=refusal)
         self._options = options
-        self._on_step = on_step
+        self._on_step, self._on_wait = on_step, on_wait
         self._stamp_ns = 0
         self._complaints = set[str]()
         self._print, self._server_watch = print_line, ServerWatch(options.server)
@@ -202,32 +205,35 @@ class Agent:
             self.journal.close()
             raise
 
-    def _begin(
-        self, calibration: OnlineCalibration | None = None, stop: threading.Event | None = None
-    ) -> None:
-        """A fresh map, whose number no map of this robot has had; a full disk is waited for until `stop`."""
+    def _begin(self, calibration: OnlineCalibration | None = None) -> None:
+        """A fresh map."""
+        self._start_fresh(self.journal.open_map(self._next_epoch()), calibration)
+
+    def _next_epoch(self) -> int:
+        """A number that no map of this robot has had."""
         options = self._options
         taken = [known_map.epoch for known_map in self.journal.maps()]
         taken += epochs_of_files(options.data, options.name)
         if options.epoch is not None:
-            epoch = max([options.epoch, *(used + 1 for used in taken)])
-        else:
-            # A session may take a moment to find its router; a disk that remembers maps needs no server.
-            patience = 0.0 if taken else FIRST_PATIENCE
-            stored = None
-            if options.patience > 0.0:
-                stored = newest_on_server(self._bus, self._keys, options.server, options.name, patience)
-            if options.recorded:
-                # The same recording is the same map, down to its number.
-                stored = stored or 0
-            epoch = next_epoch(taken, stored)
-        map_id = self._opened(epoch, stop)
+            return max([options.epoch, *(used + 1 for used in taken)])
+        # A session may take a moment to find its router; a disk that remembers maps needs no server.
+        patience = 0.0 if taken else FIRST_PATIENCE
+        stored = None
+        if options.patience > 0.0:
+            stored = newest_on_server(self._bus, self._keys, options.server, options.name, patience)
+        if options.recorded:
+            # The same recording is the same map, down to its number.
+            stored = stored or 0
+        return next_epoch(taken, stored)
+
+    def _start_fresh(self, map_id: MapId, calibration: OnlineCalibration | None) -> None:
         pipeline = Pipeline(
             map_id, self._description, self._settings, calibration=calibration, released=self._released
         )
         self._start(map_id, pipeline)
 
-    def _opened(self, epoch: int, stop: threading.Event | None) -> MapId:
+    def _opened(self, epoch: int, stop: threading.Event | None, rest: Callable[[], object]) -> MapId:
+        """Begin a map in the journal; until `stop` a full disk is waited for."""
         while True:
             try:
                 return self.journal.open_map(epoch)
@@ -235,7 +241,17 @@ class Agent:
                 if stop is None or stop.is_set():
                     raise
                 logged(error)
+                self._wait(str(error), rest)
                 stop.wait(DISK_PAUSE)
+
+    def _wait(self, why: str, rest: Callable[[], object]) -> None:
+        """The robot stands without ticks: the wheels, systemd and people hear of it."""
+        rest()
+        if NO_ROOM_FOR_MAP not in self._complaints:
+            self._complaints.add(NO_ROOM_FOR_MAP)
+            self._say(NO_ROOM_FOR_MAP)
+        self._fleet.stands(why)
+        self._on_wait()
 
     def _resume(self, map_id: MapId, calibration: OnlineCalibration | None) -> None:
         kept = RetainedMap.of(self.journal, map_id)
@@ -330,19 +346,27 @@ class Agent:
         """The map that it makes."""
         return self.replicator.map_id
 
-    def begin_new_map(self, stop: threading.Event | None = None) -> None:
+    def begin_new_map(
+        self, stop: threading.Event | None = None, rest: Callable[[], object] = lambda: None
+    ) -> None:
         """Leave a map on which the robot cannot find itself; the same mission goes on in a fresh one.
 
         Args:
             stop: until it is set, the robot stands as long as the disk is full: what it has mapped waits in
                 memory, and would be lost. None: it does not wait.
+            rest: holds the wheels; called about every second while it stands.
         """
         mission, old, calibration = self.pipeline.mission, self.map_id, self.pipeline.calibration
         cause = "was lifted" if self.pipeline.put_elsewhere else f"cannot find itself on map {old}"
         self.finish()
         while stop is not None and not stop.is_set() and not self.replicator.flush(DISK_PAUSE):
-            if DISK_FULL not in self.replicator.status().failure:
+            failure = self.replicator.status().failure
+            if DISK_FULL not in failure:
                 break
+            self._wait(failure, rest)
+        # The robot stays with its fleet until the disk has taken the new map.
+        fresh = self._opened(self._next_epoch(), stop, rest)
+        self._complaints.discard(NO_ROOM_FOR_MAP)
         self._leave()
         try:
             self.write_map()
@@ -350,7 +374,7 @@ class Agent:
             # The journal has it all.
             if not logged(error):
                 self._say(str(error))
-        self._begin(calibration, stop)
+        self._start_fresh(fresh, calibration)
         self.pipeline.set_mission(mission)
         self._say(f"{cause}; it begins map {self.map_id}, and the old one stays")
 
@@ -367,7 +391,7 @@ class Agent:
             self.runner.run(robot, stop)
             if stop.is_set() or not self.pipeline.lost:
                 return
-            self.begin_new_map(stop)
+            self.begin_new_map(stop, lambda: robot.act(Command(0.0, 0.0)))
 
     def sources(self) -> AgentSources:
         """What it knows of itself."""

@@ -78,7 +78,7 @@ def run_agent(
             closing.callback(_end_log, log, say, options.name)
         if metrics is not None and options.metrics is not None:
             closing.callback(metrics.serve(options.metrics))
-        agent = Agent(describe, bus, keys, settings, options, stepped, say)
+        agent = Agent(describe, bus, keys, settings, options, stepped, say, manager.alive)
         if metrics is not None:
             metrics.read(agent.sources())
         manager.ready()
