@@ -8,7 +8,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapweave.agent.mission import MayIDrive, Question, ServerAnswer
+from mapweave.agent.mission import MayIDrive, Question, ServerAnswer, WhereAmI, WhichWay
+from mapweave.agent.motion_primitives import NO_ANSWER
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.robots_in_view import RobotBeside
@@ -17,7 +18,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteLeg, Whereabouts
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, Whereabouts
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features
 from synthetic.maps import changes_of
@@ -73,6 +74,11 @@ class Trial:
         self._moved = Odometry(0.0, 0.0)
         self._answers: tuple[ServerAnswer, ...] = ()
 
+    @property
+    def ways(self) -> list[WhichWay]:
+        """The ways that it has asked for."""
+        return [question for question in self.asked if isinstance(question, WhichWay)]
+
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         for tick in range(round(seconds / BODY.tick)):
             observation = Observation(tick * 100_000_000, self._moved, IMAGE, self.proximity)
@@ -109,10 +115,14 @@ def here(node: NodeId, node_from_robot: Pose2) -> Whereabouts:
     return Whereabouts(node, PoseGaussian(node_from_robot, EXACT), None, 0, 30, 0.99)
 
 
-def found(question: Question, *places: Whereabouts) -> ServerAnswer:
+def at(*places: Whereabouts) -> RelocalizeAnswer:
     """One place is found; several are ambiguous; none is unknown."""
     certainty = (Certainty.UNKNOWN, Certainty.FOUND)[len(places)] if len(places) < 2 else Certainty.AMBIGUOUS
-    return ServerAnswer(question.number, RelocalizeAnswer(certainty, places, "it may be a or b"))
+    return RelocalizeAnswer(certainty, places, "it may be a or b")
+
+
+def found(question: Question, *places: Whereabouts) -> ServerAnswer:
+    return ServerAnswer(question.number, at(*places))
 
 
 def bare(node_id: NodeId) -> Node:
@@ -132,3 +142,31 @@ def straight(start: Node, *others: Node, step: float = 1.5) -> tuple[RouteLeg, .
     """A route whose nodes stand one behind the other, straight ahead."""
     legs = [RouteLeg(start, PoseGaussian(Pose2(), np.zeros((3, 3))), None)]
     return (*legs, *(RouteLeg(node, PoseGaussian(Pose2(step), EXACT), None) for node in others))
+
+
+def a_way(*nodes: Node | NodeId, step: float = 1.5) -> RouteAnswer:
+    """A route straight ahead; of a node that is given by its id nothing is to be seen."""
+    seen = [node if isinstance(node, Node) else bare(node) for node in nodes]
+    return RouteAnswer(straight(*seen, step=step), "a way")
+
+
+def only_a_to_b(question: WhichWay) -> RouteAnswer:
+    """The one way there is."""
+    blocked = {A, B} in map(set, question.blocked)
+    return RouteAnswer((), "every way is blocked") if blocked else a_way(A, B)
+
+
+def answering(
+    way: Callable[[WhichWay], RouteAnswer | None],
+    where: Callable[[], RelocalizeAnswer] = lambda: at(here(A, Pose2())),
+) -> Fleet:
+    """A fleet that answers each question; the robot is at A unless it is told otherwise."""
+
+    def fleet(question: Question) -> ServerAnswer:
+        if isinstance(question, WhereAmI):
+            return ServerAnswer(question.number, where())
+        assert isinstance(question, WhichWay)
+        route = way(question)
+        return ServerAnswer(question.number, route, "" if route else NO_ANSWER)
+
+    return fleet

@@ -12,7 +12,7 @@ from mapweave.agent.global_localization import candidates
 from mapweave.agent.global_localization.candidates import FleetMapSource, OwnMapSource
 from mapweave.agent.global_localization.global_localization import GlobalLocalization
 from mapweave.agent.global_localization.search_policy import TO_NAVIGATE
-from mapweave.agent.mission import Question, ServerAnswer, WhereAmI, WhichWay
+from mapweave.agent.mission import ServerAnswer, WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.hybridmap.change import NodePut
@@ -20,7 +20,7 @@ from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer
 from mapweave.registration.recognition import Recognition
 from mapweave.vision.sift import Features
 from synthetic.world import take_map
@@ -35,11 +35,12 @@ from tests.agent.scripted_fleet import (
     C,
     Eyes,
     Trial,
-    bare,
+    a_way,
+    answering,
+    at,
     found,
     here,
     navigator,
-    straight,
 )
 
 
@@ -60,14 +61,11 @@ def test_it_drives_elsewhere_to_tell_two_places_apart(home):
     start = Pose2(2.5, 2.0)
     eyes = Eyes(home, start)
 
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhichWay):
-            return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(C)), "a way"))
-        if start.distance(eyes.pose) < 0.5:
-            return found(question, here(A, Pose2()), here(B, Pose2()))
-        return found(question, here(A, Pose2(0.1, 0.2, 0.3)))
+    def where() -> RelocalizeAnswer:
+        alike = start.distance(eyes.pose) < 0.5
+        return at(here(A, Pose2()), here(B, Pose2())) if alike else at(here(A, Pose2(0.1, 0.2, 0.3)))
 
-    trial = Trial(navigator(eyes, NOWHERE, C), eyes, fleet)
+    trial = Trial(navigator(eyes, NOWHERE, C), eyes, answering(lambda _: a_way(A, C), where))
     trial.run(60.0, lambda: trial.navigator.fix is not None)
     assert trial.navigator.fix is not None and trial.navigator.fix.node == A
     assert any("driving on to search from elsewhere" in detail for _, detail in trial.said)
@@ -82,13 +80,11 @@ def test_views_that_prove_nothing_alone_are_a_place_once_they_agree(home, moves_
     start = Pose2(2.5, 2.0)
     eyes = Eyes(home, start)
 
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhichWay):
-            return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(C)), "a way"))
+    def where() -> RelocalizeAnswer:
         place = here(A, start.inverse() @ eyes.pose if moves_along else Pose2(0.1, 0.2, 0.3))
-        return ServerAnswer(question.number, RelocalizeAnswer(Certainty.UNKNOWN, (place,), "not sure"))
+        return RelocalizeAnswer(Certainty.UNKNOWN, (place,), "not sure")
 
-    trial = Trial(navigator(eyes, NOWHERE, C), eyes, fleet)
+    trial = Trial(navigator(eyes, NOWHERE, C), eyes, answering(lambda _: a_way(A, C), where))
     trial.run(12.0, lambda: trial.navigator.fix is not None)
     assert (trial.navigator.fix is not None) == moves_along
     if moves_along:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from mapweave.agent.mission import Question, ServerAnswer, WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER
 from mapweave.agent.navigation.stage import NavigationStage
 from mapweave.agent.settings import NavigatorSettings
@@ -14,15 +13,14 @@ from mapweave.hybridmap.query import RouteAnswer
 from tests.agent.scripted_fleet import (
     NOWHERE,
     WALL_AHEAD,
-    A,
     B,
     Eyes,
     Trial,
+    a_way,
+    answering,
     bare,
-    found,
-    here,
     navigator,
-    straight,
+    only_a_to_b,
 )
 
 UNKNOWN = NodeId("s", 1, 99)
@@ -33,13 +31,7 @@ def trial_without_a_route(
 ) -> Trial:
     """A robot that finds itself at A at once, and a fleet that always gives the same answer to routes."""
     eyes = Eyes(home, Pose2(2.5, 2.0))
-
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2()))
-        return ServerAnswer(question.number, answer, "" if answer else NO_ANSWER)
-
-    return Trial(navigator(eyes, NOWHERE, UNKNOWN, settings), eyes, fleet)
+    return Trial(navigator(eyes, NOWHERE, UNKNOWN, settings), eyes, answering(lambda _: answer))
 
 
 def test_a_goal_that_does_not_exist_is_given_up_with_the_reason(home):
@@ -68,16 +60,9 @@ def test_without_a_server_it_waits_for_one_before_it_gives_up(home):
 def test_a_way_that_stays_blocked_is_given_up(home):
     """The server has a way each time that the block is forgotten; the robot never gets through."""
     eyes = Eyes(home, Pose2(2.5, 2.0))
-
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2()))
-        if {A, B} in [set(pair) for pair in question.blocked]:
-            return ServerAnswer(question.number, RouteAnswer((), "every way is blocked"))
-        return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
-
     settings = NavigatorSettings(patience=100.0, blind_distance=1e9)
-    trial = Trial(navigator(eyes, NOWHERE, B, settings), eyes, fleet, WALL_AHEAD, held=True)
+    nav = navigator(eyes, NOWHERE, B, settings)
+    trial = Trial(nav, eyes, answering(only_a_to_b), WALL_AHEAD, held=True)
     trial.run(95.0)
     assert not trial.navigator.given_up
     trial.run(40.0, lambda: trial.navigator.given_up)
@@ -88,12 +73,7 @@ def test_who_gets_on_does_not_give_up(home):
     """A way of many edges takes longer than the patience; each edge that is driven renews it."""
     eyes = Eyes(home, Pose2(0.3, 2.0))
     nodes = [bare(NodeId("s", 1, number)) for number in range(1, 12)]
-
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2()))
-        return ServerAnswer(question.number, RouteAnswer(straight(*nodes, step=1.0), "a way"))
-
+    fleet = answering(lambda _: a_way(*nodes, step=1.0))
     settings = NavigatorSettings(patience=12.0, blind_distance=1e9)
     trial = Trial(navigator(eyes, NOWHERE, nodes[-1].id, settings), eyes, fleet)
     trial.run(36.0)

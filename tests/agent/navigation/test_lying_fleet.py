@@ -13,14 +13,13 @@ import pytest
 
 from mapweave.agent.global_localization.refuted_places import RefutedPlaces
 from mapweave.agent.localization.fix import TURN_SHARE, Fix
-from mapweave.agent.mission import Question, ServerAnswer, WhereAmI
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.navigation.answer_trial import TRIALS, AnswerTrial
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import RouteAnswer
+from mapweave.hybridmap.query import RelocalizeAnswer
 from synthetic.world import take_map
 from tests.agent.scripted_fleet import (
     BODY,
@@ -29,8 +28,10 @@ from tests.agent.scripted_fleet import (
     B,
     Eyes,
     Trial,
+    a_way,
+    answering,
+    at,
     bare,
-    found,
     here,
     navigator,
     straight,
@@ -55,13 +56,7 @@ def real_node(home, pose: Pose2, node_id: NodeId):
 def test_a_place_of_which_nothing_is_in_view_is_refuted_and_given_up(home):
     """The same wrong answer for ever. Before, the robot drove on by it until its patience ended, 300 s."""
     eyes = Eyes(home, START)
-
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2()))
-        return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(B), step=9.0), "a way"))
-
-    trial = Trial(navigator(eyes, NOWHERE, B), eyes, fleet)
+    trial = Trial(navigator(eyes, NOWHERE, B), eyes, answering(lambda _: a_way(A, B, step=9.0)))
     trial.run(200.0, lambda: trial.navigator.given_up)
     assert trial.navigator.given_up and trial.navigator.refuted == TRIALS
     reason = f"says that the robot is at node {A}; nothing of it is in view after {BLIND:.1f} m"
@@ -75,14 +70,10 @@ def test_places_that_contradict_each_other_end_the_same_way(home):
     """Another node each time, of which nothing is in view."""
     eyes = Eyes(home, START)
     asked = iter(range(1, 10_000, 2))
-
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(NodeId("s", 1, next(asked)), Pose2(0.1)))
-        return ServerAnswer(
-            question.number, RouteAnswer(straight(bare(question.start), bare(B), step=9.0), "a way")
-        )
-
+    fleet = answering(
+        lambda question: a_way(question.start, B, step=9.0),
+        lambda: at(here(NodeId("s", 1, next(asked)), Pose2(0.1))),
+    )
     trial = Trial(navigator(eyes, NOWHERE, B), eyes, fleet)
     trial.run(200.0, lambda: trial.navigator.given_up)
     assert trial.navigator.given_up and effort(trial) < TRIALS * BLIND + 15.0
@@ -93,12 +84,7 @@ def test_the_own_view_corrects_a_wrong_pose_before_the_robot_drives(home, wrong)
     """The right node, half a metre or 90 degrees off: the robot sees the node itself."""
     eyes = Eyes(home, START)
     node, true = real_node(home, START @ Pose2(-0.3), A), Pose2(0.3)
-
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, true @ wrong))
-        return ServerAnswer(question.number, RouteAnswer(straight(node, bare(B), step=3.0), "a way"))
-
+    fleet = answering(lambda _: a_way(node, B, step=3.0), lambda: at(here(A, true @ wrong)))
     trial = Trial(navigator(eyes, NOWHERE, B), eyes, fleet)
     trial.run(10.0, lambda: any(command.forward for command in trial.commands))
     fix = trial.navigator.fix
@@ -116,15 +102,11 @@ def test_answers_that_agree_with_the_wheels_are_not_called_wrong(home, apart):
     eyes, goal = Eyes(home, START), START @ Pose2(20.0)
     asked = iter(range(1, 10_000, 2))
 
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            node = NodeId("s", 1, next(asked))
-            return found(question, here(node, Pose2(0.0, apart * (node.number % 4 - 2))))
-        way = (eyes.pose.inverse() @ goal).x
-        return ServerAnswer(
-            question.number, RouteAnswer(straight(bare(question.start), bare(B), step=way), "a way")
-        )
+    def where() -> RelocalizeAnswer:
+        node = NodeId("s", 1, next(asked))
+        return at(here(node, Pose2(0.0, apart * (node.number % 4 - 2))))
 
+    fleet = answering(lambda question: a_way(question.start, B, step=(eyes.pose.inverse() @ goal).x), where)
     trial = Trial(navigator(eyes, NOWHERE, B), eyes, fleet)
     trial.run(200.0, lambda: trial.navigator.given_up or eyes.pose.distance(goal) < 0.3)
     assert trial.navigator.given_up == bool(apart), "contradicting answers are given up as before"

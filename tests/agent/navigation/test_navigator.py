@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.mission import Question, ServerAnswer, WhereAmI, WhichWay
+from mapweave.agent.mission import ServerAnswer, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER
 from mapweave.agent.navigation import positioning, route_follower
 from mapweave.agent.navigation.blocks import Blocks
@@ -37,10 +37,13 @@ from tests.agent.scripted_fleet import (
     C,
     Eyes,
     Trial,
+    a_way,
+    answering,
+    at,
     bare,
-    found,
     here,
     navigator,
+    only_a_to_b,
     straight,
 )
 from tests.quick import first_quick
@@ -55,15 +58,11 @@ def blocked_trial(home: World, forget: float = 15.0) -> tuple[Trial, list[tuple[
     nav = navigator(eyes, NOWHERE, B, settings)
     routes: list[tuple[float, WhichWay]] = []
 
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2()))
+    def way(question: WhichWay) -> RouteAnswer:
         routes.append((len(trial.commands) * BODY.tick, question))
-        if {A, B} in [set(pair) for pair in question.blocked]:
-            return ServerAnswer(question.number, RouteAnswer((), "every way is blocked"))
-        return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
+        return only_a_to_b(question)
 
-    trial = Trial(nav, eyes, fleet, WALL_AHEAD, held=True)
+    trial = Trial(nav, eyes, answering(way), WALL_AHEAD, held=True)
     return trial, routes
 
 
@@ -98,14 +97,12 @@ def test_it_goes_around_by_another_way(home):
     nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1e9))
     answered: list[tuple[NodeId, ...]] = []
 
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2()))
-        legs = straight(bare(A), bare(C), bare(B)) if question.blocked else straight(bare(A), bare(B))
-        answered.append(tuple(leg.node.id for leg in legs))
-        return ServerAnswer(question.number, RouteAnswer(legs, "a way"))
+    def way(question: WhichWay) -> RouteAnswer:
+        route = a_way(A, C, B) if question.blocked else a_way(A, B)
+        answered.append(tuple(leg.node.id for leg in route.legs))
+        return route
 
-    trial = Trial(nav, eyes, fleet, WALL_AHEAD, held=True)
+    trial = Trial(nav, eyes, answering(way), WALL_AHEAD, held=True)
     trial.run(40.0, lambda: len(answered) == 2)
     assert answered == [(A, B), (A, C, B)]
     trial.proximity, trial.held = FREE, False
@@ -120,17 +117,9 @@ def held_at_the_goal(
     eyes = Eyes(home, Pose2(2.5, 2.0))
     monkeypatch.setattr(route_follower, "PARKING_PATIENCE", 3.0)
     nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1e9))
-    routes: list[WhichWay] = []
-
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2()))
-        routes.append(question)
-        return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(B), step=0.3), "a way"))
-
-    trial = Trial(nav, eyes, fleet, proximity, held=True)
-    trial.run(20.0, lambda: len(routes) == 3)
-    return nav, routes
+    trial = Trial(nav, eyes, answering(lambda _: a_way(A, B, step=0.3)), proximity, held=True)
+    trial.run(20.0, lambda: len(trial.ways) == 3)
+    return nav, trial.ways
 
 
 def test_endless_parking_is_retried_before_it_is_a_block(home, monkeypatch):
@@ -210,13 +199,11 @@ def test_a_goal_without_features_is_reached_by_its_neighbours(home, seen):
     node = replace(nodes[0], id=A) if seen else bare(A)
     observations: list[float] = []
 
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhichWay):
-            return ServerAnswer(question.number, RouteAnswer(straight(node, bare(B), step=0.6), "a way"))
+    def where() -> RelocalizeAnswer:
         observations.append((start.inverse() @ eyes.pose).x)
-        return found(question, here(A, start.inverse() @ eyes.pose))
+        return at(here(A, start.inverse() @ eyes.pose))
 
-    trial = Trial(nav, eyes, fleet)
+    trial = Trial(nav, eyes, answering(lambda _: a_way(node, B, step=0.6), where))
     trial.run(150.0, lambda: nav.arrived or nav.given_up)
     assert nav.arrived == seen
     if not seen:
@@ -241,12 +228,8 @@ def test_a_photograph_of_unknown_distance_is_driven_to_and_a_vague_pose_is_not(h
         nav = navigator(eyes, NOWHERE, B)
         certainty = Certainty.FOUND if known else Certainty.PLACE
         place = replace(here(A, Pose2()), node_from_robot=vague, distance_known=known)
-
-        def fleet(question: Question, certainty=certainty, place=place) -> ServerAnswer:
-            if isinstance(question, WhichWay):
-                return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
-            return ServerAnswer(question.number, RelocalizeAnswer(certainty, (place,), "it looks like a"))
-
+        answer = RelocalizeAnswer(certainty, (place,), "it looks like a")
+        fleet = answering(only_a_to_b, lambda answer=answer: answer)
         Trial(nav, eyes, fleet).run(3.0, lambda nav=nav: nav.fix is not None)
         fixed.append(nav.fix is not None)
     assert fixed == [True, False]
@@ -260,15 +243,15 @@ def test_without_landmarks_it_drives_on_a_little_before_it_is_lost(home, monkeyp
     observations: list[float] = []
     ahead = RouteLeg(bare(B), PoseGaussian(Pose2(9.0), EXACT), None)
 
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhichWay):
-            here_first = PoseGaussian(Pose2(), EXACT) if question.start == B else ahead.previous_from_node
-            legs = (replace(ahead, previous_from_node=here_first),)
-            return ServerAnswer(question.number, RouteAnswer(legs, "a way"))
-        observations.append(eyes.pose.x - 0.5)
-        return found(question, here(A, Pose2())) if len(observations) == 1 else found(question)
+    def way(question: WhichWay) -> RouteAnswer:
+        here_first = PoseGaussian(Pose2(), EXACT) if question.start == B else ahead.previous_from_node
+        return RouteAnswer((replace(ahead, previous_from_node=here_first),), "a way")
 
-    trial = Trial(nav, eyes, fleet)
+    def where() -> RelocalizeAnswer:
+        observations.append(eyes.pose.x - 0.5)
+        return at(here(A, Pose2())) if len(observations) == 1 else at()
+
+    trial = Trial(nav, eyes, answering(way, where))
     trial.run(60.0, lambda: nav.stage == NavigationStage.LOST and len(observations) > 3)
     assert observations[1:4] == pytest.approx([1.0, 1.5, 2.0], abs=0.1)
     assert nav.stage == NavigationStage.LOST and nav.fix is None
@@ -325,59 +308,36 @@ NO_READINGS = np.zeros(0)
 def test_a_touch_blocks_the_edge_and_another_way_is_sought(home):
     eyes = Eyes(home, Pose2(2.5, 2.0))
     nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1e9), BARE)
-    blocked: list[tuple[tuple[NodeId, NodeId], ...]] = []
-
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2()))
-        blocked.append(question.blocked)
-        return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(B)), "a way"))
-
-    trial = Trial(nav, eyes, fleet, NO_READINGS)
+    trial = Trial(nav, eyes, answering(lambda _: a_way(A, B)), NO_READINGS)
     trial.run(20.0, lambda: any(command.forward > 0.0 for command in trial.commands))
     nav.touch("the bumper is pressed")
-    trial.run(20.0, lambda: len(blocked) == 2)
-    assert blocked == [(), ((A, B),)]
+    trial.run(20.0, lambda: len(trial.ways) == 2)
+    assert [question.blocked for question in trial.ways] == [(), ((A, B),)]
     assert any("something was touched: the bumper is pressed" in detail for _, detail in trial.said)
+
+
+def undriven(_: WhichWay) -> RouteAnswer:
+    """A way from A to B that is known by a link alone."""
+    start, last = straight(bare(A), bare(B))
+    return RouteAnswer((start, replace(last, kind=EdgeKind.MERGED)), "a way")
 
 
 @pytest.mark.parametrize("body", [BODY, BARE], ids=["rangers", "no rangers"])
 def test_only_driven_edges_are_driven_without_rangers(home, body):
     eyes = Eyes(home, Pose2(2.5, 2.0))
     nav = navigator(eyes, NOWHERE, B, NavigatorSettings(blind_distance=1e9), body)
-    blocked: list[tuple[tuple[NodeId, NodeId], ...]] = []
-
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2()))
-        blocked.append(question.blocked)
-        start, last = straight(bare(A), bare(B))
-        return ServerAnswer(
-            question.number, RouteAnswer((start, replace(last, kind=EdgeKind.MERGED)), "a way")
-        )
-
-    trial = Trial(nav, eyes, fleet, FREE if body is BODY else NO_READINGS)
-    trial.run(8.0, lambda: len(blocked) == 3 or any(c.forward > 0.0 for c in trial.commands))
+    trial = Trial(nav, eyes, answering(undriven), FREE if body is BODY else NO_READINGS)
+    trial.run(8.0, lambda: len(trial.ways) == 3 or any(c.forward > 0.0 for c in trial.commands))
     drives = any(command.forward > 0.0 for command in trial.commands)
     assert drives == (body is BODY)
-    assert blocked[-1] == (() if body is BODY else ((A, B),))
+    assert trial.ways[-1].blocked == (() if body is BODY else ((A, B),))
 
 
 def test_a_fleet_that_insists_on_an_undriven_edge_is_asked_seldom_and_the_goal_given_up(home):
     """Before, it was asked at each tick, and the reason was that the robot did not know where it is."""
     eyes = Eyes(home, Pose2(2.5, 2.0))
-    ways: list[Question] = []
-
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2()))
-        ways.append(question)
-        start, last = straight(bare(A), bare(B))
-        return ServerAnswer(
-            question.number, RouteAnswer((start, replace(last, kind=EdgeKind.MERGED)), "a way")
-        )
-
     nav = navigator(eyes, NOWHERE, B, NavigatorSettings(patience=30.0), BARE)
-    Trial(nav, eyes, fleet, NO_READINGS).run(40.0)
+    trial = Trial(nav, eyes, answering(undriven), NO_READINGS)
+    trial.run(40.0)
     assert nav.given_up and f"no robot has driven between {A} and {B}" in nav.detail
-    assert len(ways) < 20
+    assert len(trial.ways) < 20

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from mapweave.agent.mission import Question, ServerAnswer, WhereAmI, WhichWay
+from mapweave.agent.mission import WhereAmI, WhichWay
 from mapweave.agent.navigation.onboard_router import onboard_route
 from mapweave.agent.navigation.portal_crossing import PortalCrossing
 from mapweave.agent.navigation.stage import NavigationStage
@@ -17,9 +17,9 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import RouteAnswer
+from mapweave.hybridmap.query import RelocalizeAnswer, RouteAnswer
 from synthetic.world import World, room
-from tests.agent.scripted_fleet import TOUR, B, C, Eyes, Trial, bare, found, here, navigator, straight
+from tests.agent.scripted_fleet import TOUR, B, C, Eyes, Trial, a_way, answering, at, bare, here, navigator
 
 MAP = MapId("r0", 1)
 LANDING = Pose2(2.5, 2.0)
@@ -36,21 +36,21 @@ class Lift:
         self.seen_upstairs = True
         nav = navigator(self.eyes, own_map, C, NavigatorSettings(patience=30.0))
         nav.crossing = PortalCrossing(MAP, patience, PortalWait(self.portal) if wait else None)
-        self.trial = Trial(nav, self.eyes, self.fleet)
+        self.trial = Trial(nav, self.eyes, answering(self.way, self.where))
         self.crossing = nav.crossing
 
-    def fleet(self, question: Question) -> ServerAnswer:
-        """Knows its way; knows the robot upstairs alone, and there only on a floor that may be meant."""
-        if isinstance(question, WhereAmI):
-            up = self.eyes.world is self.upstairs and self.seen_upstairs
-            return found(question, *([here(B, LANDING.inverse() @ self.eyes.pose)] if up else []))
-        assert isinstance(question, WhichWay)
+    def where(self) -> RelocalizeAnswer:
+        """It is known upstairs alone, and there only on a floor that may be meant."""
+        up = self.eyes.world is self.upstairs and self.seen_upstairs
+        return at(here(B, LANDING.inverse() @ self.eyes.pose)) if up else at()
+
+    def way(self, question: WhichWay) -> RouteAnswer:
         if question.start == B:
-            return ServerAnswer(question.number, RouteAnswer(straight(bare(B), bare(C)), "a way"))
+            return a_way(B, C)
         way = onboard_route(self.own_map, question.start, self.entry).legs
         # The robot's images show nothing, so that it parks by what it knows of the nodes around.
         legs = tuple(replace(leg, node=bare(leg.node.id)) for leg in way)
-        return ServerAnswer(question.number, RouteAnswer(legs, "to the lift", self.portal))
+        return RouteAnswer(legs, "to the lift", self.portal)
 
     def run_until_it_asks(self, times: int = 1) -> None:
         def asks() -> bool:
@@ -147,12 +147,7 @@ def test_a_robot_that_gets_lost_is_looked_for_on_its_floor_first(home: World) ->
     eyes, known = Eyes(home, Pose2(0.5, 2.0)), [True]
     nav = navigator(eyes, HybridMap(), C)
 
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhichWay):
-            legs = straight(bare(B), bare(C), step=9.0)
-            return ServerAnswer(question.number, RouteAnswer(legs, "a way"))
-        return found(question, *([here(B, Pose2())] if known[0] else []))
-
+    fleet = answering(lambda _: a_way(B, C, step=9.0), lambda: at(here(B, Pose2())) if known[0] else at())
     trial = Trial(nav, eyes, fleet)
     trial.run(10.0, lambda: nav.fix is not None)
     known[0] = False

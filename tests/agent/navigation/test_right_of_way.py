@@ -9,20 +9,20 @@ import numpy as np
 import pytest
 
 from mapweave.agent.localization.fix import Fix
-from mapweave.agent.mission import MayIDrive, Question, ServerAnswer, WhereAmI, WhichWay
+from mapweave.agent.mission import MayIDrive, Question, ServerAnswer, WhichWay
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.navigation.goal_patience import YIELDED
 from mapweave.agent.navigation.right_of_way import Passage, RightOfWay
 from mapweave.agent.navigation.stage import NavigationStage
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.robots_in_view import RobotBeside
-from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest, RouteAnswer
+from mapweave.hybridmap.query import ReserveAnswer, RouteAnswer
 from mapweave.mapserver.nearby import Nearby
 from mapweave.mapserver.reservations import Reservations
+from tests.agent.reserving_robot import BLIND, reserving_robot
 from tests.agent.scripted_fleet import (
     BODY,
     FREE,
@@ -31,30 +31,30 @@ from tests.agent.scripted_fleet import (
     B,
     C,
     Eyes,
+    Fleet,
     Trial,
-    bare,
-    found,
+    a_way,
+    answering,
+    at,
     here,
     navigator,
-    straight,
 )
 from tests.mapserver.test_reservations import node, router  # noqa: F401 - a fixture
-
-BLIND = NavigatorSettings(blind_distance=1e9)
 
 
 def trial_to(home, goal=B) -> Trial:
     """A robot at A, whose fleet knows the way to any node: straight ahead."""
     eyes = Eyes(home, Pose2(1.0, 2.0))
 
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2()))
-        if {A, B} in [set(pair) for pair in question.blocked]:
-            return ServerAnswer(question.number, RouteAnswer((), "blocked"))
-        return ServerAnswer(question.number, RouteAnswer(straight(bare(A), bare(question.goal)), "a way"))
+    def way(question: WhichWay) -> RouteAnswer:
+        blocked = {A, B} in map(set, question.blocked)
+        return RouteAnswer((), "blocked") if blocked else a_way(A, question.goal)
 
-    return Trial(navigator(eyes, NOWHERE, goal, BLIND), eyes, fleet)
+    return Trial(navigator(eyes, NOWHERE, goal, BLIND), eyes, answering(way))
+
+
+def let_drive(question: MayIDrive) -> ServerAnswer:
+    return ServerAnswer(question.number, ReserveAnswer(2, "", None, ""))
 
 
 def test_a_robot_whose_way_is_held_stands_and_says_so_and_then_drives_on(home):
@@ -96,10 +96,7 @@ def test_a_robot_that_waits_too_long_looks_for_another_way(home):
     trial = trial_to(home)
     trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(0, "r7", None, ""))
     trial.run(YIELDED + 8.0)
-    assert [question.blocked for question in trial.asked if not isinstance(question, WhereAmI)][:2] == [
-        (),
-        ((A, B),),
-    ]
+    assert [question.blocked for question in trial.ways][:2] == [(), ((A, B),)]
 
 
 def test_a_robot_that_a_person_drives_meanwhile_has_not_waited():
@@ -143,18 +140,14 @@ def test_a_robot_whose_goal_is_taken_waits_and_then_gives_up(home):
 
 def test_a_robot_steps_aside_and_asks_for_its_way_again(home):
     trial = trial_to(home)
-    free = ReserveAnswer(2, "", None, "")
-
-    def traffic(question: MayIDrive) -> ServerAnswer:
-        return ServerAnswer(
-            question.number, free if question.route[-1] == C else ReserveAnswer(0, "r7", C, "")
-        )
-
-    trial.traffic = traffic
+    aside = ReserveAnswer(0, "r7", C, "")
+    trial.traffic = lambda question: (
+        let_drive(question) if question.route[-1] == C else ServerAnswer(question.number, aside)
+    )
     trial.run(4.0)
-    goals = [question.goal for question in trial.asked if not isinstance(question, WhereAmI)]
+    goals = [question.goal for question in trial.ways]
     assert goals[:2] == [B, C] and trial.navigator.stage == NavigationStage.ASIDE
-    trial.traffic = lambda question: ServerAnswer(question.number, free)
+    trial.traffic = let_drive
     trial.run(20.0, lambda: len(trial.asked) > 3)
     assert trial.asked[-1].goal == B
 
@@ -163,8 +156,7 @@ def test_a_robot_in_the_way_is_named(home):
     trial = trial_to(home)
     r7 = RobotBeside(0.2, "r7", 0.5, 0.0, 0.14)
     trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: r7)
-    trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(2, "", None, ""))
-    trial.held = True
+    trial.traffic, trial.held = let_drive, True
     trial.run(60.0, lambda: trial.navigator.stage == NavigationStage.BLOCKED)
     assert trial.navigator.detail == f"between {A} and {B}: no progress; r7 is 0.2 m off"
 
@@ -176,30 +168,14 @@ def test_two_robots_head_on_in_a_corridor(home, router, reserved):  # noqa: F811
     They drive by exact wheels and see nothing, so what keeps them apart is the reservation alone.
     """
     poses, reservations = router.roads.poses, Reservations(Nearby().standing)
-
-    def robot(name: str, start: int, goal: int) -> Trial:
-        facing = Pose2(0.0, 0.0, 0.0 if goal > start else math.pi)
-        eyes = Eyes(home, poses[node(start)] @ facing)
-
-        def fleet(question: Question) -> ServerAnswer:
-            if isinstance(question, WhereAmI):
-                return found(question, here(node(start), poses[node(start)].inverse() @ eyes.pose))
-            return ServerAnswer(
-                question.number,
-                router.route(question.start, question.goal, question.blocked, (), question.start_from_robot),
-            )
-
-        def traffic(question: MayIDrive) -> ServerAnswer:
-            request = ReserveRequest(name, question.start, question.start_from_robot, question.route)
-            now = len(trial.commands) * BODY.tick
-            return ServerAnswer(question.number, reservations.ask(request, router, now) if reserved else None)
-
-        trial = Trial(navigator(eyes, NOWHERE, node(goal), BLIND), eyes, fleet)
-        trial.traffic = traffic
-        return trial
-
-    robots = [robot("r0", 0, 8), robot("r1", 8, 0)]
     gaps, goals = [], [node(8), node(0)]
+    robots = [
+        reserving_robot(home, router, reservations, name, *ends, lambda: len(gaps) * BODY.tick, facing)
+        for name, ends, facing in (("r0", goals[::-1], 0.0), ("r1", goals, math.pi))
+    ]
+    if not reserved:
+        for trial in robots:
+            trial.traffic = lambda question: ServerAnswer(question.number, None)
 
     def there(trial: Trial, goal) -> bool:
         return trial.eyes.pose.distance(poses[goal]) < 0.3
@@ -228,22 +204,8 @@ def test_a_parked_robot_makes_room_in_a_corridor_and_the_other_passes(home, rout
     clock = [0.0]
 
     def robot(name: str, start: int, goal: int) -> Trial:
-        eyes = Eyes(home, poses[node(start)])
-
-        def fleet(question: Question) -> ServerAnswer:
-            if isinstance(question, WhereAmI):
-                return found(question, here(node(start), poses[node(start)].inverse() @ eyes.pose))
-            ends = question.start, question.goal
-            answer = router.route(*ends, question.blocked, (), question.start_from_robot)
-            return ServerAnswer(question.number, answer)
-
-        def traffic(question: MayIDrive) -> ServerAnswer:
-            request = ReserveRequest(name, question.start, question.start_from_robot, question.route)
-            return ServerAnswer(question.number, reservations.ask(request, router, clock[0]))
-
-        trial = Trial(navigator(eyes, NOWHERE, node(goal), BLIND), eyes, fleet)
-        trial.traffic = traffic
-        return trial
+        ends = node(start), node(goal)
+        return reserving_robot(home, router, reservations, name, *ends, lambda: clock[0])
 
     driving, parked, room = robot("r0", 0, 8), robot("r1", 5, 5), None
     gaps: list[float] = []
@@ -275,12 +237,11 @@ def test_a_robot_whose_way_is_closed_asks_for_another_one_at_once(home):
     closed = ReserveAnswer(0, "", None, "the way ahead is closed by anna: wet floor", closed=True)
     trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(1, "", None, ""))
     trial.run(3.0)
-    before = len([question for question in trial.asked if not isinstance(question, WhereAmI)])
-    assert before == 1 and trial.commands[-1].forward > 0.0, "it is on its way"
+    assert len(trial.ways) == 1 and trial.commands[-1].forward > 0.0, "it is on its way"
     trial.traffic = lambda question: ServerAnswer(question.number, closed)
     trial.run(3.0, lambda: len(trial.asked) > 2)
-    ways = [question for question in trial.asked if not isinstance(question, WhereAmI)]
-    assert len(ways) == 2 and ways[-1].goal == B and ways[-1].blocked == (), "closed is not blocked"
+    _, second = trial.ways
+    assert second.goal == B and second.blocked == (), "closed is not blocked"
     assert any("closed by anna" in detail for _, detail in trial.said)
     trial.run(0.5)
     trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(1, "", None, ""))
@@ -288,24 +249,24 @@ def test_a_robot_whose_way_is_closed_asks_for_another_one_at_once(home):
     assert any(command.forward or command.turn for command in trial.commands[-10:]), "and goes on by it"
 
 
+def in_a_row(eyes: Eyes, poses: dict[NodeId, float]) -> Fleet:
+    """A fleet that knows nodes in a row, m from A, and where the robot is."""
+
+    def way(question: WhichWay) -> RouteAnswer:
+        step = poses[question.goal] - poses[question.start]
+        return a_way(question.start, question.goal, step=step)
+
+    return answering(way, lambda: at(here(A, Pose2(eyes.pose.x - 1.0))))
+
+
 def test_a_robot_passes_what_it_must_in_order_and_then_seeks_its_goal(home):
     eyes, poses = Eyes(home, Pose2(1.0, 2.0)), {A: 0.0, B: 1.0, C: 2.0}
     goal = NodeId("s", 1, 7)
     poses[goal] = 0.5
 
-    def fleet(question: Question) -> ServerAnswer:
-        x = eyes.pose.x - 1.0
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2(x)))
-        step = poses[question.goal] - poses[question.start]
-        return ServerAnswer(
-            question.number, RouteAnswer(straight(bare(question.start), bare(question.goal), step=step), "")
-        )
-
-    trial = Trial(navigator(eyes, NOWHERE, goal, BLIND, via=(B, C)), eyes, fleet)
-    trial.run(60.0, lambda: any(getattr(question, "goal", None) == goal for question in trial.asked))
-    goals = [question.goal for question in trial.asked if not isinstance(question, WhereAmI)]
-    assert list(dict.fromkeys(goals)) == [B, C, goal]
+    trial = Trial(navigator(eyes, NOWHERE, goal, BLIND, via=(B, C)), eyes, in_a_row(eyes, poses))
+    trial.run(60.0, lambda: any(question.goal == goal for question in trial.ways))
+    assert list(dict.fromkeys(question.goal for question in trial.ways)) == [B, C, goal]
     assert eyes.pose.x - 1.0 == pytest.approx(poses[C], abs=0.35), "it has been at the last before it turns"
 
 
@@ -314,16 +275,8 @@ def test_a_robot_that_goes_to_and_fro_gives_up_neither_for_time_nor_for_way(home
     """Before, it gave up once its stops took more way than 50 m, or its patience: it drove no new edge."""
     eyes, poses = Eyes(home, Pose2(1.0, 2.0)), {A: 0.0, B: 1.0}
 
-    def fleet(question: Question) -> ServerAnswer:
-        if isinstance(question, WhereAmI):
-            return found(question, here(A, Pose2(eyes.pose.x - 1.0)))
-        step = poses[question.goal] - poses[question.start]
-        return ServerAnswer(
-            question.number, RouteAnswer(straight(bare(question.start), bare(question.goal), step=step), "")
-        )
-
-    patience = NavigatorSettings(blind_distance=1e9, patience=30.0)
-    trial = Trial(navigator(eyes, NOWHERE, C, patience, via=(B, A) * 50), eyes, fleet)
+    nav = navigator(eyes, NOWHERE, C, replace(BLIND, patience=30.0), via=(B, A) * 50)
+    trial = Trial(nav, eyes, in_a_row(eyes, poses))
     trial.run(600.0, lambda: trial.navigator.given_up or trial.navigator.passed > 50)
     assert trial.navigator.passed > 50, trial.navigator.detail
 
@@ -334,14 +287,12 @@ def test_a_robot_that_stands_in_the_only_way_is_named_and_the_goal_given_up(home
     reach = BODY.radius + 0.14
     r7 = RobotBeside(0.2, "r7", reach + 0.2, 0.0, 0.14)
     trial.navigator = navigator(trial.eyes, NOWHERE, B, BLIND, beside=lambda: r7)
-    trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(2, "", None, ""))
-    trial.held = True
+    trial.traffic, trial.held = let_drive, True
     trial.run(70.0, lambda: trial.navigator.given_up)
     seconds = len(trial.commands) * BODY.tick
     assert YIELDED < seconds < 65.0, "of these 30 s until parking counts as blocked"
     assert trial.navigator.detail == f"r7 stands in the way between {A} and {B}, and there is no other"
-    ways = [question for question in trial.asked if isinstance(question, WhichWay)]
-    (obstacle,) = ways[1].obstacles
+    (obstacle,) = trial.ways[1].obstacles
     assert obstacle.node == A and obstacle.reach == pytest.approx(BODY.radius + 0.14 + 0.1)
     assert (obstacle.x, obstacle.y) == pytest.approx((r7.x, r7.y), abs=0.05), "it has not moved from A"
 
@@ -358,8 +309,7 @@ def test_a_robot_that_has_left_the_way_again_ends_no_goal(home):
         return plain(question)
 
     trial.fleet = fleet
-    trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(2, "", None, ""))
-    trial.held = True
+    trial.traffic, trial.held = let_drive, True
     trial.run(60.0, lambda: trial.navigator.stage == NavigationStage.BLOCKED)
     assert trial.navigator.stage == NavigationStage.BLOCKED
     around.clear()
@@ -378,7 +328,7 @@ def test_the_reason_of_a_longer_way_is_said_all_along_it(home):
         return answer
 
     trial.fleet = fleet
-    trial.traffic = lambda question: ServerAnswer(question.number, ReserveAnswer(2, "", None, ""))
+    trial.traffic = let_drive
     trial.run(8.0)
     driving = [detail for stage, detail in trial.said if stage == "driving along the route"]
     assert len(driving) > 5 and all(detail.endswith("r7 stands on a shorter way") for detail in driving)

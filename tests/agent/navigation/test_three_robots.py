@@ -6,18 +6,15 @@ from collections.abc import Sequence
 
 import pytest
 
-from mapweave.agent.mission import MayIDrive, Question, ServerAnswer, WhereAmI
 from mapweave.agent.navigation.stage import NavigationStage
-from mapweave.agent.settings import NavigatorSettings
-from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import ReserveRequest
 from mapweave.mapserver.nearby import Nearby
 from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.routes import Router
-from tests.agent.scripted_fleet import BODY, NOWHERE, Eyes, Trial, found, here, navigator
+from synthetic.world import World
+from tests.agent.reserving_robot import reserving_robot
+from tests.agent.scripted_fleet import BODY, Trial
 from tests.mapserver.test_reservations import node, router  # noqa: F401 - a fixture
 
-BLIND = NavigatorSettings(blind_distance=1e9)
 EDGE = {node(4), node(5)}
 """In the corridor; node 9 is in a niche beside its one end."""
 LONGEST = 150.0
@@ -27,7 +24,7 @@ LONGEST = 150.0
 class Corridor:
     """Robots with the real navigator and the real reservations, by exact wheels."""
 
-    def __init__(self, home: object, map_router: Router, ways: Sequence[tuple[int, int]]) -> None:
+    def __init__(self, home: World, map_router: Router, ways: Sequence[tuple[int, int]]) -> None:
         self._router, self._reservations = map_router, Reservations(Nearby().standing)
         self._home, self._ticks = home, 0
         self.goals = {f"r{k}": map_router.roads.poses[node(goal)] for k, (_, goal) in enumerate(ways)}
@@ -38,25 +35,11 @@ class Corridor:
         self.least_gap = 1e9
 
     def _robot(self, name: str, start: int, goal: int) -> Trial:
-        poses = self._router.roads.poses
-        facing = Pose2(0.0, 0.0, 0.0 if poses[node(goal)].x >= poses[node(start)].x else 3.1415)
-        eyes = Eyes(self._home, poses[node(start)] @ facing)
-
-        def fleet(question: Question) -> ServerAnswer:
-            if isinstance(question, WhereAmI):
-                return found(question, here(node(start), poses[node(start)].inverse() @ eyes.pose))
-            ends = question.start, question.goal
-            answer = self._router.route(*ends, question.blocked, (), question.start_from_robot)
-            return ServerAnswer(question.number, answer)
-
-        def traffic(question: MayIDrive) -> ServerAnswer:
-            request = ReserveRequest(name, question.start, question.start_from_robot, question.route)
-            answer = self._reservations.ask(request, self._router, self._ticks * BODY.tick)
-            return ServerAnswer(question.number, answer)
-
-        trial = Trial(navigator(eyes, NOWHERE, node(goal), BLIND), eyes, fleet)
-        trial.traffic = traffic
-        return trial
+        poses, ends = self._router.roads.poses, (node(start), node(goal))
+        return reserving_robot(
+            self._home, self._router, self._reservations, name, *ends, lambda: self._ticks * BODY.tick,
+            facing=0.0 if poses[ends[1]].x >= poses[ends[0]].x else 3.1415,
+        )  # fmt: skip
 
     def on_edge(self) -> set[str]:
         """Robots amid the edge."""
