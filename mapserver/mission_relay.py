@@ -73,6 +73,7 @@ class MissionRelay:
         time_ns: Callable[[], int],
         later: Callable[[Callable[[], None]], None],
         note: Callable[[MissionOrder, bool], None] = lambda order, heard: None,
+        monotonic: Callable[[], float] = time.monotonic,
     ) -> None:
         """Go on with the record of the store.
 
@@ -84,7 +85,10 @@ class MissionRelay:
             time_ns: the present time.
             later: has something done soon, and does not wait for it.
             note: is called with each mission once, and whether a robot has said so; must not wait.
+            monotonic: a clock that only grows, s.
         """
+        self._monotonic = monotonic
+        self._sent_at: dict[_Key, float] = {}
         self._later, self._noted = later, note
         self._bus, self._keys, self._store, self._places, self._time_ns = bus, keys, store, places, time_ns
         self.roster: Roster | None = None
@@ -204,9 +208,12 @@ class MissionRelay:
             waiting = [report for report in self._reports.values() if report.state is MissionState.SENT]
         self._write()
         orders: list[MissionOrder] = []
+        now, known = self._monotonic(), self._sent_at
+        self._sent_at = {_key(report.order): known.get(_key(report.order), now) for report in waiting}
         for report in waiting:
             robot, age = report.order.robot, (self._time_ns() - report.order.stamp_ns) * 1e-9
-            if age > EXPIRY:
+            # A clock that was put back, or a person's that is ahead, makes a mission last no longer.
+            if max(age, now - self._sent_at[_key(report.order)]) > EXPIRY:
                 reason = f"{robot} did not answer within {EXPIRY:g} s"
                 self._note(replace(report, state=MissionState.FAILED, reason=reason))
             elif self.roster is not None and self.roster.alive(robot):

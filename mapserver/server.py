@@ -140,7 +140,7 @@ class MapServer:
         self._history = MapHistory(self._store, clock=clock.time_ns)
         self._metrics = Metrics()
         pruning = PruningRecord(
-            self._store, s.merge.keep_superseded_days, self._said, base.maps if base else ()
+            self._store, s.merge.keep_superseded_days, self._said, base.maps if base else (), clock.monotonic
         )
         # In lock-step nothing may depend on when another process has merged.
         shares = self._store.shared and not isinstance(clock, LockstepSchedule)
@@ -186,7 +186,7 @@ class MapServer:
         self._commands = CommandHistory(self._store, clock.time_ns, clock.post)
         self._missions = MissionRelay(
             self._bus, self._keys, self._store, self._named_places, clock.time_ns, clock.post,
-            self._commands.order,
+            self._commands.order, clock.monotonic,
         )  # fmt: skip
         self._roster = Roster(
             self._bus, self._keys, clock.monotonic, self._hear, self._quotas, lambda: self._ingest.lags()

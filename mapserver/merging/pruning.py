@@ -106,6 +106,15 @@ class Pruning:
         doubted = {node for pair in self._linked_since.keys() - lasting for node in pair}
         return {node for node, since in self._since.items() if since <= least} - doubted, lasting
 
+    def put_forward(self, leap_ns: int) -> None:
+        """The server's clock was put forward: nothing is superseded for longer by that.
+
+        Args:
+            leap_ns: by so much.
+        """
+        self._since = {node: since + leap_ns for node, since in self._since.items()}
+        self._linked_since = {pair: since + leap_ns for pair, since in self._linked_since.items()}
+
     def take(self, plan: PrunePlan) -> None:
         """It is done."""
         if plan.nodes:

@@ -16,10 +16,13 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.store import PRUNING_MARK, Store
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.merging.pruning import Pruning, named_nodes, plan_of
+from mapweave.mapserver.merging.pruning import DAY_NS, Pruning, named_nodes, plan_of
 
 log = logging.getLogger(__name__)
 
+LEAP_NS = 3_600_000_000_000
+"""By so much the machine's clock may run ahead of a clock that only grows, between two merges, before it
+counts as put forward: nothing against the days for which superseded nodes are kept."""
 MARK_BYTES = 16
 """Of a digest: two of a million nodes have the same with a chance below 1e-26."""
 
@@ -28,7 +31,12 @@ class PruningRecord:
     """What was pruned from one store. Only the merging thread may call its methods."""
 
     def __init__(
-        self, store: Store, keep_days: float, named: Callable[[], Iterable[object]], base: Collection[MapId]
+        self,
+        store: Store,
+        keep_days: float,
+        named: Callable[[], Iterable[object]],
+        base: Collection[MapId],
+        monotonic: Callable[[], float] | None = None,
     ) -> None:
         """Nothing is done yet.
 
@@ -38,7 +46,10 @@ class PruningRecord:
             named: what people have said; nodes that it names are not pruned.
             base: maps of a file beside the store, of which nothing is pruned: which state of such a map is
                 newer depends on all that the store has of it.
+            monotonic: a clock that only grows, s; None: the server's clock is never put forward.
         """
+        self._monotonic = monotonic
+        self._clocks: tuple[int, float] | None = None
         self._store, self._keep_days, self._named, self._base = store, keep_days, named, frozenset(base)
         self._mark: bytes | None = None
 
@@ -103,6 +114,10 @@ class PruningRecord:
         Raises:
             InvalidFile: the disk does not take it; nothing is pruned.
         """
+        if leap := self._leap(now_ns):
+            # A machine without a clock of its own begins in another year.
+            log.warning("the clock was put forward by %.1f days: nothing is older for that", leap / DAY_NS)
+            merger.pruning.put_forward(leap)
         if not self._store.leads:
             return False
         named = {*named_nodes(tuple(self._named()))}
@@ -132,6 +147,16 @@ class PruningRecord:
         pruned = node in merger.pruning.pruned and node.map not in self._base
         if pruned and self._store.landmarks(node) is None:
             merger.let_go([node])
+
+    def _leap(self, now_ns: int) -> int:
+        """By how much the server's clock was put forward since the merge before, ns; 0 if it was not."""
+        if self._monotonic is None:
+            return 0
+        before, self._clocks = self._clocks, (now_ns, self._monotonic())
+        if before is None:
+            return 0
+        leap = now_ns - before[0] - round((self._clocks[1] - before[1]) * 1e9)
+        return leap if leap > LEAP_NS else 0
 
     def _read(self) -> tuple[bytes | None, Pruning]:
         """The mark and the record that the store has, all of one time."""

@@ -5,6 +5,7 @@ from __future__ import annotations
 import logging
 import threading
 import time
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -52,6 +53,31 @@ def test_two_servers_that_write_at_once_lose_no_mission_of_each_other() -> None:
         one.retry()
     assert record.writes == 3, "once each, and again what the second wrote over"
     assert [report.order.robot for report in relay().missions().reports] == ["r1", "r2"]
+
+
+@pytest.mark.parametrize("off", [-3600.0, 0.0, 3600.0], ids=["put back", "as it was", "put forward"])
+def test_a_mission_for_a_robot_that_is_away_expires_whatever_the_clock_does(off: float) -> None:
+    record: Any = SharedRecord()
+    hours, seconds = [0.0], [0.0]
+
+    def time_ns() -> int:
+        return 10**18 + round((hours[0] + seconds[0]) * 1e9)
+
+    relay = MissionRelay(
+        MemoryBus(MemoryHub()), KEYS, record, pytest.fail, time_ns, lambda job: job(),
+        monotonic=lambda: seconds[0],
+    )  # fmt: skip
+    order = replace(MissionOrder.new("r1", MissionKind.EXPLORE, "anna"), stamp_ns=time_ns())
+    relay._note(MissionReport(order, MissionState.SENT))
+    relay.retry()
+    hours[0] = off
+    last = 0.0
+    while relay.missions().reports[0].state is MissionState.SENT and seconds[0] < 7200.0:
+        last = seconds[0]
+        seconds[0] += 10.0
+        relay.retry()
+    assert relay.missions().reports[0].state is MissionState.FAILED
+    assert last <= mission_relay.EXPIRY and (off > 0.0 or last == mission_relay.EXPIRY)
 
 
 def test_a_record_that_cannot_be_written_now_holds_up_no_robot_and_no_reader(house: House) -> None:

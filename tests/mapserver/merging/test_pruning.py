@@ -239,6 +239,26 @@ def reachable(root: object) -> Iterator[object]:
             stack.extend(gc.get_referents(value))
 
 
+@pytest.mark.parametrize("years", [-50.0, 50.0], ids=["behind", "ahead"])
+def test_a_clock_that_is_set_makes_nothing_older(logs: Logs, tmp_path: Path, years: float) -> None:
+    """A machine without a clock of its own begins in another year, until it has heard what time it is."""
+    day, off = 0.0, years * 365.0
+    with serving(tmp_path / "s0.sqlite") as server:
+        server.record = PruningRecord(server.store, DAYS, tuple, (), lambda: day * 86_400.0)
+        for map_id in MAPS:
+            server.take(logs.changes[map_id])
+        nodes = len(server.merged().poses)
+        assert server.merged().superseded
+        for day in (0.0, 0.1):
+            assert not server.prune(day + off)
+        set_right = day
+        for day in (0.2, 1.3, 5.0, DAYS - 1.0):
+            assert not server.prune(day), day
+        assert len(server.merged().poses) == nodes
+        day = set_right + DAYS + 1.5
+        assert server.prune(day), "kept for as long as ever, and then it leaves"
+
+
 def test_what_is_left_of_many_nodes_takes_few_records(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mapweave.mapserver.merging.pruning.PART_NODES", 4)
     results: dict[str, bytes] = {}
