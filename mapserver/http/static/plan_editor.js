@@ -3,7 +3,7 @@
 import { add, button, byId, say } from "./dom.js";
 import { change } from "./changes.js";
 import { colours } from "./colours.js";
-import { draft, imageOf, planNamed, planNames } from "./plans.js";
+import { draft, planNamed, planNames } from "./plans.js";
 import { PlanPane, mark } from "./plan_pane.js";
 
 const SNAP = 14;  // px: a click so near to a node means the node
@@ -65,8 +65,7 @@ export class PlanEditor {
     this.changed();
   }
   shown() {
-    this.pane.sha256 = this.image.sha256;
-    this.pane.image = imageOf(this.image.sha256, () => this.pane.fit());
+    this.pane.image = this.image;
     this.show();
     this.pane.fit();
   }

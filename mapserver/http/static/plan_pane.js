@@ -1,13 +1,14 @@
 // The image of a floor plan beside the map: moved and zoomed as the map is, with the pixels of the pairs.
 import { colours } from "./colours.js";
 import { listen } from "./input.js";
-import { inTheme } from "./plans.js";
+import { imageOf, inTheme } from "./plans.js";
 import { Viewport } from "./viewport.js";
 
-// The viewport's plane is that of the pixels: x is u, y is -v.
+// The viewport's plane is that of the pixels: x is u, y is -v. An image is `{ sha256, width, height }`; its size is known
+// before its pixels have come.
 export class PlanPane {
   constructor(canvas, clicked) {
-    Object.assign(this, { canvas, viewport: new Viewport(), image: null, sha256: "", marks: { pairs: [], pixel: null } });
+    Object.assign(this, { canvas, viewport: new Viewport(), image: null, marks: { pairs: [], pixel: null } });
     const toPixel = (u, v) => { const [x, y] = this.viewport.toPlane(u, v); return [x, -y]; };
     listen(canvas, this.viewport, { moved: () => this.draw(), fit: () => this.fit(),
       chosen: (u, v) => { if (this.image) clicked(...toPixel(u, v)); } });
@@ -23,7 +24,7 @@ export class PlanPane {
     if (first || !viewport.touched) this.fit(); else this.draw();
   }
   fit() {
-    const { naturalWidth: width, naturalHeight: height } = this.image || {};
+    const { width, height } = this.image || {};
     if (width) this.viewport.fit([0, -height, width, 0], { most: 8, margin: 12, tools: 0 });
     this.viewport.touched = false;
     this.draw();
@@ -32,10 +33,11 @@ export class PlanPane {
     const { canvas, viewport: v } = this, c = canvas.getContext("2d"), ratio = window.devicePixelRatio || 1;
     c.setTransform(ratio, 0, 0, ratio, 0, 0);
     c.fillStyle = colours.ground; c.fillRect(0, 0, v.width, v.height);
-    if (this.image?.complete && this.image.naturalWidth) {
+    const { sha256, width, height } = this.image || {}, image = sha256 && imageOf(sha256, () => this.draw());
+    if (image?.complete && image.naturalWidth) {
       const [left, top] = v.toScreen(0, 0);
       c.imageSmoothingEnabled = v.scale < 4;
-      c.drawImage(inTheme(this.sha256, this.image), left, top, this.image.naturalWidth * v.scale, this.image.naturalHeight * v.scale);
+      c.drawImage(inTheme(sha256, image), left, top, width * v.scale, height * v.scale);
     }
     this.marks.pairs.forEach((pair, k) => mark(c, ...v.toScreen(pair.u, -pair.v), k + 1));
     if (this.marks.pixel) mark(c, ...v.toScreen(this.marks.pixel.u, -this.marks.pixel.v), "");

@@ -3,6 +3,7 @@ import { isDark } from "./colours.js";
 import { ask, byId, degrees } from "./dom.js";
 
 const LARGEST = 16e6; // px; browsers may refuse larger canvases
+const AGAIN = 3000;   // ms, after which an image that has not come is asked for again
 const images = new Map(), inverted = new Map(); // by digest
 let plans = [], offered = true;
 // The plan that is being edited takes the place of the one of its name: `{ name, image, parts }`.
@@ -43,6 +44,8 @@ export function imageOf(sha256, loaded = () => {}) {
   if (!images.has(sha256)) {
     const image = new Image();
     images.set(sha256, image);
+    // The connection may have been lost for a moment.
+    image.addEventListener("error", () => setTimeout(() => { images.delete(sha256); imageOf(sha256, loaded); }, AGAIN));
     image.src = `plan-images/${sha256}.png`;
   }
   const image = images.get(sha256);

@@ -202,8 +202,11 @@ def test_a_plan_is_laid_under_the_map_on_the_page(
     with Web(("127.0.0.1", 0), server) as web:
         person = opened(browser, web.port)
         person.fill("edit-kind", "plan")
+        browser.devtools("Network.enable")
+        browser.devtools("Network.setBlockedURLs", urls=["*/plan-images/*"])
         browser.type("#plan-file", f"{tmp_path / 'map.yaml'}\n{tmp_path / 'hall.pgm'}")
-        eventually(lambda: browser.run("return mapweave.planEditor.pane.image?.naturalWidth") == 500)
+        # Its size is known before its pixels come, here only at the second try.
+        eventually(lambda: browser.run("return mapweave.planEditor.image?.width") == 500)
         assert browser.run("return document.getElementById('plan-scale').value") == str(SCALE)
 
         def pair(node: NodeId, x: float, y: float, off: float = 0.0) -> None:
@@ -227,6 +230,15 @@ def test_a_plan_is_laid_under_the_map_on_the_page(
         browser.run("document.getElementById('plan-canvas').focus()")
         person.key("Enter")
         eventually(lambda: browser.run("return mapweave.planEditor.pixel?.u") == 250)
+        browser.devtools("Network.setBlockedURLs", urls=[])
+        # What is most there, since a pair may be marked anywhere.
+        paper = (
+            "const canvas = document.getElementById('plan-canvas'), c = canvas.getContext('2d');"
+            "const data = c.getImageData(canvas.width / 2, canvas.height / 2, 60, 60).data, counts = {};"
+            "for (let k = 0; k < data.length; k += 4) counts[data[k]] = (counts[data[k]] ?? 0) + 1;"
+            "return Number(Object.keys(counts).reduce((a, b) => (counts[a] > counts[b] ? a : b)))"
+        )
+        eventually(lambda: browser.run(paper) == 215)
         # A click beside the plan is none.
         corner = "const box = document.getElementById('plan-canvas').getBoundingClientRect();"
         person.mouse(tuple(browser.run(f"{corner} return [box.left + 3, box.top + 3]")))
@@ -264,13 +276,7 @@ def test_a_plan_is_laid_under_the_map_on_the_page(
         )
         browser.look(1280, 800, "dark")
         eventually(lambda: browser.run(pixel) == 255 - 215)
-        # As in the pane beside it: what is most there, since a pair may be marked anywhere.
-        paper = (
-            "const canvas = document.getElementById('plan-canvas'), c = canvas.getContext('2d');"
-            "const data = c.getImageData(canvas.width / 2, canvas.height / 2, 60, 60).data, counts = {};"
-            "for (let k = 0; k < data.length; k += 4) counts[data[k]] = (counts[data[k]] ?? 0) + 1;"
-            "return Number(Object.keys(counts).reduce((a, b) => (counts[a] > counts[b] ? a : b)))"
-        )
+        # As in the pane beside it.
         eventually(lambda: browser.run(paper) == 255 - 215)
         browser.look(1280, 800)
         eventually(lambda: browser.run(paper) == 215 == browser.run(pixel))
