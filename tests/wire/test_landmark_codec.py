@@ -60,16 +60,6 @@ def test_a_second_decoder_reads_landmarks(some: SimpleNamespace, count: int, by_
         assert sigma == pytest.approx(back.depth_sigmas[n], rel=1e-6, nan_ok=True)
 
 
-def test_a_second_decoder_reads_features(some: SimpleNamespace) -> None:
-    one: Landmarks = some.node(30).landmarks
-    plain = PlainLandmarks(pack_features(one.pixels, one.codes, CAMERA))
-    assert plain.flags == 0
-    pixels, codes = unpack_features(pack_features(one.pixels, one.codes, CAMERA), CAMERA)
-    for n, (x, y, code, depth, _) in enumerate(plain.read(320, 240)):
-        assert (x, y, code) == (*pixels[n], codes[n].tolist())
-        assert math.isnan(depth)
-
-
 @given(data)
 def test_landmarks_come_back_in_their_order(some: SimpleNamespace, data: st.DataObject) -> None:
     camera = data.draw(some.cameras)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import hashlib
 import struct
 from pathlib import Path
 from types import SimpleNamespace
 
-import msgpack
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -42,19 +40,6 @@ def test_written_values_are_read(tmp_path: Path, content: MapFile) -> None:
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mapweave", "b.mapweave"], (
         "nothing is left beside"
     )
-
-
-def test_a_second_reader(content: MapFile) -> None:
-    data = pack_map_file(content)
-    magic, version, length = struct.unpack_from("<8sIQ", data)
-    assert (magic, version, length) == (b"MAPWEAVE", 1, len(data) - 20 - 32)
-    assert hashlib.sha256(data[:-32]).digest() == data[-32:]
-    fields = msgpack.unpackb(data[20:-32])
-    assert (fields["v"], fields["kind"], fields["title"]) == (1, "merged", "three rooms")
-    assert fields["changes"] == [encode_body(body) for body in content.changes]
-    ((node, (component, pose)),) = fields["poses"]
-    assert (node, component) == (["robot-0", 3, 17], 4)
-    assert struct.unpack("<9f", pose) == (1.5, -2.5, 0.25, 0.25, 0, 0, 0.25, 0, 0.0625)
 
 
 @settings(max_examples=100)

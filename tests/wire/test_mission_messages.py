@@ -20,12 +20,7 @@ node_ids = st.builds(NodeId, names, st.integers(0, 2**53), st.integers(0, 2**40)
 stamps = st.integers(0, 2**63 - 1)
 orders = st.one_of(
     st.builds(
-        MissionOrder,
-        names,
-        names,
-        st.sampled_from(sorted(set(MissionKind) - {MissionKind.GO})),
-        stamps,
-        names,
+        MissionOrder, names, names, st.sampled_from(sorted({*MissionKind} - {MissionKind.GO})), stamps, names
     ),
     st.builds(MissionOrder, names, names, st.just(MissionKind.GO), stamps, names, node_ids),
 )
@@ -54,34 +49,6 @@ def test_statuses_come_back_as_they_were(
 ) -> None:
     sent = AgentStatus(status, stamp_ns, "r0", mission=mission)
     assert decode(encode(sent), AgentStatus) == sent
-
-
-odd_texts = ["goto", "r0.1.2", "r0.².1", "r0.1.٣", "r0.-1.2", "r0.1." + "9" * 400, "nan", "inf", "..", ""]
-scalars = st.one_of(
-    st.sampled_from(odd_texts), st.text(max_size=30), st.integers(-(2**63), 2**63 - 1), st.floats(),
-    st.booleans(), st.none(), st.binary(max_size=9),
-)  # fmt: skip
-
-
-@given(st.binary(max_size=200))
-def test_garbage_is_no_mission_and_no_status(data: bytes) -> None:
-    for kind in (MissionOrder, MissionReport, AgentStatus):
-        with pytest.raises(InvalidMessage):
-            decode(data, kind)
-
-
-@given(st.sampled_from([MissionOrder, AgentStatus]), orders, statuses, st.data())
-def test_a_message_with_a_strange_field_is_read_or_refused(
-    kind: type, order: MissionOrder, status: Status, data: st.DataObject
-) -> None:
-    fields = msgpack.unpackb(encode(order if kind is MissionOrder else AgentStatus(status, 5)))
-    within = data.draw(st.sampled_from([fields, fields.get("status", fields)]))
-    within[data.draw(st.sampled_from(sorted(within)))] = data.draw(scalars)
-    try:
-        value = decode(msgpack.packb(fields), kind)
-    except InvalidMessage:
-        return
-    assert decode(encode(value), kind) == value
 
 
 @pytest.mark.parametrize("name", ["doing", "detail", "nodes", "tracked", "map_from_robot", "finished"])

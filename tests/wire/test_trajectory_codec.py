@@ -32,18 +32,6 @@ def test_any_bytes_are_a_trajectory_or_refused_and_encode_to_themselves(data, ra
     assert (segment.distances <= ranges.reach).all()
 
 
-def test_the_layout_matches_the_documentation():
-    """Columns of little-endian numbers, read by struct."""
-    segment = TrajectorySegment(
-        np.array([-1.5, 2.25]),
-        np.array([[-0.5, 0.25, 1.0], [1.234, -2.0, -3.0]]),
-        np.array([[2.0, 1.0], [0.0, 0.5]]),
-    )
-    data = pack_trajectory(segment, TWO.reach)
-    numbers = struct.unpack("<2h 2h 2h 2h 4B", data)
-    assert numbers == (-150, 225, -500, 1234, 250, -2000, 10000, -30000, 255, 127, 0, 64)
-
-
 def test_a_moment_with_sixteen_sensors_costs_24_bytes():
     segment = TrajectorySegment(np.arange(3.0), np.zeros((3, 3)), np.ones((3, 16)))
     assert len(pack_trajectory(segment, 3.0)) == 3 * 24
