@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from mapweave.agent.drivers.messages import decode_description, decode_observation, decode_step
 from mapweave.hybridmap.errors import InvalidMessage
+from mapweave.hybridmap.manual_constraint import ConstraintRequest
 from mapweave.hybridmap.query import RelocalizeAnswer, RouteAnswer
 from mapweave.storage.map_file import unpack_map_file
 from mapweave.wire import messages
@@ -51,6 +52,8 @@ NAMED = [(one["what"], bytes.fromhex(one["hex"])) for one in VECTORS if one["wha
 GOOD = [(DECODERS[what], data) for what, data in NAMED]
 """Good messages of every kind, with what reads them."""
 GOOD.append((decode_body, msgpack.unpackb(GOOD[0][1])["b"]))
+asked = messages.decode(dict(NAMED)["ConstraintRequest"], ConstraintRequest)
+GOOD.append((DECODERS["ManualConstraint"], messages.encode(asked.constraint)))
 EVERY = [decode_body, *map(DECODERS.__getitem__, dict(NAMED))]
 
 
@@ -99,8 +102,8 @@ def test_every_truncation_is_refused() -> None:
 
 
 ANYTHING = [
-    None, True, -1, 2**63, 1.5, float("nan"), float("inf"), "x", "x" * 70000, "r0.².1", "r0.1." + "9" * 400, "..",
-    b"", b"x", [], [[]], [None] * 3, {},
+    None, True, -1, 2**63, 1.5, float("nan"), float("inf"), "x", "x" * 70000, "r0.².1", "r0.1." + "9" * 400,
+    "..", b"", b"x", [], [[]], [None] * 3, {},
 ]  # fmt: skip
 
 
