@@ -18,6 +18,7 @@ from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.storage.full_disks import FullDisk
+from mapweave.storage.os_errors import reason_of
 
 SCHEME = "postgresql://"
 EXAMPLE = "postgresql://USER@HOST/DATABASE"
@@ -234,6 +235,13 @@ class PostgresSession:
             self._drop()
             self._failure, self._retry_at = str(error), time.monotonic() + RETRY
             raise
+        except BaseException as error:
+            # It has no mark and no settings yet: nothing may use it.
+            self._drop()
+            if not isinstance(error, OSError):
+                raise
+            self._failure, self._retry_at = str(self._unusable(reason_of(error))), time.monotonic() + RETRY
+            raise InvalidFile(self._failure) from None
         return self._connection
 
     @contextmanager

@@ -29,6 +29,8 @@ from uvicorn.protocols.http.h11_impl import H11Protocol
 from mapweave.hybridmap.errors import NotConnected
 from mapweave.mapserver.http.websocket import WebSocketConnection
 
+log = logging.getLogger(__name__)
+
 MAX_HEAD_BYTES = 16384
 """Of a request: its first line and headers."""
 MAX_CONNECTIONS = 1024
@@ -45,6 +47,10 @@ ARRIVAL = 0.05
 """s in which a request may still arrive then, of a client that has connected before."""
 STEP = 0.005
 """s between two looks at whether that has happened."""
+NO_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
+"""Errors of a process, or a machine, that can open no more connections."""
+REMINDER = 60.0
+"""s between two lines about that."""
 START = 10.0
 """s in which the thread has to be there."""
 POLICY = (
@@ -190,7 +196,28 @@ class _Loop(asyncio.SelectorEventLoop):
     def __init__(self, handshake: float) -> None:
         super().__init__()
         self._handshake = handshake
+        self._next_line = 0.0
         self.shaking: dict[asyncio.Future[None], asyncio.Transport] = {}
+
+    def _accept_connection(
+        self, factory: Any, listening: socket.socket, tls: Any, server: Any, backlog: int, *rest: Any
+    ) -> None:
+        """Accept one connection at a time.
+
+        Where no file may be opened any more, asyncio reports that `backlog` times, and so often again after
+        each second. What waits stays in the queue of the system.
+        """
+        del backlog
+        super()._accept_connection(factory, listening, tls, server, 1, *rest)  # type: ignore[misc]
+
+    def call_exception_handler(self, context: dict[str, Any]) -> None:
+        """Say in one line now and then that no connection can be taken; leave all else to asyncio."""
+        error, now = context.get("exception"), time.monotonic()
+        if not (isinstance(error, OSError) and error.errno in NO_FILES):
+            super().call_exception_handler(context)
+        elif now >= self._next_line:
+            self._next_line = now + REMINDER
+            log.error("no more connections can be taken: %s", error.strerror)
 
     async def create_server(self, *arguments: Any, **named: Any) -> asyncio.Server:
         if named.get("ssl") is not None:

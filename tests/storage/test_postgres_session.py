@@ -2,16 +2,67 @@
 
 from __future__ import annotations
 
+import errno
+import os
+from collections.abc import Iterator
+from contextlib import closing, suppress
 from pathlib import Path
 
 import psycopg
 import pytest
 
 from mapweave.hybridmap.errors import InvalidFile
+from mapweave.storage import postgres_session
 from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
 from synthetic.postgres_server import PostgresServer
 from tests.postgres import started
 from tests.waiting import eventually, free_port
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[PostgresServer]:
+    yield from started()
+
+
+@pytest.mark.parametrize("what", ["dup", "prepare"])
+def test_a_session_that_could_not_be_made_ready_is_not_used(
+    server: PostgresServer, what: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """No file may be opened any more, and later again: a session without its settings would lose what it
+    commits, and one without its mark would fail for ever.
+    """
+    fails = [True]
+
+    def failing(*_: object) -> None:
+        if fails[0]:
+            raise OSError(errno.EMFILE, "Too many open files")
+
+    def dup(handle: int) -> int:
+        failing()
+        return duplicated(handle)
+
+    duplicated = os.dup
+    if what == "dup":
+        monkeypatch.setattr(os, "dup", dup)
+    monkeypatch.setattr(postgres_session, "RETRY", 0.1)
+    address = PostgresAddress.read(server.address())
+    session = PostgresSession(
+        address, "test", {"synchronous_commit": "on"}, prepare=failing if what == "prepare" else bool
+    )
+    with closing(session):
+        for _ in range(2):
+            with pytest.raises(InvalidFile, match=r"cannot be used \(Too many open files\)"):
+                _ = session.connection
+            assert not session.is_open
+        fails[0] = False
+
+        def works() -> bool:
+            with suppress(InvalidFile), session.transaction() as connection:
+                row = connection.execute("SHOW lock_timeout").fetchone()
+                return row == ("5s",)
+            return False
+
+        eventually(works)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import resource
 import socket
+import subprocess
+import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -304,3 +306,43 @@ def test_a_port_that_is_taken(served: Web, services: StubServices) -> None:
         Web(("127.0.0.1", served.port), services)
     with pytest.raises(NotConnected, match="address"):
         serving.HttpThread(Questions(services, 1.0).app, ("192.0.2.1", 8080))
+
+
+WITHOUT_FILES = """
+import logging, resource, socket, sys, time, urllib.request
+from mapweave.mapserver.http.serving import ConnectionTimeouts, HttpThread
+
+logging.basicConfig(format="%(message)s")
+
+async def app(scope, receive, send):
+    await send({"type": "http.response.start", "status": 200, "headers": []})
+    await send({"type": "http.response.body", "body": b"here"})
+
+with HttpThread(app, ("127.0.0.1", 0), ConnectionTimeouts(600.0, 600.0, 600.0)) as thread:
+    address = "127.0.0.1", thread.port
+    held = [socket.create_connection(address)]
+    while not thread.connections:
+        time.sleep(0.01)
+    # The client is in the same process: only what is accepted fails.
+    calls, opened = [0], socket.socket.accept
+    def full(listening):
+        calls[0] += 1
+        raise OSError(24, "Too many open files")
+    socket.socket.accept = full
+    held += [socket.create_connection(address) for _ in range(20)]
+    time.sleep(5.0)
+    socket.socket.accept = opened
+    body = urllib.request.urlopen(f"http://127.0.0.1:{thread.port}/", timeout=30.0).read()
+print(body.decode(), calls[0])
+"""
+
+
+def test_a_server_that_can_open_no_more_files_says_so_in_one_line_and_goes_on() -> None:
+    """By itself asyncio writes thousands of tracebacks a second, until the disk is full."""
+    done = subprocess.run(
+        [sys.executable, "-c", WITHOUT_FILES], capture_output=True, text=True, timeout=120, check=True
+    )
+    words, calls = done.stdout.split()
+    assert words == "here"
+    assert done.stderr.splitlines() == ["no more connections can be taken: Too many open files"]
+    assert int(calls) <= 10, "it is tried once a second"
