@@ -113,6 +113,12 @@ class Nearby:
         robots = tuple(_seen_from(here, other) for other in around[:MAX_NEARBY])
         return NearbyAnswer(robots, "" if robots else "no other robot of this part of the map is near")
 
+    def radius(self, robot: str) -> float:
+        """Radius that a robot has said last that it has, m; 0 if it has said nothing."""
+        with self._turn:
+            seen = self._seen.get(robot, ())
+        return seen[-1].request.radius if seen else 0.0
+
     def standing(
         self, stops: Array, component: int, radius: float, merged: MergedMap, now: float
     ) -> list[StandingRobot]:

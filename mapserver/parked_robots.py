@@ -24,7 +24,11 @@ Standing = Callable[[Array, int, float], Sequence[StandingRobot]]
 
 
 def route_past_parked(
-    request: RouteRequest, roads: Roadmap, route: Callable[[Sequence[Disc]], RouteAnswer], standing: Standing
+    request: RouteRequest,
+    roads: Roadmap,
+    route: Callable[[Sequence[Disc]], RouteAnswer],
+    standing: Standing,
+    radius: float | None = None,
 ) -> RouteAnswer:
     """The best way, by the robots that stand on the ways to the goal.
 
@@ -33,6 +37,8 @@ def route_past_parked(
         roads: of the newest merged map.
         route: finds the best way, by places that cost more.
         standing: finds robots on a way.
+        radius: of the robot that asks, m; None if it has no name: then it is as large as those that have
+            mapped its way.
     """
     component = roads.merged.component_of(request.start)
     answer = shortest = route(())
@@ -41,15 +47,16 @@ def route_past_parked(
     known: dict[str, StandingRobot] = {}
     first: list[str] = []
     for _ in range(MOST_PARKED):
-        stops, radius = _way(request, answer, roads)
-        there = standing(stops, component, radius) if answer.legs else ()
+        stops, widest = _way(request, answer, roads)
+        size = widest if radius is None else radius
+        there = standing(stops, component, size) if answer.legs else ()
         new = {one.robot: one for one in there if one.robot not in known}
         first = first if known else [*new]
         if not new:
             break
         known |= new
         answer = route([
-            Disc(component, one.x, one.y, radius + one.radius + MARGIN, PARKED_COST) for one in known.values()
+            Disc(component, one.x, one.y, size + one.radius + MARGIN, PARKED_COST) for one in known.values()
         ])  # fmt: skip
     avoided = [name for name in first if name not in {one.robot for one in there}]
     if answer is shortest or not avoided:
@@ -59,7 +66,7 @@ def route_past_parked(
 
 
 def _way(request: RouteRequest, answer: RouteAnswer, roads: Roadmap) -> tuple[Array, float]:
-    """(N, 2) m, the stops of a way from where the robot is, and the robot's radius, m."""
+    """(N, 2) m, the stops of a way from where the robot is, and the largest radius of its nodes, m."""
     nodes = [leg.node for leg in answer.legs]
     poses = [roads.poses[request.start] @ request.start_from_robot]
     poses += [roads.poses[node.id] for node in nodes if node.id in roads.poses]

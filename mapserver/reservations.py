@@ -9,6 +9,7 @@ nothing: others drive around it. Only where it stands at another's goal does tha
 
 from __future__ import annotations
 
+import math
 import threading
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -111,13 +112,14 @@ class _Passing:
 class Reservations:
     """Leases by robot. Thread-safe."""
 
-    def __init__(self, standing: Standing) -> None:
+    def __init__(self, standing: Standing, said: Callable[[str], float] = lambda robot: 0.0) -> None:
         """No robot holds anything.
 
         Args:
             standing: robots on a way.
+            said: radius that a robot has given as its own, m; 0 if it has given none.
         """
-        self._standing = standing
+        self._standing, self._said = standing, said
         self._leases: dict[str, _Lease] = {}
         self._passings: dict[str, _Passing] = {}
         self._turn = threading.Lock()
@@ -143,12 +145,16 @@ class Reservations:
             poses = router.roads.poses
             if any(node not in poses for node in (request.start, *request.route)):
                 return ReserveAnswer(len(request.route), "", None, "the way leads over nodes without a pose")
+            if any(merged.component_of(node) != component for node in request.route):
+                # Their poses are in another frame.
+                words = "the way leads over nodes of another part of the map"
+                return ReserveAnswer(len(request.route), "", None, words)
             robot = poses[request.start] @ request.start_from_robot
             here = np.array([robot.x, robot.y])
             stops = np.array([here, *([poses[node].x, poses[node].y] for node in request.route)])
             if _too_long(stops):
                 raise InvalidValue("the way is longer than any that a robot drives")
-            radius = max(router.roads.union.nodes[node].radius for node in request.route) or RADIUS
+            radius = self.radius(request.robot, router)
             others = {name: one for name, one in self._leases.items() if one.component == component}
             granted, held, holder = _free(stops, radius, others)
             taken = ""
@@ -173,6 +179,15 @@ class Reservations:
             self._leases[request.robot] = replace(lease, held=aside.way)
             free = _free(aside.way, radius, others)[0] == len(aside.way) - 1
             return ReserveAnswer(0, holder, aside.node if free else None, reason)
+
+    def radius(self, robot: str, router: Router) -> float:
+        """Radius of a robot, m, by its own nodes and by what it has said: those of others are theirs.
+
+        Args:
+            robot: its name.
+            router: of the newest merged map.
+        """
+        return max(router.roads.radii.get(robot, 0.0), self._said(robot)) or RADIUS
 
     def ways(self, now: float) -> dict[str, tuple[NodeId, ...]]:
         """The nodes ahead of each robot that drives, in order; `now` is of the same clock, s."""
@@ -215,7 +230,7 @@ class Reservations:
                 passing.asked, pose = True, router.roads.poses[start] @ start_from_robot
                 here = np.array([pose.x, pose.y])
                 request = ReserveRequest(robot, start, start_from_robot, (start,))
-                radius = router.roads.union.nodes[start].radius or RADIUS
+                radius = self.radius(robot, router)
                 lease = _Lease(request, component, radius, here, here[None], here[None], now, passing.robot)
                 aside = _place_aside(lease, [other], router)
                 passing.aside = None if aside is None else aside.node
@@ -272,7 +287,7 @@ def _too_long(stops: Points) -> bool:
 
 
 def _free(stops: Points, radius: float, others: Mapping[str, _Lease]) -> tuple[int, Points, str]:
-    """How many stops of a way may be driven to, the points up to there, and who holds the next part."""
+    """How many stops of a way may be driven to, the points that are held, and who holds the next part."""
     from scipy.spatial import cKDTree
 
     parts, length = [stops[:1]], 0.0
@@ -286,7 +301,8 @@ def _free(stops: Points, radius: float, others: Mapping[str, _Lease]) -> tuple[i
                 return number, np.vstack(parts), name
         if number and length > AHEAD:
             break
-        parts.append(part)
+        # A first leg may be of any length: of that it holds no more either.
+        parts.append(part[: math.ceil(AHEAD / STEP) + 1])
     else:
         number = len(stops) - 1
     return number, np.vstack(parts), ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Iterator, Mapping
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -95,6 +96,14 @@ class Roadmap:
         for k, (node, fate) in enumerate(sorted(merged.superseded.items())):
             if node in self.poses and fate.by in self.poses:
                 self._join(EdgeId(SUCCESSION, 0, k), node, fate.by)
+
+    @cached_property
+    def radii(self) -> dict[str, float]:
+        """The largest radius that a robot's own nodes give it, m, by the robot's name."""
+        radii: dict[str, float] = {}
+        for node_id, node in self.union.nodes.items():
+            radii[node_id.agent] = max(radii.get(node_id.agent, 0.0), node.radius)
+        return radii
 
     def segments(self, component: int) -> tuple[list[tuple[NodeId, NodeId]], Floats, Floats]:
         """Joined pairs of nodes of a component, and (N, 2) where each begins and ends in the merged frame."""

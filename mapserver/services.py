@@ -108,7 +108,7 @@ class Services(BusClient):
         self._missions = missions
         self._relays = relays
         self._nearby = Nearby()
-        self._reservations = Reservations(self._nearby.standing)
+        self._reservations = Reservations(self._nearby.standing, self._nearby.radius)
         self._map = PackedMap(
             answers, history, lambda request, pack: guarded(lambda _: pack())(request), executor,
             lambda: places().annotations, images,
@@ -214,7 +214,8 @@ class Services(BusClient):
         def standing(way: Array, component: int, radius: float) -> list[StandingRobot]:
             return self._reservations.parked(way, component, radius, router.merged, now, robot)
 
-        return encode(route_past_parked(request, router.roads, route, standing))
+        radius = self._reservations.radius(robot, router) if robot else None
+        return encode(route_past_parked(request, router.roads, route, standing, radius))
 
     def _barred(self, obstacles: Sequence[Obstacle], router: Router, now: float) -> list[Disc]:
         """Where the obstacles are that a robot has met, without those of robots that have left."""

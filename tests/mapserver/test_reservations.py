@@ -10,8 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.change import Change, EdgePut, NodePut
+from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
+from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -108,6 +110,62 @@ def test_a_way_that_no_robot_drives_takes_no_time_and_holds_nothing(router: Rout
     traffic.now = 5.1
     traffic.ask("r1", 0, 1, 2, 3)
     assert traffic.reservations.room_for("r0", node(2), Pose2(1e6, 0.0, 0.0), router, traffic.now) is None
+
+
+def test_no_robot_holds_a_leg_of_any_length(router: Router) -> None:
+    """Of a first leg of 900 m, straight through the corridor, it held all: no other robot drove any more."""
+    for begin in (-900.0, 20.0):
+        traffic = Traffic(router)
+        far = ReserveRequest("r9", node(0), Pose2(begin, 0.0, 0.0), (node(8 if begin < 0.0 else 0),))
+        for traffic.now in (0.0, 1.0):
+            traffic.reservations.ask(far, router, traffic.now)
+            for robot in range(0, 8, 2):
+                assert traffic.ask(f"r{robot}", robot, robot + 1).granted == 1
+
+
+OWN, OTHERS = ("r0", 0, 0.3), ("r9", 2, 5.0)
+"""Robots, each with two nodes 1 m apart from so far along the corridor on, and its radius, m."""
+
+
+def two_robots(joined: bool) -> Router:
+    merger, exact = Merger(), np.diag([1e-4, 1e-4, 1e-4])
+    for robot, first, radius in (OWN, OTHERS):
+        nodes = [
+            replace(place_node(NodeId(robot, 1, k), (float(first + k), 0.0)), radius=radius) for k in (0, 1)
+        ]
+        step = PoseGaussian(Pose2(1.0), exact)
+        edge = Edge(EdgeId(robot, 1, 2), nodes[0].id, nodes[1].id, step, EdgeKind.MAPPED)
+        for number, body in enumerate((*map(NodePut, nodes), EdgePut(edge)), start=1):
+            merger.on_change(Change(MapId(robot, 1), number, 0, body))
+    if joined:
+        link = Linked(NodeId("r0", 1, 1), NodeId("r9", 1, 0), Pose2(1.0), (1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4))
+        merger.constrain(ManualConstraints((ManualConstraint(link, True, "anna", 1),)))
+    return Router(merger.merged())
+
+
+def test_a_robot_is_as_large_as_it_says_itself_and_as_no_other_says() -> None:
+    """A node on its way is of a robot of 5 m: it was taken for as large, and waited for one 3 m ahead."""
+    router, nearby = two_robots(joined=True), Nearby()
+    here, near, far = NodeId("r0", 1, 0), NodeId("r9", 1, 0), NodeId("r9", 1, 1)
+    assert router.merged.component_of(here) == router.merged.component_of(far)
+    reservations = Reservations(nearby.standing, nearby.radius)
+    assert [reservations.radius(robot, router) for robot in ("r0", "r9", "r1")] == [0.3, 5.0, 0.2]
+    nearby.ask(NearbyRequest("r1", ((near, Pose2()),), 0.05, 0.02, 0.4, 0.4, 0.5), router.merged, 0.0)
+    assert reservations.radius("r1", router) == 0.4, "it has mapped nothing"
+    ahead = ReserveRequest("r1", far, Pose2(2.0), (far,))
+    assert reservations.ask(ahead, router, 0.0).granted == 1
+    way = ReserveRequest("r0", here, Pose2(), (NodeId("r0", 1, 1), near))
+    assert reservations.ask(way, router, 0.0).granted == 2
+
+
+def test_nothing_is_held_on_a_way_through_another_part_of_the_map() -> None:
+    """Poses of nodes that are not joined are in different frames."""
+    router = two_robots(joined=False)
+    reservations = Reservations(Nearby().standing)
+    here, there = NodeId("r0", 1, 0), NodeId("r9", 1, 1)
+    answer = reservations.ask(ReserveRequest("r0", here, Pose2(), (there,)), router, 0.0)
+    assert answer == ReserveAnswer(1, "", None, "the way leads over nodes of another part of the map")
+    assert reservations.ways(0.0) == {}
 
 
 def test_who_comes_second_waits_until_the_first_has_passed(router: Router) -> None:
