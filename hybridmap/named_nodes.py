@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
+from numbers import Real
+from typing import TypeGuard, cast
+
+import numpy as np
 
 from mapweave.hybridmap.annotation import Annotations, Place
 from mapweave.hybridmap.constraint_subject import (
@@ -13,15 +17,42 @@ from mapweave.hybridmap.constraint_subject import (
     read_retired,
 )
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 
+Position = tuple[float, float]
+"""x and y in the frame of a component, or of a floor plan, m."""
+NodeWord = NodeId | str | Position
+"""A node, also as people write it: `r0.1.17`, the name of a place, a position `3.1,-2.0` or `(3.1, -2.0)`."""
 Resolve = Callable[[ResolveRequest], ResolveAnswer]
 """Returns nodes for words, of a map; raises InvalidValue for a word that is none."""
 Record = Callable[[], Annotations]
 """Returns the annotations of the same map."""
 
 
-def asked_of(words: ResolveRequest | str | Iterable[str]) -> ResolveRequest:
+def word_of(node: NodeWord | MapId) -> str:
+    """A node, or a map, as people write it; a position to a millimetre.
+
+    Raises:
+        InvalidValue: it is neither of these, nor text, nor two numbers.
+    """
+    if isinstance(node, str | NodeId | MapId):
+        return str(node)
+    if is_position(node):
+        return ",".join(str(round(float(number), 3)) for number in node)
+    raise InvalidValue(f"{node!r:.40}: give a node (r0.1.17), the name of a place, or a position (3.1, -2.0)")
+
+
+def is_position(value: object) -> TypeGuard[Position]:
+    """Whether a value is two numbers, in a tuple, a list or an array."""
+    return (
+        isinstance(value, tuple | list | np.ndarray)
+        and len(value) == 2
+        and all(isinstance(number, Real) for number in value)
+    )
+
+
+def asked_of(words: ResolveRequest | NodeWord | Iterable[NodeWord]) -> ResolveRequest:
     """A question for nodes: one word, several, or the question itself.
 
     Raises:
@@ -29,11 +60,9 @@ def asked_of(words: ResolveRequest | str | Iterable[str]) -> ResolveRequest:
     """
     if isinstance(words, ResolveRequest):
         return words
-    if not isinstance(words, str | list | tuple) or not all(isinstance(word, str) for word in words):
-        raise InvalidValue(
-            f"{words!r:.40}: give a node (r0.1.17), the name of a place, or a position, as text"
-        )
-    return ResolveRequest((words,) if isinstance(words, str) else tuple(words))
+    if isinstance(words, list | tuple) and not isinstance(words, NodeId) and not is_position(words):
+        return ResolveRequest(tuple(map(word_of, words)))
+    return ResolveRequest((word_of(cast(NodeWord, words)),))
 
 
 def ids_of(words: Iterable[str], resolve: Resolve, near: str = "") -> list[str]:

@@ -10,14 +10,12 @@ from typing import Any, Literal
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.named_nodes import ids_of
+from mapweave.hybridmap.named_nodes import NodeWord, ids_of, is_position, word_of
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.refusals import refusals
 from mapweave.wire.typed import packed
 
-NodeWord = NodeId | str
-"""A node, also as people write it: `r0.1.17`, the name of a place, a position `3.1,-2.0`."""
 Corners = Sequence[tuple[float, float]]
 """Of an area, in order around it, m, in the merged map, or on a plan."""
 Time = str | int
@@ -83,8 +81,8 @@ class AnnotationMethods(ABC):
 
         with refusals():
             annotation = annotation_of_words(
-                name, fields, removed, self.annotations, self.resolve, self.plans, self._by, because,
-                time.time_ns(),
+                name, _in_words(fields), removed, self.annotations, self.resolve, self.plans, self._by,
+                because, time.time_ns(),
             )  # fmt: skip
         return self._say(annotation, check)
 
@@ -97,7 +95,7 @@ class AnnotationMethods(ABC):
         """The PNG file of a plan, by the name of its image."""
 
     @abstractmethod
-    def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
+    def resolve(self, request: ResolveRequest | NodeWord | Iterable[NodeWord]) -> ResolveAnswer:
         """Nodes for words."""
 
     @abstractmethod
@@ -128,7 +126,7 @@ class AnnotationMethods(ABC):
             because: why.
             check: only say what it would do.
         """
-        fields = _given(node=_word(node), radius=radius, corners=corners, near=_word(near), plan=plan)
+        fields = _given(node=word_of(node), radius=radius, corners=corners, near=word_of(near), plan=plan)
         return self.annotate("place", name, because, check=check, **fields)
 
     def close_way(
@@ -220,12 +218,12 @@ class AnnotationMethods(ABC):
             because: why.
             check: only say what it would do.
         """
-        words = [_word(node)]
+        words = [word_of(node)]
         if plan is not None:
             from mapweave.mapserver.plan_answers import off_plan
 
-            words = off_plan(words, self.plans().plan(plan), _word(near), self.resolve)
-        (own,) = ids_of(words, self.resolve, _word(near))
+            words = off_plan(words, self.plans().plan(plan), word_of(near), self.resolve)
+        (own,) = ids_of(words, self.resolve, word_of(near))
         name = str(NodeId.parse(own).map)
         return self.annotate("floor", name, because, check=check, node=own, label=label)
 
@@ -255,8 +253,8 @@ class AnnotationMethods(ABC):
             because: why.
             check: only say what it would do.
         """
-        given = _given(near=_word(near), plan=plan)
-        fields = {"a": _word(a), "b": _word(b), "means": str(means), "note": note, **given}
+        given = _given(near=word_of(near), plan=plan)
+        fields = {"a": word_of(a), "b": word_of(b), "means": str(means), "note": note, **given}
         return self.annotate("portal", name, because, check=check, **fields)
 
     def plan(
@@ -283,8 +281,8 @@ class AnnotationMethods(ABC):
             because: why.
             check: only say what it would do.
         """
-        clicked = [{"at": _word(at), "u": u, "v": v} for at, u, v in pairs]
-        given = _given(metres_per_pixel=metres_per_pixel, near=_word(near))
+        clicked = [{"at": word_of(at), "u": u, "v": v} for at, u, v in pairs]
+        given = _given(metres_per_pixel=metres_per_pixel, near=word_of(near))
         if origin is not None:
             given["origin"] = packed(origin)
         fields = {"pairs": clicked, "image": packed(image), **given}
@@ -302,7 +300,7 @@ class AnnotationMethods(ABC):
         """Hold the frame of a component by one of its nodes: at a pose, or where it is now; with a floor plan
         at its pose on that, so that the component gets the coordinates of the plan.
         """
-        own = str(self.resolve(_word(node)).found[0].node)
+        own = str(self.resolve(word_of(node)).found[0].node)
         fields = _given(plan=plan, merged_from_node=None if pose is None else packed(pose))
         return self.annotate("pin", own, because, check=check, node=own, **fields)
 
@@ -317,15 +315,22 @@ def _where(
     plan: str | None,
 ) -> dict[str, Any]:
     fields = _given(
-        place=place, node=_word(node), radius=radius, corners=corners, near=_word(near), plan=plan
+        place=place, node=word_of(node), radius=radius, corners=corners, near=word_of(near), plan=plan
     )
-    return fields if edge is None else {**fields, "edge": [_word(end) for end in edge]}
+    return fields if edge is None else {**fields, "edge": [word_of(end) for end in edge]}
+
+
+def _in_words(fields: Mapping[str, Any]) -> dict[str, Any]:
+    """Fields of a body with text for nodes that are given by a position or an id."""
+    plain = dict(fields)
+    for name in ("node", "near", "a", "b"):
+        if is_position(plain.get(name)) or isinstance(plain.get(name), NodeId):
+            plain[name] = word_of(plain[name])
+    if isinstance(edge := plain.get("edge"), list | tuple):
+        plain["edge"] = [word_of(end) if is_position(end) or isinstance(end, NodeId) else end for end in edge]
+    return plain
 
 
 def _given(**fields: Any) -> dict[str, Any]:
     """Those that are given."""
     return {name: value for name, value in fields.items() if value is not None and value != ""}
-
-
-def _word(node: NodeWord) -> str:
-    return str(node)

@@ -18,9 +18,9 @@ from mapweave.hybridmap.constraint_subject import (
     read_window,
 )
 from mapweave.hybridmap.errors import InvalidValue, Refused
-from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, event_words, to_take_back
-from mapweave.hybridmap.named_nodes import own_ids_of, retired_of
+from mapweave.hybridmap.named_nodes import NodeWord, own_ids_of, retired_of, word_of
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.refusals import refusals
@@ -34,7 +34,7 @@ class ConstraintMethods(ABC):
         """What people say about the map."""
 
     @abstractmethod
-    def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
+    def resolve(self, request: ResolveRequest | NodeWord | Iterable[NodeWord]) -> ResolveAnswer:
         """Nodes for words."""
 
     @abstractmethod
@@ -46,12 +46,12 @@ class ConstraintMethods(ABC):
         """Set a manual constraint of any kind, or take it back; see `link`."""
 
     def link(
-        self, a: str, b: str, pose: Pose2 | None = None, because: str = "", *, check: bool = False
+        self, a: NodeWord, b: NodeWord, pose: Pose2 | None = None, because: str = "", *, check: bool = False
     ) -> str:
         """Link two nodes by hand: they see one place.
 
         Args:
-            a: a node, `r0.1.17`, the name of a place, or a position `3.1,-2.0`.
+            a: a node, `r0.1.17`, the name of a place, or a position `(3.1, -2.0)`.
             b: another one, of the same map or of another.
             pose: of b's robot frame in a's, where their images do not say it; needs `because`.
             because: why.
@@ -64,17 +64,20 @@ class ConstraintMethods(ABC):
             Refused: the images do not agree, or the map contradicts it: the evidence, and what to do.
             NotConnected: it is a fleet's, and no map server answers.
         """
-        first, second = map(NodeId.parse, own_ids_of((a, b), self.annotations, self.resolve))
+        first, second = map(NodeId.parse, own_ids_of(map(word_of, (a, b)), self.annotations, self.resolve))
         return self.constrain(Linked(first, second, pose), True, because, check=check)
 
-    def unlink(self, first: str, second: str, because: str = "", *, check: bool = False) -> str:
+    def unlink(
+        self, first: NodeWord | MapId, second: NodeWord | MapId, because: str = "", *, check: bool = False
+    ) -> str:
         """Undo the link between two nodes, or all links between two maps; see `link`."""
-        ends = read_ends(*own_ids_of((first, second), self.annotations, self.resolve))
+        words = map(word_of, (first, second))
+        ends = read_ends(*own_ids_of(words, self.annotations, self.resolve))
         return self.constrain(Apart(ends), True, because, check=check)
 
     def retire(
         self,
-        *which: str,
+        *which: NodeWord | MapId,
         area: Area | None = None,
         begin: str | int = "",
         end: str | int = "",
@@ -100,7 +103,7 @@ class ConstraintMethods(ABC):
                 raise InvalidValue("an area goes with neither maps, nodes nor times")
             about = RetiredArea(area)
         else:
-            about = retired_of(which, self.annotations, self.resolve)
+            about = retired_of(map(word_of, which), self.annotations, self.resolve)
             if in_time:
                 if not isinstance(about, RetiredMap):
                     raise InvalidValue("a time window is of one map")

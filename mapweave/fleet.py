@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
@@ -33,6 +33,7 @@ from mapweave.hybridmap.mission_order import (
     later_stamp,
     new_id,
 )
+from mapweave.hybridmap.named_nodes import NodeWord, word_of
 from mapweave.hybridmap.portal import PortalDone
 from mapweave.identities.key_file import read_key_file
 from mapweave.login import login
@@ -242,13 +243,13 @@ class Fleet(FleetMap, FleetConstraints):
     def go(
         self,
         robot: str,
-        goal: str,
+        goal: NodeWord,
         wait: float = 0.0,
-        via: Sequence[str] = (),
+        via: Iterable[NodeWord] = (),
         plan: str | None = None,
         because: str = "",
     ) -> MissionReport:
-        """Send a robot to a node (`r0.1.17`), a place, a position in the merged map (`3.1,-2.0`) or `home`.
+        """Send a robot to a node (`r0.1.17`), a place, a position in the merged map or `home`.
 
         Args:
             robot: which.
@@ -263,7 +264,7 @@ class Fleet(FleetMap, FleetConstraints):
             Refused: the robot or the goal does not exist, or no way leads there.
             NotConnected: the robot does not answer.
         """
-        words = (goal, *listed("via", via))
+        words = tuple(map(word_of, (goal, *listed("via", via))))
         if plan is not None:
             from mapweave.mapserver.plan_answers import component_of, goal_on_plan
 

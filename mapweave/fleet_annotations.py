@@ -10,7 +10,7 @@ from mapweave.fleet_questions import FleetQuestions
 from mapweave.hybridmap.annotation import Annotation, AnnotationRequest, Annotations
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.floor_plan import PIECE, PlacedPlans, PlanImage, PlanPiece, PlanReceived
-from mapweave.hybridmap.named_nodes import asked_of
+from mapweave.hybridmap.named_nodes import NodeWord, asked_of
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
@@ -31,7 +31,7 @@ class FleetAnnotations(FleetQuestions, AnnotationMethods):
         """
         return decode(self._question(self._keys.any_annotations(), b"", ANSWER), Annotations)
 
-    def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
+    def resolve(self, request: ResolveRequest | NodeWord | Iterable[NodeWord]) -> ResolveAnswer:
         """Nodes for words: names of places, and positions in the merged map.
 
         Raises:

@@ -40,7 +40,7 @@ from mapweave.hybridmap.explanation import (
 from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
-from mapweave.hybridmap.named_nodes import asked_of, ids_of
+from mapweave.hybridmap.named_nodes import NodeWord, asked_of, ids_of, word_of
 from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
@@ -63,8 +63,6 @@ Image = NDArray[np.uint8] | str | os.PathLike[str]
 """(H, W) grey, or its file."""
 CameraName = Camera | str | os.PathLike[str]
 """A camera, or its `camera.toml`."""
-NodeName = NodeId | str
-"""A node, also as people write it: `r0.1.17`, the name of a place, a position `3.1,-2.0` in component 0."""
 MapName = MapId | str
 """A robot's own map, also as people write it: `r0.1`."""
 
@@ -90,7 +88,7 @@ class Map(ABC):
         """What people say about the map: named places, closures, preferences."""
 
     @abstractmethod
-    def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
+    def resolve(self, request: ResolveRequest | NodeWord | Iterable[NodeWord]) -> ResolveAnswer:
         """Nodes for words: names of places, and positions in the merged map.
 
         Raises:
@@ -130,7 +128,7 @@ class Map(ABC):
         """
         return self._reading.nodes_on(plan)
 
-    def node(self, node: NodeName) -> Node:
+    def node(self, node: NodeWord) -> Node:
         """A node with its camera and landmarks.
 
         Raises:
@@ -139,7 +137,7 @@ class Map(ABC):
         with refusals():
             return self._reading.node(self._named(node)[0])
 
-    def pose(self, node: NodeName) -> PoseGaussian:
+    def pose(self, node: NodeWord) -> PoseGaussian:
         """Pose of a node in the frame of its component.
 
         Raises:
@@ -261,12 +259,12 @@ class Map(ABC):
 
     def route(
         self,
-        start: NodeName,
-        goal: NodeName,
-        blocked: Iterable[tuple[NodeName, NodeName]] = (),
-        via: Iterable[NodeName] = (),
+        start: NodeWord,
+        goal: NodeWord,
+        blocked: Iterable[tuple[NodeWord, NodeWord]] = (),
+        via: Iterable[NodeWord] = (),
         plan: str | None = None,
-        near: NodeName = "",
+        near: NodeWord = "",
     ) -> RouteExplanation:
         """The way that a robot would drive, step by step, or why there is none.
 
@@ -291,8 +289,8 @@ class Map(ABC):
         if plan is not None:
             from mapweave.mapserver.plan_answers import off_plan
 
-            words = [*off_plan(map(str, words), self.plans().plan(plan), str(near), self.resolve)]
-        nodes = self._named(*words, near=str(near))
+            words = [*off_plan(map(word_of, words), self.plans().plan(plan), word_of(near), self.resolve)]
+        nodes = self._named(*words, near=word_of(near))
         stopping, closed = nodes[: len(stops)], nodes[len(stops) :]
         pairs = tuple(zip(closed[::2], closed[1::2], strict=True))
         legs = []
@@ -302,14 +300,14 @@ class Map(ABC):
             legs.append(explanation)
         return route_over(legs)
 
-    def explain(self, a: NodeName, b: NodeName) -> PairExplanation:
+    def explain(self, a: NodeWord, b: NodeWord) -> PairExplanation:
         """Why two nodes are linked, or are not, with every number behind it.
 
         Raises:
             InvalidValue: the two are one node, or maps.
             Refused: a node is not there.
         """
-        for name in map(str, (a, b)):
+        for name in map(word_of, (a, b)):
             if _is_map(name):
                 raise InvalidValue(f"{name} is a map: `explain_maps` is for two maps")
         first, second = self._named(a, b)
@@ -333,13 +331,13 @@ class Map(ABC):
         assert isinstance(explanation, FleetExplanation), "maps were asked for"
         return explanation.maps
 
-    def _named(self, *names: NodeName, near: str = "") -> list[NodeId]:
+    def _named(self, *names: NodeWord, near: str = "") -> list[NodeId]:
         """The nodes for names; positions are in the component of `near`, see `ids_of`.
 
         Raises:
             Refused: one is none.
         """
-        return [NodeId.parse(word) for word in ids_of(map(str, names), self.resolve, near)]
+        return [NodeId.parse(word) for word in ids_of(map(word_of, names), self.resolve, near)]
 
     def _frame(self, component: int | None, plan: str | None) -> tuple[int, Pose2]:
         """A component, and what takes its coordinates to those of a plan.
@@ -484,7 +482,7 @@ class FileMap(Map, ConstraintMethods, AnnotationMethods):
         """Floor plans under the map."""
         return self._read.plans
 
-    def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
+    def resolve(self, request: ResolveRequest | NodeWord | Iterable[NodeWord]) -> ResolveAnswer:
         """Nodes for words; see Map."""
         asked = asked_of(request)
         router = self._router()

@@ -18,7 +18,7 @@ from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlans, PlanImage
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.named_nodes import asked_of
+from mapweave.hybridmap.named_nodes import NodeWord, asked_of
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.mapserver.annotation_effects import effects_of
@@ -112,7 +112,7 @@ class OfflineAnnotations(AnnotationMethods):
         """What people say about the map."""
         return Annotations(self._opened.content.annotations)
 
-    def resolve(self, request: ResolveRequest | str | Iterable[str]) -> ResolveAnswer:
+    def resolve(self, request: ResolveRequest | NodeWord | Iterable[NodeWord]) -> ResolveAnswer:
         """Nodes for words.
 
         Raises:

@@ -8,8 +8,9 @@ from typing import TypeVar
 
 from mapweave.hybridmap.errors import InvalidValue, Refused
 from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.named_nodes import NodeWord, is_position
 
-Name = TypeVar("Name", bound=NodeId | str)
+Name = TypeVar("Name", bound=NodeWord)
 
 
 @contextmanager
@@ -33,10 +34,11 @@ def listed(name: str, given: Iterable[Name]) -> tuple[Name, ...]:
         given: nodes, or names of places.
 
     Raises:
-        InvalidValue: it is one node or one name.
+        InvalidValue: it is one node, one name or one position.
     """
-    if isinstance(given, str | NodeId):
-        raise InvalidValue(f"`{name}` is a list, such as [{str(given)!r}], and not one place")
+    if isinstance(given, str | NodeId) or is_position(given):
+        one = given if is_position(given) else str(given)
+        raise InvalidValue(f"`{name}` is a list, such as [{one!r}], and not one place")
     return tuple(given)
 
 

@@ -208,8 +208,10 @@ def test_answers_and_goals_in_coordinates_of_a_plan(
         status, _, body = ask(served, "POST", f"/robots/r0/go?goal={goal}&plan=flat")
         assert (status, json.loads(body)["order"]["node"]) == (200, str(node))
         assert ask(served, "POST", "/robots/r0/stop?plan=none")[0] == 200, "a stop stops"
-    report = fleet.go("r0", goal, via=["5,6"], plan="flat")
-    assert report.order.node == node and len(report.order.via) == 1
+    for to, by in ((goal, "5,6"), (at, (5, 6))):
+        report = fleet.go("r0", to, via=[by], plan="flat")
+        assert report.order.node == node and len(report.order.via) == 1
+    assert fleet.go("r0", (pose_of(fleet, node).x, pose_of(fleet, node).y)).order.node == node
     assert fleet.go("r0", str(node), plan="flat").order.node == node, "what is no position is as without"
     assert fleet.place("spot", goal, plan="flat") == f"place spot is node {node}, by anna"
     with Web(("127.0.0.1", 0), house.server) as served:

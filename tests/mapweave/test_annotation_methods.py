@@ -9,9 +9,11 @@ import numpy as np
 import pytest
 
 import mapweave
-from mapweave.hybridmap.annotation import Annotation, Closure, Place, Preference
-from mapweave.hybridmap.errors import InvalidValue, Refused
-from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.annotation import Annotation, Closure, Floor, Place, Preference
+from mapweave.hybridmap.errors import InvalidValue, MapweaveError, Refused
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.pin import Pin
+from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.pose import Pose2
 from mapweave.offline_annotations import OfflineAnnotations
 from mapweave.storage.plan_image import plan_file
@@ -77,3 +79,40 @@ def test_words_are_nodes_and_what_is_none_is_refused(joined: Path, record: Offli
             one.resolve("kitchen")
         with pytest.raises(InvalidValue, match=r"3: give a node \(r0\.1\.17\)"):
             one.resolve(3)  # type: ignore[arg-type]
+
+
+def test_a_position_is_two_numbers_wherever_a_node_stands(joined: Path, record: OfflineAnnotations) -> None:
+    """Only text was taken: `(1.0, 2.0)` was asked for as the word "(1.0, 2.0)", or refused."""
+    room = mapweave.open(joined)
+    at = room.pose(THIRD).mean
+    there = (at.x, at.y)
+    for position in (there, np.array(there), (np.float32(at.x), at.y)):
+        assert room.resolve(position).found[0].node == THIRD
+        assert room.node(position).id == THIRD
+    assert [found.node for found in record.resolve([there, "r0.1.1", FIRST]).found] == [THIRD, FIRST, FIRST]
+    assert record.resolve(FIRST).found[0].node == FIRST
+    assert room.explain(FIRST, there).reason == room.explain(FIRST, THIRD).reason
+    way = room.route(there, FIRST, blocked=[(there, FIRST)], via=[there])
+    assert way == room.route(THIRD, FIRST, blocked=[(THIRD, FIRST)], via=[THIRD]) and way.hops
+    with pytest.raises(InvalidValue, match=r"`via` is a list, such as \[\(1\.0, 2\.0\)\]"):
+        room.route(FIRST, THIRD, via=(1.0, 2.0))  # type: ignore[arg-type]
+    for body, say in (
+        (Place(THIRD), lambda: record.place("kitchen", there)),
+        (Place(THIRD), lambda: record.annotate("place", "larder", node=there)),
+        (Closure((FIRST, THIRD)), lambda: record.close_way("way", edge=(FIRST, there))),
+        (Preference(0.5, (FIRST, THIRD)), lambda: record.prefer("way", 0.5, edge=(FIRST, there))),
+        (Floor(THIRD, "ground"), lambda: record.floor(there, "ground")),
+        (Portal(FIRST, THIRD, PortalMeans.DOOR), lambda: record.portal("gate", FIRST, there, "door")),
+        (Pin(THIRD, Pose2(1.0, 2.0, 3.0)), lambda: record.pin(there, Pose2(1.0, 2.0, 3.0))),
+    ):
+        say()
+        assert last(record).body == body
+    said = room.retire(there, because="the wall is new", check=True)
+    assert said == room.retire(THIRD, because="the wall is new", check=True)
+    said = room.unlink(MapId("r0", 1), MapId("r1", 1), because="two rooms", check=True)
+    assert said == room.unlink("r0.1", "r1.1", because="two rooms", check=True)
+    for nothing in ((1.0, 2.0, 3.0), ("1", "2"), None, 3):
+        with pytest.raises(MapweaveError, match="give a node"):
+            room.node(nothing)  # type: ignore[arg-type]
+    with pytest.raises(Refused, match="nothing is mapped within"):
+        room.node((500.0, 2.0))
