@@ -18,6 +18,9 @@ from mapweave.storage.full_disks import logged
 
 log = logging.getLogger(__name__)
 
+VERSION = version("mapweave")
+"""Read once: it is in a file, and a process may be able to open no more."""
+
 SUFFIX = ".verdicts"
 """Of the file, behind the store's name."""
 RECORD_SUFFIX = ".superseded"
@@ -131,4 +134,4 @@ class VerificationCacheKeeper:
 
 def made_by(merger: Merger) -> str:
     """Settings and version of what merges, in words."""
-    return f"{version('mapweave')} {merger.settings}"
+    return f"{VERSION} {merger.settings}"

@@ -380,7 +380,7 @@ def test_a_damaged_record_is_thrown_away(
     merging = MergeSettings(exclusion=ExclusionSettings(doubt=0.01)) if damage == "merging" else None
     if damage == "version":
         # Another version may supersede by other rules.
-        monkeypatch.setattr(verification_cache_keeper, "version", lambda _: "0.0.0")
+        monkeypatch.setattr(verification_cache_keeper, "VERSION", "0.0.0")
     merger, plain = Merger(settings=merging, compare=compare), Merger(settings=merging, compare=compare)
     caplog.clear()
     with caplog.at_level(logging.INFO):

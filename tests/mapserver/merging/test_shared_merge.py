@@ -342,6 +342,6 @@ def test_merges_with_other_settings_or_of_another_version_are_not_adopted(
     follower = Follower(handed_over[0], MergeSettings(exclusion=ExclusionSettings(doubt=0.01)))
     follower.take(handed_over[1])
     assert not follower.look() and "with other settings" in follower.adoption.reason
-    monkeypatch.setattr(verification_cache_keeper, "version", lambda _: "0.0.0")
+    monkeypatch.setattr(verification_cache_keeper, "VERSION", "0.0.0")
     follower = Follower(handed_over[0])
     assert not follower.look() and "of another version" in follower.adoption.reason

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import logging
+import os
+import resource
 from dataclasses import replace
 from pathlib import Path
 
@@ -174,7 +176,7 @@ def test_a_damaged_index_is_built_again(
     }
     if damage == "version":
         # Another version may compare by other rules.
-        monkeypatch.setattr(verification_cache_keeper, "version", lambda _: "0.0.0")
+        monkeypatch.setattr(verification_cache_keeper, "VERSION", "0.0.0")
     merger = Merger(None, settings.get(damage))
     with caplog.at_level(logging.INFO):
         VerificationCacheKeeper(tmp_path / "store").restore(merger)
@@ -236,3 +238,27 @@ def test_a_full_disk_is_reported(logged: Log, tmp_path: Path, caplog: pytest.Log
     now[0] += verification_cache_keeper.RETRY + 1.0
     keeper.save(merger)
     assert (tmp_path / "later" / f"store{SUFFIX}").exists()
+
+
+def test_a_process_that_can_open_no_more_files_says_so_once(
+    logged: Log, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    merger = read(logged)
+    merger.merged()
+    now = [0.0]
+    keeper = VerificationCacheKeeper(tmp_path / "store", clock=lambda: now[0])
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    newest = max(int(one.name) for one in Path("/proc/self/fd").iterdir())
+    held = [os.open("/", os.O_RDONLY) for _ in range(newest)]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (max(held) + 1, hard))
+    try:
+        for _ in range(5):
+            keeper.save(merger)
+            now[0] += verification_cache_keeper.RETRY + 1.0
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (soft, hard))
+        for handle in held:
+            os.close(handle)
+    assert [line.getMessage().count("Too many open files") for line in caplog.records] == [1, 1]
+    keeper.save(merger)
+    assert (tmp_path / f"store{SUFFIX}").exists()
