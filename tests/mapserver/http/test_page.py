@@ -35,6 +35,7 @@ FACTS = (
     "return [...document.querySelectorAll('#selected dt')]"
     ".map(dt => [dt, dt.nextSibling].map(c => c.textContent))"
 )
+PLANS = "return import('/static/plans.js').then(one => one.planNames().length)"
 KIND = "const answer = document.getElementById('answer'); return answer.dataset.certainty || answer.className"
 
 
@@ -68,7 +69,7 @@ def test_a_picture_is_answered_on_the_page(page: Browser, services: StubServices
         ["place", "ahead", "left", "turned", "probability"],
         ["r0.1.7", "0.50 m", "-0.25 m", "6°", "99 %"],
     ]
-    assert page.run("return document.getElementById('shown').naturalWidth") == 160
+    eventually(lambda: page.run("return document.getElementById('shown').naturalWidth") == 160)
     assert services.views[-1].camera.fx == pytest.approx(80.0)
 
 
@@ -127,6 +128,7 @@ def test_robots_and_photos_are_named_in_coordinates_of_a_plan(
     services.answer = replace(PLACE, candidates=(replace(found, component=1), replace(found, component=0)))
     page.run("document.dispatchEvent(new Event('mapchanged'))")
     eventually(lambda: page.run("return document.querySelectorAll('#robots button').length") == 2)
+    eventually(lambda: page.run(PLANS) == 1)
     for number, words in ((1, "office 9.00, 7.00 m, 90°"), (0, None)):
         page.run(f"document.querySelectorAll('#robots button')[{number}].click()")
         facts = dict(page.run(FACTS))
@@ -149,7 +151,7 @@ def test_nodes_are_named_and_found_in_coordinates_of_a_plan(
     words = f"ground floor {10.0 - at.y:.2f}, {5.0 + at.x:.2f}"
     search = "document.getElementById('query').value = '{}';document.getElementById('search').requestSubmit()"
     shown = "return document.querySelector('#selected h2')?.textContent"
-    eventually(lambda: page.run("return import('/static/plans.js').then(one => one.planNames().length)"))
+    eventually(lambda: page.run(PLANS) == 1)
     for typed in (words, words.replace(", ", ",")):
         page.run(search.format("r0.1.1"))
         eventually(lambda: page.run(shown) == "Node r0.1.1")
@@ -229,6 +231,7 @@ def test_labels_do_not_lie_on_each_other(
     services.said = Annotations((*places, label))
     page.run("document.dispatchEvent(new Event('mapchanged'))")
     eventually(lambda: page.run("return document.querySelectorAll('#places li').length") == 7)
+    eventually(lambda: page.run("return mapweave.model.rowOf('r0.1.1')") is not None)
     texts, overlaps = page.run(f"""
         const p = mapweave.painter, row = p.model.rowOf("r0.1.1"), x = p.model.x[row], y = p.model.y[row];
         p.viewport.show(x, y);
