@@ -58,7 +58,8 @@ class PatroniMember:
         self._folder, self._user = folder, user
         given = page_configuration()
         given["etcd3"]["hosts"] = etcd
-        given["bootstrap"]["dcs"] |= {"ttl": TTL, "loop_wait": 5, "retry_timeout": 5}
+        # Members look about once a second: what is waited for here is the time to live, not their pause.
+        given["bootstrap"]["dcs"] |= {"ttl": TTL, "loop_wait": 1, "retry_timeout": 5}
         # The page leaves out what is of a machine: names, addresses, folders, passwords.
         given |= {
             "scope": "maps",
