@@ -53,7 +53,7 @@ slow: setup $(AUDIT)/.installed
 	@$(MAKE) --no-print-directory -j 2 slow-waits slow-most
 	$(BIN)/python -m pytest -m "slow and alone" $(call marked,alone)
 
-# Beside two workers: these wait for time-outs, or drive in real time, and need a third of a core at most.
+# Beside two workers: these wait for time-outs, or drive in real time, and need half a core at most.
 slow-waits:
 	$(BIN)/python -m pytest -m "slow and waits" $(call marked,waits)
 

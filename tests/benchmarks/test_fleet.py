@@ -137,6 +137,7 @@ def test_it_ends_with_1_unless_it_is_good_and_prints_json(
 
 
 @pytest.mark.slow
+@pytest.mark.waits
 @pytest.mark.timeout(400)
 def test_a_small_fleet_is_measured_as_a_whole() -> None:
     """Not how fast it is: that is a matter of the machine and of what else it does."""

@@ -18,7 +18,7 @@ import pytest
 from synthetic.postgres_server import binaries
 from tests.disks import own_mounts
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(900)]
+pytestmark = [pytest.mark.slow, pytest.mark.waits, pytest.mark.timeout(900)]
 
 
 @pytest.fixture(scope="module", params=["sqlite", "postgresql"])

@@ -14,7 +14,7 @@ import pytest
 from mapweave.exit_status import FAILED
 from tests.disks import own_mounts
 
-pytestmark = [pytest.mark.slow, pytest.mark.timeout(600)]
+pytestmark = [pytest.mark.slow, pytest.mark.waits, pytest.mark.timeout(600)]
 
 
 @pytest.fixture(scope="module")
