@@ -1,4 +1,4 @@
-"""Patterns match what they should, and what comes from outside is checked; for each key see test_vectors.py."""
+"""Patterns match what they should, and what comes from outside is checked; each key is in test_vectors.py."""
 
 from __future__ import annotations
 
