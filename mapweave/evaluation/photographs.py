@@ -11,9 +11,11 @@ import csv
 import math
 import re
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
+from statistics import mode
 
 import cv2
 import numpy as np
@@ -127,6 +129,12 @@ def rivals(inliers: Mapping[int, int], together: Callable[[int, int], bool], com
     return kept
 
 
+def step_of(numbers: Iterable[int]) -> int:
+    """By how much the numbers of images that follow each other differ: 5 where every fifth was kept."""
+    differences = [after - before for before, after in pairwise(sorted(numbers))]
+    return mode(differences) if differences else 1
+
+
 CANDIDATES = 8
 """Places that are compared with a question."""
 APART = 2
@@ -138,9 +146,9 @@ COMPARABLE = 0.6
 class AppearanceMap:
     """Places by their appearance alone."""
 
-    def __init__(self, camera: Camera, distortion: Distortion):
-        """Begin with none, for a camera and its lens."""
-        self._camera = camera
+    def __init__(self, camera: Camera, distortion: Distortion, step: int):
+        """Begin with none, for a camera and its lens; `step` of the places' numbers, see `step_of`."""
+        self._camera, self._apart = camera, APART * step
         self._sift = Sift(Lens(camera, distortion))
         self._index = PlaceIndex()
         self._nodes: dict[int, Node] = {}
@@ -178,7 +186,7 @@ class AppearanceMap:
         counts = {number: len(inliers) for number, inliers in pairs.items() if inliers is not None}
         if not counts:
             return Certainty.UNKNOWN, None
-        best, *runners_up = rivals(counts, lambda a, b: abs(a - b) <= APART, COMPARABLE)
+        best, *runners_up = rivals(counts, lambda a, b: abs(a - b) <= self._apart, COMPARABLE)
         return (Certainty.AMBIGUOUS if runners_up else Certainty.FOUND), best
 
     def _view(self, path: Path) -> View:
@@ -190,9 +198,11 @@ def photograph_trials(verdicts: Sequence[JudgedAnswer]) -> list[LostDrive]:
 
     Photographs have no odometry. They are 1 to 3 m apart, so the next one is what lies within 2 m.
     """
+    step = step_of(int(verdict.query) for verdict in verdicts)
     trials = []
     for first, second in zip(verdicts, [*verdicts[1:], None], strict=True):
-        asked = [first] if second is None or int(second.query) != int(first.query) + 1 else [first, second]
+        follows = second is not None and int(second.query) == int(first.query) + step
+        asked = [first, second] if second is not None and follows else [first]
         answered = next((verdict for verdict in asked if verdict.certainty is Certainty.FOUND), None)
         right = None if answered is None else answered.right
         trials.append(LostDrive(first.expected, answered is not None, right))

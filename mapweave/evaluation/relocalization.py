@@ -17,7 +17,7 @@ from mapweave.agent.recordings.splits import robots_of
 from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.asking_again import LostDrive, trial_figures
 from mapweave.evaluation.drive import DriveMap
-from mapweave.evaluation.photographs import AppearanceMap, Photographs, photograph_trials
+from mapweave.evaluation.photographs import AppearanceMap, Photographs, photograph_trials, step_of
 from mapweave.evaluation.pieces import check_folder, say
 from mapweave.evaluation.truth import Truth
 from mapweave.evaluation.verdict import JudgedAnswer, figures
@@ -152,7 +152,7 @@ def _examine_photographs(
 ) -> RelocalizationEvaluation:
     photographs = Photographs(folder)
     camera, distortion = _camera_of(folder, camera_file, focal_px)
-    places = AppearanceMap(camera, distortion)
+    places = AppearanceMap(camera, distortion, step_of(photographs.places))
     for number, image in tracked(list(photographs.places.items()), "first pass", console=console):
         places.add(number, image)
     verdicts = [

@@ -208,6 +208,30 @@ def test_photographs(walk: Path, capfd, tmp_path: Path) -> None:
     assert (values["recall_at_1"], values["precision"]) == (pytest.approx(1 / 3, abs=1e-4),) * 2
 
 
+@pytest.mark.parametrize("step", [1, 5])
+def test_photographs_are_numbered_in_any_step(step: int, capfd, tmp_path: Path) -> None:
+    """A scene that two places in a row show is one place; if a place far from it shows it too, it is two."""
+    (tmp_path / "images").mkdir()
+    rng = np.random.default_rng(4)
+    scenes = {"a": skimage.data.coffee(), "b": skimage.data.astronaut(), "c": skimage.data.chelsea()}
+    for number, name in enumerate("aabbccccbabcb", 1):
+        grey = cv2.resize(cv2.cvtColor(scenes[name], cv2.COLOR_RGB2GRAY), (320, 240))
+        corners = np.array([[0, 0], [320, 0], [320, 240], [0, 240]], np.float32)
+        moved = corners + rng.uniform(-9, 9, (4, 2)).astype(np.float32)
+        seen = cv2.warpPerspective(grey, cv2.getPerspectiveTransform(corners, moved), (320, 240))
+        cv2.imwrite(str(tmp_path / "images" / f"{step * number:04d}.png"), seen)
+    # Places 1 to 9; scene b is at 3, 4 and 9. Questions 10 to 13.
+    rows = [(10, 1, 1, 2), (11, 3, 3, 4), (12, 5, 5, 8), (13, 3, 3, 4)]
+    lines = "".join(",".join(str(step * value) for value in row) + ",\n" for row in rows)
+    (tmp_path / "lap_truth.csv").write_text("query,ref_best,ref_lo,ref_hi,note\n" + lines)
+    values = report(capfd, tmp_path, "--focal", 300, "--out", tmp_path / "out")
+    with (tmp_path / "out" / "answers-looks.csv").open() as file:
+        answers = [row["certainty"] for row in csv.DictReader(file)]
+    assert answers == ["found", "ambiguous", "found", "ambiguous"]
+    assert (values["precision"], values["recall_at_1"]) == (1.0, 0.5)
+    assert values["recall_within_2m"] == 0.75, "the one after the second is found"
+
+
 def test_figures_by_hand() -> None:
     result, unknown, ambiguous = Certainty.FOUND, Certainty.UNKNOWN, Certainty.AMBIGUOUS
     verdicts = [
