@@ -24,24 +24,35 @@ from mapweave.vision.lens import NO_DISTORTION, LensModel, lens_of
 
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy, px."""
+KITTI_IMAGES = "image_0", "image_2"
+"""Folders of the left cameras, grey and colour."""
 
 
 def kitti(folder: Path, options: RecordingOptions) -> Recording:
     """A sequence of KITTI's odometry benchmark: image_0 (or image_2), calib.txt, times.txt.
 
+    Of an excerpt times.txt may be that of the whole sequence.
+
     Raises:
         DeviceError: something is missing or wrong.
     """
-    name = "image_0" if (folder / "image_0").is_dir() else "image_2"
-    paths = images_in(folder / name)
-    stamps = _seconds(folder / "times.txt", len(paths))
-    row = f"P{name[-1]}:"
-    lines = [line.split()[1:] for line in _lines(folder / "calib.txt") if line.startswith(row)]
-    if not lines or len(lines[0]) != 12:
-        raise DeviceError(f"{folder / 'calib.txt'}: no line {row} with twelve numbers")
-    p = _numbers(folder / "calib.txt", lines[0])
-    given = _camera(paths, (p[0], p[5], p[2], p[6])), NO_DISTORTION
-    return _folder(folder, "KITTI odometry", paths, stamps, given, options)
+    name = next((name for name in KITTI_IMAGES if (folder / name).is_dir()), None)
+    if name is None:
+        raise DeviceError(
+            f"{folder}: as KITTI odometry it needs {' or '.join(KITTI_IMAGES)}, with the images"
+        )
+    paths, calibration, times = images_in(folder / name), folder / "calib.txt", folder / "times.txt"
+    assumed = "" if times.exists() else f"no {times.name}: ten images a second are assumed"
+    stamps = stamps_of(times, 0.1 * np.arange(len(paths))) if assumed else _numbered_seconds(times, paths)
+    given = None
+    if options.camera is None and calibration.exists():
+        row = f"P{name[-1]}:"
+        lines = [line.split()[1:] for line in _lines(calibration) if line.startswith(row)]
+        if not lines or len(lines[0]) != 12:
+            raise DeviceError(f"{calibration}: no line {row} with twelve numbers")
+        p = _numbers(calibration, lines[0])
+        given = _camera(paths, (p[0], p[5], p[2], p[6])), NO_DISTORTION
+    return _folder(folder, "KITTI odometry", paths, stamps, given, options, assumed)
 
 
 def euroc(folder: Path, options: RecordingOptions) -> Recording:
@@ -57,6 +68,18 @@ def euroc(folder: Path, options: RecordingOptions) -> Recording:
         stamps = np.array([int(row[0]) for row in rows], np.int64)
     except (ValueError, OverflowError) as error:
         raise DeviceError(f"{cam / 'data.csv'}: {error}") from None
+    if not paths:
+        raise DeviceError(f"{cam / 'data.csv'}: no images")
+    given = _euroc_camera(cam, paths) if options.camera is None else None
+    return _folder(folder, "EuRoC", paths, stamps, given, options)
+
+
+def _euroc_camera(cam: Path, paths: Sequence[Path]) -> CameraAndLens:
+    """What sensor.yaml says.
+
+    Raises:
+        DeviceError: it is missing or wrong.
+    """
     text = "\n".join(_lines(cam / "sensor.yaml"))
     intrinsics, lens = (
         _yaml_list(cam, text, "intrinsics", 4),
@@ -67,15 +90,12 @@ def euroc(folder: Path, options: RecordingOptions) -> Recording:
     if name not in list(LensModel):
         known = " and ".join(LensModel)
         raise DeviceError(f"{cam / 'sensor.yaml'}: lens model {name} is not supported; {known} are")
-    if not paths:
-        raise DeviceError(f"{cam / 'data.csv'}: no images")
     fx, fy, cx, cy = intrinsics
     try:
         coefficients = [*lens, 0.0] if name == LensModel.RADIAL_TANGENTIAL else lens
-        given = lens_of(_camera(paths, (fx, fy, cx, cy)), LensModel(name), coefficients)
+        return lens_of(_camera(paths, (fx, fy, cx, cy)), LensModel(name), coefficients)
     except InvalidValue as error:
         raise DeviceError(f"{cam / 'sensor.yaml'}: {error}") from None
-    return _folder(folder, "EuRoC", paths, stamps, given, options)
 
 
 def tum_rgbd(folder: Path, options: RecordingOptions) -> Recording:
@@ -157,12 +177,14 @@ def _folder(
     stamps_ns: Stamps,
     given: CameraAndLens | None,
     options: RecordingOptions,
+    assumed: str = "",
 ) -> Recording:
     optics = options.camera_of(given)
     beside = next((p for p in (folder / "odometry.csv", folder / "odometry.txt") if p.exists()), None)
     odometry = options.odometry or beside
     poses = None if odometry is None else read_poses(odometry)
-    return complete(folder, kind, optics, _images(paths, stamps_ns), poses)
+    images = replace(_images(paths, stamps_ns), assumed=assumed)
+    return complete(folder, kind, optics, images, poses)
 
 
 def _images(paths: Sequence[Path], stamps_ns: Stamps, camera: Camera | None = None) -> Images:
@@ -197,10 +219,21 @@ def _numbers(path: Path, words: Sequence[str]) -> list[float]:
         raise DeviceError(f"{path}: {error}") from None
 
 
-def _seconds(path: Path, count: int) -> Stamps:
+def _numbered_seconds(path: Path, images: Sequence[Path]) -> Stamps:
+    """Times of images of which each is named by its line, counted from 0; of an excerpt there are more lines.
+
+    Raises:
+        DeviceError: there are more lines, and the names are not their numbers, or there are fewer.
+    """
     times = _numbers(path, "\n".join(_lines(path)).split())
-    if len(times) != count:
-        raise DeviceError(f"{path}: {len(times)} times for {count} images")
+    lines = [int(image.stem) for image in images if re.fullmatch(r"[0-9]+", image.stem)]
+    if len(times) > len(images) == len(lines) and lines[-1] < len(times):
+        times = [times[line] for line in lines]
+    if len(times) != len(images):
+        raise DeviceError(
+            f"{path}: {len(times)} times for {len(images)} images; there must be a line for each image, or "
+            "the name of each image must be the number of its line, counted from 0"
+        )
     return stamps_of(path, times)
 
 

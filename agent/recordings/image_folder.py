@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from collections.abc import Iterator
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -21,16 +22,17 @@ IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp"}
 
 
 def images_of(folder: Path) -> list[Path]:
-    """The images of a recording in the order of the numbers in their names.
+    """The images of a recording in the order of the numbers in their names: in images/, else in it itself.
 
     Raises:
         DeviceError: there are none, or one is there in two formats.
     """
-    images = images_in(folder / "images")
+    inside = folder / "images"
+    images = images_in(folder if has_images(folder) and not inside.exists() else inside)
     for before, image in pairwise(sorted(images, key=lambda path: path.stem)):
         if before.stem == image.stem:
             both = " and ".join(sorted((before.name, image.name)))
-            raise DeviceError(f"{folder / 'images'}: {both} are one image; keep one format")
+            raise DeviceError(f"{image.parent}: {both} are one image; keep one format")
     return images
 
 
@@ -40,11 +42,20 @@ def images_in(folder: Path) -> list[Path]:
     Raises:
         DeviceError: there are none.
     """
-    # On disks of others macOS keeps a file `._0001.png` of its own beside each.
-    images = [p for p in folder.glob("[!.]*") if p.suffix.lower() in IMAGE_SUFFIXES]
+    images = list(_images(folder))
     if not images:
         raise DeviceError(f"{folder}: no images there (png, jpg, pgm or bmp)")
     return sorted(images, key=_natural_order)
+
+
+def has_images(folder: Path) -> bool:
+    """Whether images lie in a folder itself."""
+    return next(_images(folder), None) is not None
+
+
+def _images(folder: Path) -> Iterator[Path]:
+    # On disks of others macOS keeps a file `._0001.png` of its own beside each.
+    return (path for path in folder.glob("[!.]*") if path.suffix.lower() in IMAGE_SUFFIXES)
 
 
 def _natural_order(path: Path) -> tuple[list[int], str]:

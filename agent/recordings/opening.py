@@ -7,14 +7,22 @@ from pathlib import Path
 
 from mapweave.agent.recordings import bag as bags
 from mapweave.agent.recordings import video as videos
-from mapweave.agent.recordings.folders import euroc, four_seasons, images_folder, kitti, tum_rgbd
+from mapweave.agent.recordings.folders import (
+    KITTI_IMAGES,
+    euroc,
+    four_seasons,
+    images_folder,
+    kitti,
+    tum_rgbd,
+)
+from mapweave.agent.recordings.image_folder import has_images
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.recording import Recording
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.storage.os_errors import unreadable
 
 FORMATS = (
-    "a folder with images/ and camera.toml, a bag (.mcap, .bag, .db3 or its folder), a video, or a sequence "
+    "a folder of images with camera.toml, a bag (.mcap, .bag, .db3 or its folder), a video, or a sequence "
     "of KITTI odometry, EuRoC, TUM RGB-D or 4Seasons"
 )
 
@@ -54,10 +62,13 @@ def _opener(path: Path) -> Callable[[Path, RecordingOptions], Recording]:
     marks = {
         "images": images_folder, "camera.toml": images_folder, "metadata.yaml": bags.bag, "mav0": euroc,
         "rgb.txt": tum_rgbd, "undistorted_images": four_seasons, "calib.txt": kitti,
+        **dict.fromkeys(KITTI_IMAGES, kitti),
     }  # fmt: skip
     for mark, opened in marks.items():
         if (path / mark).exists():
             return opened
     if bags.parts_of(path):
         return bags.bag
+    if has_images(path):
+        return images_folder
     raise DeviceError(f"{path}: not a recording; one is {FORMATS}")

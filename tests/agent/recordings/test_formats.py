@@ -11,7 +11,7 @@ import pytest
 
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.recordings.camera_file import read_camera
-from mapweave.agent.recordings.incomplete import NoOdometry
+from mapweave.agent.recordings.incomplete import Incomplete, NoOdometry
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.video import video_images
@@ -132,6 +132,71 @@ def test_a_first_image_that_is_missing_is_left_out_as_any_other(
         image.unlink()
     with pytest.raises(DeviceError, match=r"no such file$"):
         open_recording(tmp_path, RecordingOptions(odometry=poses_file, camera_height=0.3))
+
+
+def test_an_excerpt_of_kitti_has_the_times_that_its_images_are_named_by(drive: Drive, tmp_path: Path) -> None:
+    """times.txt and calib.txt are of the whole sequence; images 3 to 6 are there."""
+    kitti(drive, tmp_path)
+    for k in {*range(COUNT)} - {3, 4, 5, 6}:
+        (tmp_path / "image_0" / f"{k:06d}.png").unlink()
+    with pytest.raises(NoOdometry, match="KITTI odometry, 4 images") as found:
+        open_recording(tmp_path, RecordingOptions(camera_height=0.3))
+    recording = found.value.recording
+    assert np.abs(recording.stamps_ns - (np.array(drive.stamps_ns[3:7]) - BEGUN_NS)).max() <= 1000
+    assert np.array_equal(recording.read(0), drive.images[3])
+    for k in (3, 4, 5, 6):
+        (tmp_path / "image_0" / f"{k:06d}.png").rename(tmp_path / "image_0" / f"left{k}.png")
+    with pytest.raises(DeviceError, match=r"9 times for 4 images; .* the number of its line"):
+        open_recording(tmp_path, RecordingOptions(camera_height=0.3))
+
+
+@pytest.mark.parametrize(
+    ("write", "calibration"), [(kitti, "calib.txt"), (euroc, "mav0/cam0/sensor.yaml")], ids=lambda f: str(f)
+)
+@pytest.mark.parametrize("text", [None, "intrinsics: [fx: 277.0]\nP0: 1\n"], ids=["missing", "another form"])
+def test_the_calibration_of_others_is_not_needed_beside_a_camera_file(
+    write, calibration: str, text: str | None, drive: Drive, poses_file: Path, tmp_path: Path
+) -> None:
+    folder, camera = tmp_path / "sequence", tmp_path / "camera.toml"
+    folder.mkdir()
+    write(drive, folder)
+    (folder / calibration).unlink()
+    if text is not None:
+        (folder / calibration).write_text(text)
+    camera.write_text(CAMERA_TOML)
+    with pytest.raises(NoOdometry) as found:
+        open_recording(folder, RecordingOptions(camera=camera))
+    assert found.value.recording.camera == drive.camera
+    with pytest.raises(DeviceError) as refused:
+        open_recording(folder, RecordingOptions(camera_height=0.3))
+    assert calibration.split("/")[-1] in str(refused.value) or "give --camera FILE" in str(refused.value)
+
+
+def test_kitti_without_times_is_ten_images_a_second(drive: Drive, tmp_path: Path) -> None:
+    kitti(drive, tmp_path)
+    (tmp_path / "times.txt").unlink()
+    with pytest.raises(NoOdometry) as found:
+        open_recording(tmp_path, RecordingOptions(camera_height=0.3))
+    assert np.abs(np.diff(found.value.recording.stamps_ns) - 10**8).max() <= 1
+    assert not found.value.recording.timed
+    (tmp_path / "image_0").rename(tmp_path / "image_l")
+    with pytest.raises(DeviceError, match="it needs image_0 or image_2"):
+        open_recording(tmp_path)
+
+
+def test_images_may_lie_in_the_folder_itself(drive: Drive, tmp_path: Path) -> None:
+    for k, image in enumerate(drive.images):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), image)
+    with pytest.raises(Incomplete, match=r"no camera.toml; .* give --camera FILE"):
+        open_recording(tmp_path)
+    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
+    with pytest.raises(NoOdometry, match=f"folder of images, {COUNT} images") as found:
+        open_recording(tmp_path)
+    assert np.array_equal(found.value.recording.read(COUNT - 1), drive.images[-1])
+    # What lies beside images/ is no image of the recording.
+    (tmp_path / "images").mkdir()
+    with pytest.raises(DeviceError, match=r"images: no images there"):
+        open_recording(tmp_path)
 
 
 def test_a_fisheye_of_euroc_becomes_an_ideal_camera(drive: Drive, poses_file: Path, tmp_path: Path) -> None:
