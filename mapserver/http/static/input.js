@@ -16,6 +16,8 @@ export function listen(canvas, viewport, { moved, chosen, fit, next = () => {}, 
     return { middle: [(u + r) / 2, (v + s) / 2], distance: Math.hypot(u - r, v - s) };
   };
   canvas.addEventListener("pointerdown", event => {
+    // The end of a press that opens a menu is not heard of; other buttons do nothing here.
+    if (event.button) return;
     canvas.setPointerCapture(event.pointerId);
     pointers.set(event.pointerId, began = at(event));
     travelled = pointers.size > 1 ? Infinity : 0;
@@ -23,6 +25,7 @@ export function listen(canvas, viewport, { moved, chosen, fit, next = () => {}, 
   canvas.addEventListener("pointermove", event => {
     const before = pointers.get(event.pointerId);
     if (!before) return;
+    if (event.pointerType === "mouse" && !(event.buttons & 1)) { pointers.delete(event.pointerId); return; }
     const now = at(event), pinch = pointers.size === 2 ? spread() : null;
     pointers.set(event.pointerId, now);
     travelled += Math.hypot(now[0] - before[0], now[1] - before[1]);

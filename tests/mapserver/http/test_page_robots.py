@@ -246,3 +246,32 @@ def test_words_that_say_what_to_type_are_not_cut_off(person: Person) -> None:
         }).map(one => one.placeholder)
     """)
     assert cut == []
+
+
+def test_another_mouse_button_neither_selects_nor_moves(person: Person, services: DrivenServices) -> None:
+    """A right click selected; with the menu that it opens its end is not heard of, and the map hung on."""
+    page, before = person.page, person.page.run(VIEW)
+    x, y = page.run(
+        "const box = mapweave.painter.canvas.getBoundingClientRect(), robot = mapweave.painter.robots[0];"
+        "const [u, v] = mapweave.viewport.toScreen(robot.x, robot.y); return [box.left + u, box.top + v]"
+    )
+
+    def mouse(kind: str, button: str, buttons: int, x: float) -> None:
+        page.devtools(
+            "Input.dispatchMouseEvent", type=kind, x=x, y=y, button=button, buttons=buttons, clickCount=1
+        )
+
+    mouse("mousePressed", "right", 2, x)
+    mouse("mouseReleased", "right", 0, x)
+    mouse("mousePressed", "middle", 4, x)
+    for step in range(5):
+        mouse("mouseMoved", "none", 0, x + 20.0 * step)
+    mouse("mouseReleased", "middle", 0, x)
+    assert page.run(VIEW) == before and "Select a node" in person.text("selected")
+    # Nor does a drag go on whose end was not heard of.
+    mouse("mousePressed", "left", 1, x)
+    mouse("mouseMoved", "left", 1, x + 40.0)
+    after = page.run(VIEW)
+    assert after != before
+    mouse("mouseMoved", "none", 0, x + 80.0)
+    assert page.run(VIEW) == after
