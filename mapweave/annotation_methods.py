@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal
+from typing import Any, Literal, TypedDict, Unpack
 
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
@@ -20,6 +20,36 @@ Corners = Sequence[tuple[float, float]]
 """Of an area, in order around it, m, in the merged map, or on a plan."""
 Time = str | int
 """ns since 1970, or text such as `2026-03-01 14:00`, in UTC unless it names a zone."""
+
+
+class FloorWords(TypedDict, total=False):
+    """Which floor is meant.
+
+    Attributes:
+        radius: of the floor around a node, or around a place, m.
+        corners: of an area.
+        near: in the part of the map where this node or place is; the largest part without.
+        plan: a floor plan, in whose frame positions are then, instead of in the merged map.
+    """
+
+    radius: float | None
+    corners: Corners | None
+    near: NodeWord
+    plan: str | None
+
+
+class WayWords(FloorWords, total=False):
+    """Which ways are meant: an edge, or all in an area.
+
+    Attributes:
+        edge: its two nodes.
+        place: a named place.
+        node: amid the floor that is meant.
+    """
+
+    edge: tuple[NodeWord, NodeWord] | None
+    place: str
+    node: NodeWord
 
 
 class AnnotationMethods(ABC):
@@ -103,100 +133,50 @@ class AnnotationMethods(ABC):
         """Floor plans, and where they lie under the merged map."""
 
     def place(
-        self,
-        name: str,
-        node: NodeWord = "",
-        *,
-        radius: float | None = None,
-        corners: Corners | None = None,
-        near: NodeWord = "",
-        plan: str | None = None,
-        because: str = "",
-        check: bool = False,
-    ) -> str:
+        self, name: str, node: NodeWord = "", *, because: str = "", check: bool = False,
+        **floor: Unpack[FloorWords],
+    ) -> str:  # fmt: skip
         """Name a node, the floor within a radius of it, m, or the floor within corners.
 
         Args:
             name: of the place; the same name again: the later one holds.
             node: where it is; none with corners.
-            radius: of the floor around it, m.
-            corners: of an area.
-            near: in the part of the map where this node or place is; the largest part without.
-            plan: a floor plan, in whose frame positions are then, instead of in the merged map.
             because: why.
             check: only say what it would do.
+            floor: radius, corners, near and plan, see `FloorWords`.
         """
-        fields = _given(node=word_of(node), radius=radius, corners=corners, near=word_of(near), plan=plan)
-        return self.annotate("place", name, because, check=check, **fields)
+        return self.annotate("place", name, because, check=check, **_where({"node": node, **floor}))
 
     def close_way(
-        self,
-        name: str,
-        *,
-        edge: tuple[NodeWord, NodeWord] | None = None,
-        place: str = "",
-        node: NodeWord = "",
-        radius: float | None = None,
-        corners: Corners | None = None,
-        near: NodeWord = "",
-        plan: str | None = None,
-        begin: Time | None = None,
-        end: Time | None = None,
-        because: str = "",
-        check: bool = False,
-    ) -> str:
+        self, name: str, *, begin: Time | None = None, end: Time | None = None, because: str = "",
+        check: bool = False, **ways: Unpack[WayWords],
+    ) -> str:  # fmt: skip
         """Close an edge or an area to robots; give one of edge, place, node with radius, and corners.
 
         Args:
             name: of the closure.
-            edge: its two nodes.
-            place: a named place.
-            node: amid the floor that is closed.
-            radius: of the floor around it, or around the place, m.
-            corners: of an area.
-            near: see `place`.
-            plan: see `place`.
             begin: from when on; from now on without.
             end: until when; until it is withdrawn without.
             because: why.
             check: only say what it would do.
+            ways: edge, place, node, radius, corners, near and plan, see `WayWords`.
         """
-        where = _where(edge, place, node, radius, corners, near, plan)
-        fields = {**where, **_given(begin_ns=begin, end_ns=end)}
+        fields = {**_where(ways), **_given(begin_ns=begin, end_ns=end)}
         return self.annotate("closure", name, because, check=check, **fields)
 
     def prefer(
-        self,
-        name: str,
-        factor: float,
-        *,
-        edge: tuple[NodeWord, NodeWord] | None = None,
-        place: str = "",
-        node: NodeWord = "",
-        radius: float | None = None,
-        corners: Corners | None = None,
-        near: NodeWord = "",
-        plan: str | None = None,
-        because: str = "",
-        check: bool = False,
+        self, name: str, factor: float, *, because: str = "", check: bool = False, **ways: Unpack[WayWords]
     ) -> str:
         """Let robots prefer ways, or avoid them where they can; which ways, see `close_way`.
 
         Args:
             name: of the preference.
             factor: by which their cost is multiplied: 0.1 to 1 prefers, 1 to 100 avoids.
-            edge: see `close_way`; likewise place, node, radius, corners, near.
-            place: see there.
-            node: see there.
-            radius: see there, m.
-            corners: see there.
-            near: see there.
-            plan: see there.
             because: why.
             check: only say what it would do.
+            ways: edge, place, node, radius, corners, near and plan, see `WayWords`.
         """
-        fields = {**_where(edge, place, node, radius, corners, near, plan), "factor": factor}
-        return self.annotate("preference", name, because, check=check, **fields)
+        return self.annotate("preference", name, because, check=check, factor=factor, **_where(ways))
 
     def floor(
         self,
@@ -305,19 +285,14 @@ class AnnotationMethods(ABC):
         return self.annotate("pin", own, because, check=check, node=own, **fields)
 
 
-def _where(
-    edge: tuple[NodeWord, NodeWord] | None,
-    place: str,
-    node: NodeWord,
-    radius: float | None,
-    corners: Corners | None,
-    near: NodeWord,
-    plan: str | None,
-) -> dict[str, Any]:
-    fields = _given(
-        place=place, node=word_of(node), radius=radius, corners=corners, near=word_of(near), plan=plan
-    )
-    return fields if edge is None else {**fields, "edge": [word_of(end) for end in edge]}
+def _where(words: Mapping[str, Any]) -> dict[str, Any]:
+    """Words for a floor or for ways, with text for nodes."""
+    given = {name: value for name, value in words.items() if value is not None}
+    for name in given.keys() & {"node", "near"}:
+        given[name] = word_of(given[name])
+    if "edge" in given:
+        given["edge"] = [word_of(end) for end in given["edge"]]
+    return _given(**given)
 
 
 def _in_words(fields: Mapping[str, Any]) -> dict[str, Any]:
