@@ -254,7 +254,7 @@ watch({
     painter.ask();
   },
   events({ history }) {
-    addEvents(history, name => model.rowOf(name) === undefined ? find(name) : selectNode(name));
+    addEvents(history, name => model.rowOf(name) === undefined ? find(name) : selectNode(name), name => model.numbers?.has(name));
     if (page.heard) byId("announcement").textContent = history.slice(-3).map(({ words }) => words).join("; ");
     page.heard = true;
     if (history.some(({ kind }) => kind === "annotated")) loadSaid();

@@ -13,6 +13,7 @@ from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
 from mapweave.hybridmap.errors import Busy, InvalidValue
 from mapweave.hybridmap.floor_plan import PlacedPlans
 from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, SimilarPlace
 from mapweave.mapserver.http.web import Web
@@ -437,3 +438,12 @@ def test_lists_that_change_keep_what_is_pressed_or_has_the_focus(
     page.run("document.dispatchEvent(new CustomEvent('mapchanged'))")
     eventually(lambda: "attic" in person.text("places"))
     assert page.run(focused) == "hall"
+
+
+def test_numbers_in_events_are_no_names_of_maps(page: Browser, services: StubServices) -> None:
+    """The position of a goal was a button, and there was no map 1.9."""
+    words = "r0: go to r0.1.5 (1.9,-0.25) via r0.1 and b-2.1.7, after 12.5 s"
+    services.events = (MapEvent(10**18, MapEventKind.COMMANDED, words),)
+    eventually(lambda: words in page.run(text_of("history")))
+    buttons = "return [...document.querySelectorAll('#history button')].map(one => one.textContent)"
+    assert page.run(buttons) == ["r0.1.5", "r0.1", "b-2.1.7"]
