@@ -384,6 +384,8 @@ class Replicator:
         for line in news:
             log.warning("%s", line)
         if lost:
+            # It is to know how much it had: what was retired meanwhile may have been dropped here.
+            self._bus.publish(self._keys.head(state.map), state.head().encode())
             log.warning(
                 "%s has lost what it had of %s after %d: it gets it again", server, state.map, ack.watermark
             )

@@ -52,6 +52,8 @@ class AgentLog:
         pull_at: when the next one is due.
         chunk: changes to ask for at once; smaller after an answer that could not be read.
         resting_until: nothing is pulled before.
+        claimed: up to which change the robot knows this server to have had the log, as far as that was
+            compared with the store.
     """
 
     map: MapId
@@ -67,6 +69,7 @@ class AgentLog:
     pull_at: float = NEVER
     chunk: int = MAX_ROWS
     resting_until: float = -NEVER
+    claimed: int = 0
     _pause: float = 0.0
     _ahead_bytes: int = 0
     _announced: deque[tuple[int, float]] = field(default_factory=deque)

@@ -293,11 +293,26 @@ class Ingest:
             return None
         self._believe(agent_log, head.newest)
         agent_log.heard(time.monotonic())
-        # More than there is: it was another store that had it.
-        if head.acknowledged.get(self._name, 0) != agent_log.watermark:
+        # More than there is: it was another store that had it, or this one is of a copy of before.
+        if (had := head.acknowledged.get(self._name, 0)) != agent_log.watermark:
+            self._compare_if_older(agent_log, had)
             # Behind the commit of this turn, which may be acknowledged anyway.
             self._unaware[agent_log.map] = agent_log
         return agent_log
+
+    def _compare_if_older(self, agent_log: AgentLog, acknowledged: int) -> None:
+        """Compare a log with its robot's if the robot knows this server to have had more of it."""
+        if acknowledged <= max(agent_log.watermark, agent_log.claimed):
+            return
+        try:
+            # A server that shares its store may be behind it.
+            if self._store.watermark(agent_log.map) < acknowledged:
+                self._store.doubt(agent_log.map, acknowledged)
+                agent_log.unverified = self._store.unverified(agent_log.map)
+        except InvalidFile as error:  # the next beacon says it once more
+            self._commit_failed(agent_log, error)
+            return
+        agent_log.claimed = acknowledged
 
     def _take_pulled(self, pulled: Pulled) -> AgentLog | None:
         agent_log, first = pulled.log, pulled.asked.first

@@ -347,6 +347,24 @@ class Store(SqlSizes):
         rows = self._read("SELECT first, last FROM unverified WHERE agent = ? AND epoch = ?", map_id)
         return Gap(map_id, *rows[0]) if rows else None
 
+    def doubt(self, map_id: MapId, acknowledged: int) -> None:
+        """Have all changes of a log verified if the store once had more of it: it is of a copy of before.
+
+        What was retired meanwhile its robot may have dropped, as soon as it was acknowledged.
+
+        Args:
+            map_id: whose log.
+            acknowledged: so much of it the robot knows to have been acknowledged.
+
+        Raises:
+            InvalidFile: the disk does not take it.
+        """
+        with self._transaction():
+            watermark = self.watermark(map_id)
+            if 0 < watermark < acknowledged:
+                before = self.unverified(map_id)
+                self._put("unverified", (*map_id, 1, max(watermark, before.last if before else 0)))
+
     def verify(self, map_id: MapId, first: int, covered: int, kept: Collection[int]) -> list[Change]:
         """Delete unverified changes that the robot has dropped, since others undid them.
 

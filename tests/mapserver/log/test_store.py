@@ -79,6 +79,15 @@ def sequences(store: Store, map_id: MapId = MAP) -> list[int]:
     return [change.sequence for change in store.replay(map_id)]
 
 
+@pytest.mark.parametrize("acknowledged", [4, 5, 6])
+def test_a_log_is_compared_where_the_store_once_had_more_of_it(store: Store, acknowledged: int) -> None:
+    store.doubt(MAP, acknowledged)
+    assert store.unverified(MAP) is None, "there is nothing of this log"
+    store.apply(MAP, 5, [entry(k, node_put(k)) for k in range(1, 6)])
+    store.doubt(MAP, acknowledged)
+    assert store.unverified(MAP) == ((MAP, 1, 5) if acknowledged > 5 else None)
+
+
 def test_an_unknown_map_is_empty(store: Store) -> None:
     assert (store.maps(), store.watermark(MAP), store.positions(), sequences(store)) == ([], 0, {}, [])
 
