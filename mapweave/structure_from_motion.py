@@ -166,22 +166,12 @@ def _extended(
         key=lambda camera: int(visible[camera].sum()),
     )
     rotations, centres = structure.rotations.copy(), structure.centres.copy()
-    visible_points, camera = np.flatnonzero(visible[k]), views[k].camera
+    visible_points = np.flatnonzero(visible[k])
     pixels = views[k].pixels[structure.features[k, visible_points]].astype(np.float64)
-    cv2.setRNGSeed(0)
-    fits, inside = False, None
-    if len(visible_points) >= LEAST_POINTS:
-        fits, turn, shift, inside = cv2.solvePnPRansac(
-            structure.points[visible_points],
-            pixels,
-            _matrix(camera),
-            None,
-            reprojectionError=GATE_PX,
-            flags=cv2.SOLVEPNP_SQPNP,
-        )
-    if fits and inside is not None and len(inside) >= LEAST_POINTS:
-        rotations[k] = cv2.Rodrigues(turn)[0].T
-        centres[k] = -rotations[k] @ shift[:, 0]
+    pose = pose_by_points(structure.points[visible_points], pixels, views[k].camera)
+    if pose is not None:
+        rotations[k] = cv2.Rodrigues(pose.turn)[0].T
+        centres[k] = -rotations[k] @ pose.shift[:, 0]
     else:
         neighbour = high if k > high else (low if k < low else k - 1)
         step = relations[min(k, neighbour), max(k, neighbour)]
@@ -195,7 +185,57 @@ def _extended(
     return replace(structure, rotations=rotations, centres=centres)
 
 
-def _matrix(camera: Camera) -> Array:
+@dataclass(frozen=True, eq=False)
+class CameraPose:
+    """Where a camera sees points: x_camera = R(turn) x + shift.
+
+    Attributes:
+        turn: (3, 1) rotation vector, rad.
+        shift: (3, 1) m.
+        inside: (M,) which of the points agree.
+    """
+
+    turn: Array
+    shift: Array
+    inside: NDArray[np.int64]
+
+
+def pose_by_points(points: Array, pixels: Array, camera: Camera) -> CameraPose | None:
+    """The pose of a camera that sees points (PnP with RANSAC); None if too few agree, or they determine none.
+
+    Args:
+        points: (N, 3) m.
+        pixels: (N, 2) px.
+        camera: that sees them.
+    """
+    if len(points) < LEAST_POINTS:
+        return None
+    # SQPnP compares with absolute bounds, and fails where points lie within a centimetre, as those of a
+    # scene without a scale may: it gets them about 0, and 1 in size.
+    middle = points.mean(axis=0)
+    size = float(np.sqrt(np.square(points - middle).sum(axis=1).mean()))
+    if not size > 0.0:
+        return None
+    cv2.setRNGSeed(0)
+    try:
+        fits, turn, shift, inside = cv2.solvePnPRansac(
+            (points - middle) / size,
+            pixels,
+            matrix_of(camera),
+            None,
+            reprojectionError=GATE_PX,
+            flags=cv2.SOLVEPNP_SQPNP,
+        )
+    except cv2.error:
+        # Those that agree lie so that they determine no pose.
+        return None
+    if not fits or inside is None or len(inside) < LEAST_POINTS:
+        return None
+    back = size * np.asarray(shift, np.float64) - cv2.Rodrigues(turn)[0] @ middle[:, None]
+    return CameraPose(np.asarray(turn, np.float64), back, inside[:, 0].astype(np.int64))
+
+
+def matrix_of(camera: Camera) -> Array:
     """(3, 3) px, of a pinhole."""
     return np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
 
@@ -213,7 +253,7 @@ def _relate(first: View, second: View) -> _Relation | None:
     pairs = match(first.codes, second.codes)
     if len(pairs) < LEAST_MATCHES:
         return None
-    matrix = _matrix(first.camera)
+    matrix = matrix_of(first.camera)
     a = first.pixels[pairs[:, 0]].astype(np.float64)
     b = second.pixels[pairs[:, 1]].astype(np.float64)
     cv2.setRNGSeed(0)

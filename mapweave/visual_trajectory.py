@@ -21,7 +21,7 @@ from mapweave.agent.recordings.trajectory_file import tum_line
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.photographs import Stretch
-from mapweave.structure_from_motion import GATE_PX, LEAST_POINTS
+from mapweave.structure_from_motion import matrix_of, pose_by_points
 
 FOUND = "# found in the map from here\n"
 INTERPOLATED = "# not found: interpolated from here\n"
@@ -112,18 +112,12 @@ def _placed(points: Array, pixels: Array, camera: Camera) -> Pose2 | None:
         camera: that sees them.
     """
     seen = np.isfinite(pixels).all(axis=1)
-    if seen.sum() < LEAST_POINTS:
-        return None
     points, pixels = points[seen], pixels[seen]
-    matrix = np.array([[camera.fx, 0.0, camera.cx], [0.0, camera.fy, camera.cy], [0.0, 0.0, 1.0]])
-    cv2.setRNGSeed(0)
-    fits, turn, shift, inside = cv2.solvePnPRansac(
-        points, pixels, matrix, None, reprojectionError=GATE_PX, flags=cv2.SOLVEPNP_SQPNP
-    )
-    if not fits or inside is None or len(inside) < LEAST_POINTS:
+    pose = pose_by_points(points, pixels, camera)
+    if pose is None:
         return None
-    agree = inside[:, 0]
-    turn, shift = cv2.solvePnPRefineLM(points[agree], pixels[agree], matrix, None, turn, shift)
+    agree, matrix = pose.inside, matrix_of(camera)
+    turn, shift = cv2.solvePnPRefineLM(points[agree], pixels[agree], matrix, None, pose.turn, pose.shift)
     camera_from_points = cv2.Rodrigues(turn)[0]
     x, y, _ = -camera_from_points.T @ shift[:, 0]
     ahead = camera_from_points[2]

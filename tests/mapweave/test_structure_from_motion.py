@@ -12,7 +12,7 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.descriptor import quantise
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.query import View
-from mapweave.structure_from_motion import CAMERA_FROM_LEVEL, Structure, reconstruct
+from mapweave.structure_from_motion import CAMERA_FROM_LEVEL, Structure, pose_by_points, reconstruct
 from synthetic.world import random_vectors
 
 CAMERA = Camera(640, 480, 520.0, 522.0, 318.0, 243.0, mount_height=1.3)
@@ -91,6 +91,31 @@ def test_points_lie_where_their_features_are_seen() -> None:
         assert np.median(misses) < 1.0
         assert (structure.features[k, seen] < len(view)).all()
     assert ((structure.features >= 0).sum(axis=0) >= 1).all()
+
+
+@pytest.mark.parametrize("size", [100.0, 1.0, 1e-3, 1e-5])
+def test_a_camera_is_placed_by_points_of_any_size(size: float) -> None:
+    """Bearings to a scene of any size, anywhere, and as far off in proportion, are the same."""
+    rng = np.random.default_rng(5)
+    local = rng.uniform([-1.0, -0.7, 2.0], [1.0, 0.7, 4.0], (40, 3))
+    pixels = local[:, :2] / local[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
+    turn = Rotation.from_rotvec([0.2, -0.4, 0.1])
+    centre = np.array([0.3, -0.2, 1.3])
+    points = centre + size * turn.apply(local)
+    wrong = rng.permutation(40)[:8]
+    pose = pose_by_points(points, np.where(np.isin(np.arange(40), wrong)[:, None], 9.0, pixels), CAMERA)
+    assert pose is not None
+    assert set(pose.inside) == set(range(40)) - set(wrong)
+    assert (Rotation.from_rotvec(pose.turn[:, 0]) * turn).magnitude() < 1e-4
+    # Rotations are known to 1e-8 or so, and the origin is 1.3 m away.
+    assert np.linalg.norm(-turn.apply(pose.shift[:, 0]) - centre) < 1e-3 * size + 1e-7
+
+
+@pytest.mark.parametrize(
+    "points", [np.ones((20, 3)), np.full((20, 3), np.arange(20)[:, None]), np.ones((5, 3))]
+)
+def test_points_that_determine_no_camera_place_none(points: np.ndarray) -> None:
+    assert pose_by_points(points * 1e-3, np.full((len(points), 2), 100.0), CAMERA) is None
 
 
 def test_invalid_walks_are_refused() -> None:
