@@ -1,8 +1,9 @@
 // What people have said about the map: named places, closures, preferences and portals. GET /annotations; older servers
 // have none.
-import { ask, byId, listed, when } from "./dom.js";
+import { ask, byId, inOrder, listed, when } from "./dom.js";
 import { colours } from "./colours.js";
 
+const question = inOrder();
 let annotations = [], offered = true;
 
 export const placeNames = () => annotations.filter(one => one.body.kind === "place").map(one => one.name);
@@ -25,7 +26,8 @@ const colourOf = ({ kind, factor }) => ({ closure: colours.bad, preference: fact
 
 export async function loadAnnotations(select) {
   if (!offered) return;
-  const answer = await ask("annotations");
+  const isLate = question(), answer = await ask("annotations");
+  if (isLate()) return;
   offered = answer.status !== 404;
   if (answer.error) return;
   annotations = (answer.annotations || []).filter(one => one.in_force !== false && !one.removed && one.body);

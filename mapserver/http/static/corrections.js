@@ -1,9 +1,9 @@
 // What people have corrected and said, newest first, with what came after it: GET /constraints and /annotations. What
 // holds can be taken back, and of annotations what held before can be restored.
-import { add, ask, button, byId } from "./dom.js";
+import { add, ask, button, byId, inOrder } from "./dom.js";
 import { change, onPermission } from "./changes.js";
 
-const list = byId("corrections");
+const list = byId("corrections"), question = inOrder();
 let entries = [], allowed = false;
 
 // What takes the last entry of a name back: what held before holds again.
@@ -24,9 +24,9 @@ function chained(made, about) {
   }).reverse();
 }
 export async function listCorrections() {
-  const [{ constraints }, { annotations }] = await Promise.all([ask("constraints"), ask("annotations")]);
+  const isLate = question(), [{ constraints }, { annotations }] = await Promise.all([ask("constraints"), ask("annotations")]);
   // Without an answer the list stays.
-  if (!constraints || !annotations) return;
+  if (!constraints || !annotations || isLate()) return;
   entries = [
     ...chained(constraints, one => JSON.stringify(one.about)).map(one =>
       ({ ...one, undo: one.in_force ? ["constraints", { undo: one.number }] : null })),

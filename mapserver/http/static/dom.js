@@ -83,6 +83,12 @@ export const seconds = s => s < 90 ? `${s.toFixed(s < 10 ? 1 : 0)} s` : s < 5400
   : `${(s / 3600).toFixed(1)} h`;
 export const when = stamp_ns => new Date(stamp_ns / 1e6).toISOString().slice(0, 19).replace("T", " ") + " UTC";
 
+// Of answers that overtake each other: call it with a question, and what it returns with the answer, which is late if a later
+// question has been answered already.
+export function inOrder() {
+  let asked = 0, answered = 0;
+  return () => { const number = ++asked; return () => number <= answered || !(answered = number); };
+}
 // The answer as JSON, or an object with `error`; a busy server is asked again.
 export async function ask(path, options, busy) {
   for (let tries = 0; tries < 5; tries++) {

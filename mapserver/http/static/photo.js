@@ -57,18 +57,22 @@ function whyNot(similar, show) {
     add(result, "p", "Many landmarks match, but not where this camera would see them: check the height of the lens and the "
       + "angle of view above, and hold the camera level.");
 }
-let file = null;
+let file = null, asked = 0;
 async function locate(found, show) {
   if (!file) return;
+  const number = ++asked;
   const query = new URLSearchParams();
   for (const name of ["height_m", "hfov"]) if (byId(name).value) query.set(name, byId(name).value);
   result.className = ""; result.textContent = "Looking ...";
-  const busy = () => { result.textContent = "Many robots ask at present, waiting ..."; };
+  const busy = () => { if (number === asked) result.textContent = "Many robots ask at present, waiting ..."; };
   const body = await prepared(file), headers = { "Content-Type": body?.type };
+  if (number !== asked) return;
+  URL.revokeObjectURL(byId("shown").src);
   if (body) byId("shown").src = URL.createObjectURL(body);
   byId("shown").hidden = !body;
   const answer = body ? await ask("relocalize?" + query, { method: "POST", headers, body }, busy)
     : { error: `${file.name} is no image that can be read: choose a JPEG or PNG.` };
+  if (number !== asked) return;
   result.textContent = "";
   if (answer.error) { result.className = "box failed"; result.textContent = answer.error; found([]); return; }
   const good = answer.certainty === "found" || answer.certainty === "place";

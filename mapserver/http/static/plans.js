@@ -1,10 +1,11 @@
 // Floor plans under the map: GET /plans and their images. A map file of before has none.
 import { isDark } from "./colours.js";
-import { ask, byId, degrees } from "./dom.js";
+import { ask, byId, degrees, inOrder } from "./dom.js";
 
 const LARGEST = 16e6; // px; browsers may refuse larger canvases
 const AGAIN = 3000;   // ms, after which an image that has not come is asked for again
 const images = new Map(), inverted = new Map(); // by digest
+const question = inOrder();
 let plans = [], offered = true;
 // The plan that is being edited takes the place of the one of its name: `{ name, image, parts }`.
 export const draft = { plan: null };
@@ -33,7 +34,8 @@ export function fromPlan(name, x, y) {
 }
 export async function loadPlans(loaded) {
   if (!offered) return;
-  const answer = await ask("plans");
+  const isLate = question(), answer = await ask("plans");
+  if (isLate()) return;
   offered = answer.status !== 404;
   if (answer.error) return;
   plans = answer.plans || [];

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,7 +16,7 @@ from mapweave.hybridmap.floor_plan import PlacedPlans
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, SimilarPlace
+from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, SimilarPlace, View
 from mapweave.mapserver.http.web import Web
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.http.person import Person
@@ -99,6 +100,33 @@ def test_a_camera_that_was_given_wrongly_is_suspected(
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "unknown")
     assert ("check the height of the lens and the angle of view" in page.run(RESULT)) == doubted
+
+
+def test_the_answer_to_the_photo_before_does_not_replace_that_to_the_last_one(
+    page: Browser, services: StubServices, image: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A photo of which the answer took longer was answered below the picture of the next one."""
+    asked: list[Future[RelocalizeAnswer]] = []
+
+    def locate(look: Callable[[], View], ticket: int) -> Future[RelocalizeAnswer]:
+        look()
+        asked.append(Future())
+        return asked[-1]
+
+    monkeypatch.setattr(services, "locate", locate)
+    for count in (1, 2):
+        page.type("#image", str(image.rename(image.with_name(f"{count}.jpg"))))
+        image = image.with_name(f"{count}.jpg")
+        eventually(lambda count=count: len(asked) == count)
+    asked[1].set_result(PLACE)
+    eventually(lambda: page.run(KIND) == "place")
+    asked[0].set_result(services.answer)
+    answered = (
+        "return performance.getEntriesByType('resource').filter(one => one.name.includes('/relocalize'))"
+    )
+    eventually(lambda: len(page.run(answered)) == 2)
+    page.run("return fetch('status').then(() => true)")
+    assert page.run(KIND) == "place" and len(page.run(ROWS)) == 2
 
 
 def test_no_unknown_distance_is_shown(page: Browser, services: StubServices, image: Path) -> None:

@@ -162,3 +162,32 @@ def test_a_time_window_is_retired(person: Person, server: MapServer) -> None:
     window = last(server)
     assert isinstance(window, RetiredWindow) and window.map == LAST.map
     assert window.end_ns % (60 * 10**9) == 5 * 10**9
+
+
+HOLD = """
+const fetched = window.fetch;
+window.held = 0;
+window.holds = true;
+window.released = new Promise(done => { window.release = done; });
+window.fetch = async (...asked) => {
+  const hold = window.holds, reply = await fetched(...asked);
+  if (hold) { window.held++; await window.released; }
+  return reply;
+};
+document.dispatchEvent(new Event('mapchanged'));
+"""
+
+
+def test_a_late_answer_does_not_replace_a_newer_one(person: Person, server: MapServer) -> None:
+    """Lists of places and corrections went back to what they had been, until the next change."""
+    page = person.page
+    server.annotate(Annotation("kitchen", Place(FIRST), False, "bob", 1))
+    eventually(lambda: "kitchen place" in page.run(PLACES) and len(page.run(CORRECTIONS)) == 1)
+    page.run(HOLD)
+    # Those of corrections and of what is said, once each by the event and once by what it was sent for.
+    eventually(lambda: page.run("return window.held") >= 4)
+    page.run("window.holds = false")
+    server.annotate(Annotation("hall", Place(LAST), False, "bob", 1))
+    eventually(lambda: "hall place" in page.run(PLACES) and len(page.run(CORRECTIONS)) == 2)
+    page.run("window.release(); return fetch('plans').then(() => fetch('plans')).then(() => true)")
+    assert "hall place" in page.run(PLACES) and len(page.run(CORRECTIONS)) == 2
