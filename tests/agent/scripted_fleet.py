@@ -160,7 +160,7 @@ def answering(
     way: Callable[[WhichWay], RouteAnswer | None],
     where: Callable[[], RelocalizeAnswer] = lambda: at(here(A, Pose2())),
 ) -> Fleet:
-    """A fleet that answers each question; the robot is at A unless it is told otherwise."""
+    """A fleet that answers each question; the robot is at A where no place is given."""
 
     def fleet(question: Question) -> ServerAnswer:
         if isinstance(question, WhereAmI):
