@@ -90,7 +90,7 @@ class MapFile:
         history: of a merged map: what has become of its maps by itself, in order.
         annotations: what people say about the map, in order.
         images: PNG files of floor plans, by their SHA-256.
-        refused_changes: maps of which a server refused a change, and why: they are joined with no other.
+        refused_changes: maps of which a server refused a change, and why: they are implausible.
     """
 
     kind: Kind

@@ -155,6 +155,7 @@ SHOWN_BY: dict[str, tuple[tuple[str, str], ...]] = {
     "shuffled maps": _margins("shuffled maps", "one shuffled map"),
     "two sources of aliasing": (
         *_margins("two sources of aliasing", "false edges of its own"),
+        ("edges to nowhere in a room: changes 11 of 12 answers and 212 links of the others (seed 884)", ""),
         (
             "one robot takes the weight of landmarks from links between two others: "
             "`tests/merge/outlier_rejection/test_distinctness.py"
@@ -168,13 +169,6 @@ SHOWN_BY: dict[str, tuple[tuple[str, str], ...]] = {
             "{a clock that runs backwards/clocks that run backwards/links_joining} instead of "
             "{a clock that runs backwards/all rules/links_joining}",
             "lies_margins",
-        ),
-    ),
-    "refused changes": (
-        (
-            "none by itself; without it and two sources of aliasing, edges to nowhere part the others' maps "
-            "(one room, seed 1)",
-            "",
         ),
     ),
     "optimisation in two stages": (
@@ -203,7 +197,6 @@ SHOWN_BY: dict[str, tuple[tuple[str, str], ...]] = {
 """What shows rules that no way of the run with all rules shows."""
 AGAINST_LIES = {
     "copies": "mapserver/merging/copies.py",
-    "refused changes": "mapserver/merging/implausible_maps.py",
     "unmeasurable edges": "hybridmap/edge_limits.py",
     "implausible maps": "mapserver/plausibility.py",
     "maps that contradict themselves": "mapserver/plausibility.py",

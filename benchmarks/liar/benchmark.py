@@ -78,14 +78,6 @@ RULES: dict[str, tuple[Switch, ...]] = {
         (implausible_maps, "scattered", lambda *_: {}),
         (implausible_maps.ImplausibleMaps, "note_refusal", lambda *_: False),
     ),
-    "refused changes": (
-        # Named all the same, and merged.
-        (
-            implausible_maps.ImplausibleMaps,
-            "note_refusal",
-            implausible_maps.ImplausibleMaps.note_disbelief,
-        ),
-    ),
     "maps that contradict themselves": (
         (implausible_maps, "contradict_themselves", lambda _: {}),
         (implausible_maps, "contradict_each_other", lambda _: {}),

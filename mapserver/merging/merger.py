@@ -375,25 +375,18 @@ class Merger:
         # What a retired area holds only the merge says; the robot's way by it is no less true.
         nodes = retired_nodes(self._kept, self._constraints, ())
         self._constraints = self._constraints.with_nodes(nodes)
-        odd = self._implausible.refused
-        before, left_out = self._wrong, {*self._constraints.retired, *self._set_apart(), *odd}
+        before, left_out = self._wrong, {*self._constraints.retired, *self._set_apart()}
         self._wrong = self._contradictions.wrong(self._kept, self._links, self._stale, left_out)
         self._stale = set()
         if before.keys() - self._wrong.keys():
             self.alike.forget()
 
     def _leave_unlinked(self) -> None:
-        """Maps with wrong geometry, or of which a change was refused, are joined with no other.
-
-        A person who links two maps by hand vouches for refused changes, and not for the geometry.
-        """
-        vouched = {frozenset((a.map, b.map)) for a, b in self._constraints.links}
-        refused = {which: f"map {which}: {reason}" for which, reason in self._implausible.refused.items()}
+        """Maps with wrong geometry are joined with no other."""
         wrong = {which: one.reason for which, one in self._wrong.items()}
         unlinked: dict[MapPair, str] = {}
-        for maps in self._verdicts.at(wrong.keys() | refused.keys()):
-            against = wrong if frozenset(maps) in vouched else refused | wrong
-            if maps[0] != maps[1] and (reason := against.get(maps[0]) or against.get(maps[1])):
+        for maps in self._verdicts.at(wrong.keys()):
+            if maps[0] != maps[1] and (reason := wrong.get(maps[0]) or wrong.get(maps[1])):
                 unlinked[maps] = reason
         before, self._unlinked = self._unlinked, unlinked
         for maps, _ in before.items() ^ unlinked.items():
