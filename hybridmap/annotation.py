@@ -54,7 +54,7 @@ class Place:
 
     def __post_init__(self) -> None:
         """Refuse both, and neither (InvalidValue)."""
-        _check_one("a place", self.node, self.area)
+        _check_one("a place is a node or an area", self.node, self.area)
 
     @property
     def anchor(self) -> NodeId:
@@ -86,7 +86,7 @@ class Closure:
 
     def __post_init__(self) -> None:
         """Refuse both, neither, and an end before the beginning (InvalidValue)."""
-        _check_one("a closure", self.edge, self.area)
+        _check_one("a closure is of an edge or an area", self.edge, self.area)
         _check_edge(self.edge)
         if self.end_ns is not None and (self.begin_ns or 0) >= self.end_ns:
             raise InvalidValue("the closure ends before it begins")
@@ -125,7 +125,7 @@ class Preference:
 
     def __post_init__(self) -> None:
         """Refuse both, neither, and a factor that says nothing (InvalidValue)."""
-        _check_one("a preference", self.edge, self.area)
+        _check_one("a preference is of an edge or an area", self.edge, self.area)
         _check_edge(self.edge)
         if not (LEAST_FACTOR <= self.factor <= MOST_FACTOR) or self.factor == 1.0:
             within = f"{LEAST_FACTOR:g} to {MOST_FACTOR:g}"
@@ -307,9 +307,9 @@ def _is_position(name: str) -> bool:
         return False
 
 
-def _check_one(what: str, first: object, second: object) -> None:
+def _check_one(choice: str, first: object, second: object) -> None:
     if (first is None) == (second is None):
-        raise InvalidValue(f"{what} is either a node, or an edge, or an area: give one of them")
+        raise InvalidValue(f"{choice}: give one of them")
 
 
 def _check_edge(edge: Pair | None) -> None:

@@ -10,9 +10,8 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.limits import MAX_STAMP_NS
 
 NANOSECONDS = 1_000_000_000
-FORMS = (
-    "write 14:00, 2026-03-01 14:00 (local time), 2026-03-01 14:00 UTC, 2026-03-01T14:00+01:00, or +2h, +30min"
-)
+FORMS = "write 14:00, 2026-03-01 14:00 ({}), 2026-03-01 14:00 UTC, 2026-03-01T14:00+01:00, or +2h, +30min"
+"""With the zone of times that name none."""
 LONGEST = 64
 """Characters of a time. Of a longer text of blanks the expressions below would take hours."""
 CLOCK = re.compile(r"(\d{1,2}):(\d{2})")
@@ -46,11 +45,11 @@ def read_time(
         InvalidValue: it is no time.
     """
     if len(text) > LONGEST:
-        raise InvalidValue(f"{text[:LONGEST]!r}... is no time: {FORMS}")
+        raise InvalidValue(f"{text[:LONGEST]!r}... is no time: {_forms(zone)}")
     words, now = text.strip(), datetime.fromtimestamp(now_ns / NANOSECONDS, UTC).astimezone(zone)
     if (later := LATER.fullmatch(words)) is not None:
         hours = float(later[1]) * HOURS[later[2]]
-        return _stamp(text, lambda: now + timedelta(hours=hours))
+        return _stamp(text, zone, lambda: now + timedelta(hours=hours))
     if re.search(r"(utc|z)$", words, re.IGNORECASE):
         words, now = re.sub(r"\s*(utc|z)$", "", words, flags=re.IGNORECASE), now.astimezone(UTC)
 
@@ -66,7 +65,7 @@ def read_time(
         return time if time.tzinfo is not None else in_zone(time)
 
     if (clock := CLOCK.fullmatch(words)) is None:
-        return _stamp(text, dated)
+        return _stamp(text, zone, dated)
 
     def shown() -> datetime:
         begin = datetime.fromtimestamp(begin_ns / NANOSECONDS, UTC)
@@ -80,14 +79,18 @@ def read_time(
         times = today, today.replace(fold=1), today + timedelta(days=1)
         return next(time for time in map(in_zone, times) if time > after)
 
-    return _stamp(text, shown)
+    return _stamp(text, zone, shown)
 
 
-def _stamp(text: str, make: Callable[[], datetime]) -> int:
+def _forms(zone: tzinfo | None) -> str:
+    return FORMS.format("local time" if zone is None else zone)
+
+
+def _stamp(text: str, zone: tzinfo | None, make: Callable[[], datetime]) -> int:
     try:
         stamp_ns = round(make().timestamp()) * NANOSECONDS
     except (ValueError, OverflowError):
-        raise InvalidValue(f"{text!r} is no time: {FORMS}") from None
+        raise InvalidValue(f"{text!r} is no time: {_forms(zone)}") from None
     if not 0 <= stamp_ns <= MAX_STAMP_NS:
         raise InvalidValue(f"{text!r} is out of range")
     return stamp_ns

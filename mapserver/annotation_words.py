@@ -129,6 +129,8 @@ def body_of_words(
             plain["merged_from_node"] = packed(pose)
     body = {name: _node(value, name, near, resolve) for name, value in plain.items()}
     unknown = body.keys() - BODIES[kind].__dataclass_fields__.keys() - {"kind"}
+    if "node" in unknown and "area" in BODIES[kind].__dataclass_fields__:
+        raise InvalidValue(f"a {kind} has no `node` without `radius`, m, of the floor around it")
     if unknown:
         raise InvalidValue(f"a {kind} has no {', '.join(sorted(unknown))}")
     return _value(body, BODIES[kind])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal, TypedDict, Unpack
+from typing import Any, Literal, TypedDict, Unpack, get_type_hints
 
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
@@ -50,6 +50,9 @@ class WayWords(FloorWords, total=False):
     edge: tuple[NodeWord, NodeWord] | None
     place: str
     node: NodeWord
+
+
+FLOOR_WORDS, WAY_WORDS = (frozenset(get_type_hints(one)) for one in (FloorWords, WayWords))
 
 
 class AnnotationMethods(ABC):
@@ -145,7 +148,7 @@ class AnnotationMethods(ABC):
             check: only say what it would do.
             floor: radius, corners, near and plan, see `FloorWords`.
         """
-        return self.annotate("place", name, because, check=check, **_where({"node": node, **floor}))
+        return self.annotate("place", name, because, check=check, **_where(floor, FLOOR_WORDS, node=node))
 
     def close_way(
         self, name: str, *, begin: Time | None = None, end: Time | None = None, because: str = "",
@@ -161,7 +164,7 @@ class AnnotationMethods(ABC):
             check: only say what it would do.
             ways: edge, place, node, radius, corners, near and plan, see `WayWords`.
         """
-        fields = {**_where(ways), **_given(begin_ns=begin, end_ns=end)}
+        fields = {**_where(ways, WAY_WORDS), **_given(begin_ns=begin, end_ns=end)}
         return self.annotate("closure", name, because, check=check, **fields)
 
     def prefer(
@@ -176,7 +179,9 @@ class AnnotationMethods(ABC):
             check: only say what it would do.
             ways: edge, place, node, radius, corners, near and plan, see `WayWords`.
         """
-        return self.annotate("preference", name, because, check=check, factor=factor, **_where(ways))
+        return self.annotate(
+            "preference", name, because, check=check, factor=factor, **_where(ways, WAY_WORDS)
+        )
 
     def floor(
         self,
@@ -285,9 +290,15 @@ class AnnotationMethods(ABC):
         return self.annotate("pin", own, because, check=check, node=own, **fields)
 
 
-def _where(words: Mapping[str, Any]) -> dict[str, Any]:
-    """Words for a floor or for ways, with text for nodes."""
-    given = {name: value for name, value in words.items() if value is not None}
+def _where(words: Mapping[str, Any], known: frozenset[str], **more: Any) -> dict[str, Any]:
+    """Words for a floor or for ways, with text for nodes.
+
+    Raises:
+        TypeError: there is no such word, as for any other argument.
+    """
+    if unknown := words.keys() - known:
+        raise TypeError(f"unexpected keyword argument {', '.join(sorted(unknown))}")
+    given = {name: value for name, value in {**words, **more}.items() if value is not None}
     for name in given.keys() & {"node", "near"}:
         given[name] = word_of(given[name])
     if "edge" in given:

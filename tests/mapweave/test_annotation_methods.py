@@ -116,3 +116,25 @@ def test_a_position_is_two_numbers_wherever_a_node_stands(joined: Path, record: 
             room.node(nothing)  # type: ignore[arg-type]
     with pytest.raises(Refused, match="nothing is mapped within"):
         room.node((500.0, 2.0))
+
+
+def test_a_refusal_says_what_this_annotation_takes(record: OfflineAnnotations) -> None:
+    """A place was said to be an edge, a closure a node, and a time that is read as UTC local time."""
+    edge = (FIRST, THIRD)
+    with pytest.raises(Refused, match=r"^a place is a node or an area: give one of them$"):
+        record.place("kitchen")
+    for say in (
+        lambda: record.close_way("paint"),
+        lambda: record.prefer("paint", 0.5),
+        lambda: record.close_way("paint", edge=edge, corners=[(0, 0), (1, 0), (1, 1)]),
+    ):
+        with pytest.raises(Refused, match=r"^a (closure|preference) is of an edge or an area: give one"):
+            say()
+    for say in (
+        lambda: record.close_way("paint", node=FIRST),
+        lambda: record.prefer("paint", 0.5, node=FIRST),
+    ):
+        with pytest.raises(Refused, match=r"has no `node` without `radius`, m, of the floor around it"):
+            say()
+    with pytest.raises(Refused, match=r"'yesterday' is no time: write 14:00, 2026-03-01 14:00 \(UTC\), "):
+        record.close_way("paint", edge=edge, end="yesterday")
