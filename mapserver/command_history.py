@@ -6,8 +6,9 @@ import logging
 import re
 import threading
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from datetime import UTC, datetime
+from itertools import accumulate
 
 from mapweave.hybridmap.agent_status import HandDrive
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
@@ -70,7 +71,7 @@ class CommandHistory:
             return
         with self._lock:
             own, known = self._events, {*map(_key, stored)}
-            self._take((*stored, *(event for event in own if _key(event) not in known)))
+            self._take(stored, [event for event in own if _key(event) not in known])
             self._unwritten |= bool(self._said - known)
 
     def order(self, order: MissionOrder, heard: bool) -> None:
@@ -131,15 +132,26 @@ class CommandHistory:
             self._write_is_due = True
         self._later(self.write)
 
-    def _take(self, events: tuple[MapEvent, ...]) -> None:
-        """Keep the newest of each robot first, so that none displaces what is said of others."""
+    def _take(self, *records: Sequence[MapEvent]) -> None:
+        """Keep the newest of each robot first, so that none displaces what is said of others.
+
+        Args:
+            records: each in the order in which it was noted. A clock may have been put back meanwhile, so of
+                two records an event is taken for as old as the newest before it.
+        """
+        dated = [
+            (at, event)
+            for record in records
+            for at, event in zip(accumulate((one.stamp_ns for one in record), max), record, strict=True)
+        ]
+        events = [event for _, event in sorted(dated, key=lambda one: one[0])]
         turns, ranked = Counter[str](), []
-        for event in sorted(events, key=lambda event: event.stamp_ns, reverse=True):
+        for place, event in reversed([*enumerate(events)]):
             robot = event.words.partition(":")[0]
-            ranked.append((turns[robot], event))
+            ranked.append((turns[robot], place))
             turns[robot] += 1
-        kept = (event for _, event in sorted(ranked, key=lambda one: one[0])[:MOST])
-        self._events = tuple(sorted(kept, key=lambda event: event.stamp_ns))
+        kept = sorted(place for _, place in sorted(ranked, key=lambda one: one[0])[:MOST])
+        self._events = tuple(events[place] for place in kept)
         self._said = {*map(_key, self._events)}
 
 

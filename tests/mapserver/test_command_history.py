@@ -153,3 +153,30 @@ def test_a_robots_first_report_of_an_order_that_a_person_gave_it_names_the_robot
     for one in (replace(status, mission=first), status, status):
         house.server._hear(one)
     assert commands(house) == ["r0: explore, by eve (mission ID, as r0 says)"], "no person has said the first"
+
+
+def test_a_clock_that_was_put_back_loses_no_command() -> None:
+    """A machine without a clock of its own begins in another year: what is noted then is the newest all the
+    same.
+    """
+    record, now = Record(), [10**18]
+    history = CommandHistory(record, lambda: now[0], lambda job: job())  # type: ignore[arg-type]
+
+    def note(count: int, by: str) -> list[str]:
+        before = len(history.events)
+        for _ in range(count):
+            now[0] += 1
+            history.order(MissionOrder.new("r1", MissionKind.STOP, by), heard=False)
+        assert len(history.events) >= min(before, MOST)
+        return [event.words.split(", by ")[1].split(" ")[0] for event in history.events]
+
+    note(MOST, "anna")
+    now[0] = 0
+    assert note(3, "bob")[-3:] == ["bob"] * 3
+    # Another server on the store, or this one when it starts again.
+    again = CommandHistory(record, lambda: now[0], lambda job: job())  # type: ignore[arg-type]
+    assert again.events == history.events
+    again.reload()
+    assert again.events == history.events
+    now[0] = 2 * 10**18
+    assert note(2, "carl")[-6:] == ["anna", *["bob"] * 3, *["carl"] * 2]
