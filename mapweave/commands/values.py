@@ -62,6 +62,8 @@ def node(text: str) -> str:
         end = read_end(text.strip())
     except InvalidValue:
         return text
+    if not isinstance(end, NodeId) and end.agent.isdigit():
+        raise UsageError("this is a map; a position has a comma and no blank, as 3.1,-2.0")
     if not isinstance(end, NodeId):
         raise UsageError(f"this is a map: give one of its nodes, {end}.1 for example")
     return text

@@ -112,6 +112,8 @@ def test_scenarios_that_cannot_be_run(arguments, words, capfd, closed, tmp_path)
         ("server --store maps.sqlite", "a file needs no --store: it is in the folder of --data"),
         ("place add hall r0.1.1 --radius nan", "--radius nan: give metres, more than 0 and less than 10000"),
         ("place add hall r0.1.1 --radius -1", "--radius -1: give metres, more than 0 and less than 10000"),
+        ("go r0 1.0 0.5", "goal '1.0': this is a map; a position has a comma and no blank, as 3.1,-2.0"),
+        ("go r0 r1.3", "goal 'r1.3': this is a map: give one of its nodes, r1.3.1 for example"),
     ],
 )
 def test_a_wrong_value_is_answered_with_what_is_right(arguments, words, capfd):
