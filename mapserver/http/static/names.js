@@ -5,7 +5,8 @@ import { fromPlan, planNames } from "./plans.js";
 import { within } from "./selection.js";
 
 const NUMBER = "[-+]?(?:\\d+\\.?\\d*|\\.\\d+)";
-const POSITION = new RegExp(`^${NUMBER},${NUMBER}$`), AFTER_NAME = new RegExp(`^\\s+(${NUMBER}),\\s*(${NUMBER})(?=[\\s,]|$)`);
+const POSITION = new RegExp(`^${NUMBER},\\s*${NUMBER}$`), AHEAD = new RegExp(`^${NUMBER},\\s*${NUMBER}(?=,?(\\s|$))`);
+const AFTER_NAME = new RegExp(`^\\s+(${NUMBER}),\\s*(${NUMBER})(?=[\\s,]|$)`);
 const REACH = 2; // m from a position to its node, as on the server
 
 const longestFirst = names => names.sort((a, b) => b.length - a.length);
@@ -17,10 +18,9 @@ export function wordsOf(text) {
   const onPlan = name => text.startsWith(name) && AFTER_NAME.exec(text.slice(name.length));
   const begins = name => text.startsWith(name) && /^([\s,]|$)/.test(text.slice(name.length));
   while ((text = text.replace(/^[\s,]+/, ""))) {
-    const plain = /^\S+/.exec(text)[0].replace(/,+$/, "");
     const plan = plans.find(onPlan), word = plan ? plan + onPlan(plan)[0]
-      : places.find(begins) || (POSITION.test(plain) ? plain : /^[^\s,]+/.exec(text)[0]);
-    words.push(word);
+      : places.find(begins) || (AHEAD.exec(text) || /^[^\s,]+/.exec(text))[0];
+    words.push(POSITION.test(word) ? word.replace(/\s+/, "") : word);
     text = text.slice(word.length);
   }
   return words;

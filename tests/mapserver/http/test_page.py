@@ -223,7 +223,8 @@ def test_a_robot_passes_places_on_its_way(page: Browser, services: StubServices)
     )
     assert facts[facts.index("place") + 1] == "east wing" and facts[facts.index("floor") + 1] == "ground"
     page.type("#goal", "home")
-    page.type("#via", "east wing, 3.1,-2.0 r0.1.1, east\n")
+    # A position also with a blank, as on a plan and in the shell.
+    page.type("#via", "east wing, 3.1, -2.0 r0.1.1, east\n")
     eventually(lambda: services.ways == [("home", ("east wing", "3.1,-2.0", "r0.1.1", "east"))])
     eventually(lambda: "r0 stays where it is" in page.run(text_of("selected")))
     page.type("#mission-because", "a guest & a dog wait")

@@ -73,7 +73,7 @@ def test_places_and_positions_stand_for_nodes(person: Person, server: MapServer)
         (f"{A}.1 east", None),
     ]
     if component == 0:
-        typed.append((f"{x:.3f},{y:.3f}", [LAST]))
+        typed += [(f"{x:.3f},{y:.3f}", [LAST]), (f"{FIRST}, {x:.3f}, {y:.3f}", [FIRST, LAST])]
     for text, nodes in typed:
         person.fill("edit-nodes", text)
         assert page.run(NAMES) == list(map(str, nodes or [f"{A}.1", FIRST]))
@@ -92,7 +92,7 @@ def test_places_and_positions_stand_for_nodes(person: Person, server: MapServer)
     person.fill("edit-nodes", "the hall")
     assert page.run("return mapweave.selection.area.anchor") == area["anchor"]
     # The search takes the same words.
-    person.fill("query", f"{x:.3f},{y:.3f}" if component == 0 else "east wing")
+    person.fill("query", f"{x:.3f}, {y:.3f}" if component == 0 else "east wing")
     page.run("document.getElementById('search').requestSubmit()")
     eventually(
         lambda: page.run("return document.querySelector('#selected h2')?.textContent") == f"Node {LAST}"
