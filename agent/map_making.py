@@ -267,7 +267,8 @@ class MapMaking:
     def _calibrate(self, image: NDArray[np.uint8]) -> None:
         """Hold the tracks against the wheels; what they show is used from the next node on."""
         calibration = self.calibration
-        calibration.watch(image, *self.mapper.tracks)
+        calibration.watch(image, *self.mapper.tracks, self.mapper.turned)
+        self.mapper.correct_turn(calibration.take_turn())
         if calibration.pending is not None:
             self.mapper.recalibrate(*calibration.pending)
 

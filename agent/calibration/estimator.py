@@ -37,6 +37,7 @@ from mapweave.agent.calibration.pair_information import (
 )
 from mapweave.agent.calibration.parameter_sigmas import DELAY_SHARE, MODEL_SIGMAS, PRIOR_SIGMAS, useful
 from mapweave.agent.calibration.ranger_scale import RangedScale
+from mapweave.agent.calibration.turn_correction import PairTurn
 from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
 from mapweave.hybridmap.pose import Array
 
@@ -148,6 +149,20 @@ class Estimator:
         predicted = motions_over(self.vector, ways, turns)
         noise = self._noises(ways, turns)[0]
         return reduce_pair(pair, predicted[0], noise, self._sigma, self._depth, self._most_sigma)
+
+    def newest_turn(self, wheels: WheelTrack) -> PairTurn:
+        """How far the robot has turned over the newest pair."""
+        pair, information = self.pairs[-1], self.informations[-1]
+        ways, turns = counted(self.vector, wheels, np.array([pair.first_s]), np.array([pair.last_s]))
+        by_wheels = motions_over(self.vector, ways, turns)
+        off, a = by_wheels.since(information.at)[0], information.matrix
+        covariance = np.asarray(np.linalg.inv(a + np.linalg.inv(self._noises(ways, turns)[0])), np.float64)
+        slip = covariance @ (information.vector - a @ off)
+        # The robot turns about the up of the camera, and what the camera sees turns the other way.
+        down = by_wheels.floor[0] / np.linalg.norm(by_wheels.floor[0])
+        turned = math.exp(self.vector[P.TURN_SCALE]) * float(turns.sum())
+        turned += self.vector[P.DRIFT] * math.exp(self.vector[P.WHEEL_SCALE]) * float(ways.sum())
+        return PairTurn(turned + float(down @ slip[3:]), float(down @ covariance[3:, 3:] @ down))
 
     def solve(self, wheels: WheelTrack, iterations: int = INNER) -> Estimate:
         """Estimate from the pairs as they are reduced now."""

@@ -30,6 +30,7 @@ from mapweave.agent.calibration.pair_information import ImagePair
 from mapweave.agent.calibration.parameter_sigmas import useful
 from mapweave.agent.calibration.ranger_scale import RangerScale
 from mapweave.agent.calibration.report import NAMES, Cause, causes, readable
+from mapweave.agent.calibration.turn_correction import TurnCorrection
 from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, RobotDescription
 from mapweave.hybridmap.pose import Array, Pose2
@@ -110,6 +111,8 @@ class OnlineCalibration:
         self._sigmas = learned.sigmas
         self._earlier = self._used.copy()
         self._counted = CountedWheels()
+        self._turn_correction = TurnCorrection()
+        self._first_turned: float | None = None
         self._turns: list[float] = []
         self._source: object = None
         self._first_s = self._first_way = 0.0
@@ -168,7 +171,12 @@ class OnlineCalibration:
         return self._correction.step(observation, self._geometry)
 
     def watch(
-        self, image: NDArray[np.uint8], source: object, ids: NDArray[np.int64], raw: Array
+        self,
+        image: NDArray[np.uint8],
+        source: object,
+        ids: NDArray[np.int64],
+        raw: Array,
+        turned: float | None = None,
     ) -> Sequence[Cause]:
         """Take the tracks of the last image; returns causes that are found now.
 
@@ -177,11 +185,12 @@ class OnlineCalibration:
             source: whose tracks they are: ids of another source mean others.
             ids: (N,) of the tracks.
             raw: (N, 2) px in the real image.
+            turned: by the filter that follows the tracks, since it began, rad; None if there is none.
         """
         now = self._counted.stamp
         found = self._solve()
         if source is not self._source or now - self._first_s > 3.0 * LONGEST_S:
-            self._start(image, source, now, ids, raw)
+            self._start(image, source, now, ids, raw, turned)
             return found
         if now - self._first_s < SHORTEST_S:
             return found
@@ -201,11 +210,18 @@ class OnlineCalibration:
                 for px in (self._begin[mine], raw[theirs])
             )
             pair = ImagePair(self._first_s, now, before, after)
-        floor = self._floor
-        self._start(image, source, now, ids, raw)
+        floor, turned_before = self._floor, self._first_turned
+        self._start(image, source, now, ids, raw, turned)
         if pair is not None:
             self._take(pair, floor)
+            if turned_before is not None and turned is not None:
+                newest = self._estimator.newest_turn(self._counted.track())
+                self._turn_correction.add(newest, turned - turned_before)
         return found
+
+    def take_turn(self) -> float:
+        """How much further the robot has turned than the filter says, rad, since this was called last."""
+        return self._turn_correction.take()
 
     def pause(self) -> None:
         """The tracks are not to be trusted now."""
@@ -218,8 +234,15 @@ class OnlineCalibration:
             self._geometry, self.pending = self._next, None
 
     def _start(
-        self, image: NDArray[np.uint8], source: object, now: float, ids: NDArray[np.int64], raw: Array
+        self,
+        image: NDArray[np.uint8],
+        source: object,
+        now: float,
+        ids: NDArray[np.int64],
+        raw: Array,
+        turned: float | None,
     ) -> None:
+        self._first_turned = turned
         order = ids.argsort()
         self._source, self._first_s, self._ids, self._begin = source, now, ids[order], raw[order]
         self._first_way = self._counted.way

@@ -65,6 +65,7 @@ class Mapper:
         self._lens = lens or Lens(description.camera, description.distortion)
         self._pending: tuple[RobotDescription, Lens, Pose2, float] | None = None
         self._way_moved: WayCorrection | None = None
+        self._turn_off = 0.0
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings)
         self._keyframes = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
@@ -155,6 +156,11 @@ class Mapper:
     def tracks(self) -> tuple[object, NDArray[np.int64], Array]:
         """Whose tracks, their (N,) ids and (N, 2) px in the real image; see `tracked`."""
         return (self._tracking, *self._tracking.raw_tracks)
+
+    @property
+    def turned(self) -> float:
+        """How far the robot has turned since the tracks began, by the filter, rad, but for whole turns."""
+        return self._tracking.turned
 
     @property
     def tracked(self) -> int:
@@ -260,6 +266,10 @@ class Mapper:
         """
         self._pending = description, lens, old_from_new, scale
 
+    def correct_turn(self, turn: float) -> None:
+        """Know that the robot has turned further than the filter says, rad: the next edge does so, too."""
+        self._turn_off += turn
+
     def forget_clock(self) -> None:
         """The clock has jumped: see KeyframeBuilder."""
         self._keyframes.forget_clock()
@@ -285,6 +295,7 @@ class Mapper:
 
         With nodes it is astray and must `resume`; without any it may `begin` again.
         """
+        self._turn_off = 0.0
         self._keyframes.lose(self._tracking.pose)
         self._take_up_pending()
         self._tracking = Tracking(self._description, self._lens, self._settings)
@@ -342,7 +353,8 @@ class Mapper:
         tracking, anchor, further = self._tracking, self._anchor, self._further
         tracking.remember(force=True)
         estimate = tracking.estimate
-        moved = tracking.reanchor()
+        moved = _turned_further(tracking.reanchor(), self._turn_off)
+        self._turn_off = 0.0
 
         def take(features: Features) -> None:
             self._anchor = tracking.take(observation, features, HERE)
@@ -392,3 +404,9 @@ class Mapper:
         self._trajectory.rescale(scale)
         self._trajectory.move_anchor(old_from_new)
         return True
+
+
+def _turned_further(moved: PoseGaussian, turn: float) -> PoseGaussian:
+    """A way along which the robot has turned further by so much, rad, evenly."""
+    half = Pose2(0.0, 0.0, 0.5 * turn)
+    return PoseGaussian(half @ moved.mean @ half, moved.covariance)

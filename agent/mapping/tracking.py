@@ -139,6 +139,7 @@ class Tracking:
         self._correction = NO_CORRECTION
         self._expected_depth = 1.0
         self._next_track = self._first_new = 1
+        self._turned_before = 0.0
 
     @property
     def ids(self) -> NDArray[np.int64]:
@@ -165,6 +166,11 @@ class Tracking:
     def pose(self) -> PoseGaussian:
         """`anchor_from_robot`."""
         return self._filter.pose
+
+    @property
+    def turned(self) -> float:
+        """How far the robot has turned since the tracks began, by the filter, rad, but for whole turns."""
+        return self._turned_before + self._filter.pose.mean.heading
 
     @property
     def health(self) -> tuple[Health, str]:
@@ -258,6 +264,7 @@ class Tracking:
     def reanchor(self) -> PoseGaussian:
         """Restart at the present pose; returns `old_anchor_from_new`."""
         moved = self._filter.reanchor()
+        self._turned_before += moved.mean.heading
         self._dispute.settle()
         self.history.reanchor(moved.mean, self._tracker.ids)
         return moved

@@ -321,3 +321,23 @@ def test_a_camera_that_turned_away_from_all_landmarks_has_not_failed(walls, desc
     mapper.finish_pending()
     mapper.step(walls.observe(pose, pose, tick + 1))
     assert mapper.anchor_features > 0 and mapper.health == ""
+
+
+def test_an_edge_turns_further_if_the_images_say_so(walls, description):
+    """Evenly along its way: half of it is in the direction of the way, all of it in the heading."""
+    edges = []
+    for turn in (0.0, 0.02):
+        mapper = Mapper(MapId("r0", 1), description)
+        mapper.finish(drive(mapper, walls, list(np.arange(0.0, 0.51, 0.025))))
+        mapper.finish_pending()
+        last = drive(mapper, walls, list(np.arange(0.5, 0.91, 0.025)), start=50)
+        mapper.correct_turn(turn)
+        mapper.finish(last)
+        mapper.finish_pending()
+        mapper.finish(drive(mapper, walls, list(np.arange(0.9, 1.31, 0.025)), start=100))
+        mapper.finish_pending()
+        edges.append([edge.a_from_b.mean for edge in mapper.map.edges.values()][:2])
+    (earlier, straight), (same, turned) = edges
+    assert same == earlier
+    assert turned.heading - straight.heading == pytest.approx(0.02, abs=1e-3)
+    assert turned.y - straight.y == pytest.approx(0.01 * straight.x, abs=1e-3)
