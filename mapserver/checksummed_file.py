@@ -8,6 +8,7 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import tokenize
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -110,5 +111,9 @@ def read_json(part: NDArray[Any]) -> Any:
 
 def _arrays(file: io.BytesIO, size: int) -> Iterator[NDArray[Any]]:
     while file.tell() < size:
-        part: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+        try:
+            part: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
+        except (tokenize.TokenError, MemoryError):
+            # Of a head that is cut off, and of one that claims more than there is room for.
+            raise ValueError("an array is none") from None
         yield part

@@ -1,0 +1,34 @@
+"""Files of arrays: with a right digest and wrong heads they are refused in one line."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.mapserver.checksummed_file import DIGEST, json_part, read_sealed, sealed
+
+MAGIC = b"a kind\n"
+
+
+@pytest.mark.parametrize(
+    ("word", "instead"),
+    [
+        (b"'shape': (3,), }", b"'shape': (3,    "),
+        (b"'shape': (3,), }", b"'shape': (1<<60)"),
+        (b"(3,), }       ", b"(10**17,), }  "),
+        (b"(3,), }             ", b"(99999999999999,), }"),
+        (b"'<f8'", b"'|O' "),
+    ],
+)
+def test_heads_of_arrays_that_are_none_are_refused(word: bytes, instead: bytes, tmp_path: Path) -> None:
+    data = bytes(sealed(MAGIC, [json_part("header"), np.arange(3.0)]))
+    assert len(word) == len(instead) and word in data
+    whole = data[:-DIGEST].replace(word, instead)
+    path = tmp_path / "x"
+    path.write_bytes(whole + hashlib.sha256(whole).digest())
+    with pytest.raises(InvalidFile, match="x: is none of these"):
+        read_sealed(path, MAGIC, "header", list, "is none of these")
