@@ -18,22 +18,21 @@ from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.mcap_writer import McapWriter
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.ros_messages import making
+from mapweave.hybridmap.annotation import Annotation, Place
 from mapweave.hybridmap.change import Change, EdgePut, NodeRetired
-from mapweave.hybridmap.constraint_subject import Apart
+from mapweave.hybridmap.constraint_subject import Apart, Linked
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionRequest
+from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.node import EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2
+from mapweave.hybridmap.pruned_node import PrunedNode
 from mapweave.hybridmap.query import (
     Certainty,
-    ExplainRequest,
-    KnownRequest,
     RelocalizeAnswer,
     RouteAnswer,
     RouteLeg,
-    RouteRequest,
     View,
     Whereabouts,
 )
@@ -45,17 +44,7 @@ from mapweave.offline_merge import merge_parts
 from mapweave.storage.map_file import MapFile, pack_map_file
 from mapweave.wire.codec import encode_change
 from mapweave.wire.credentials import Role
-from mapweave.wire.log_messages import (
-    Ack,
-    Head,
-    KeptNodes,
-    LogAnswer,
-    LogRequest,
-    Mark,
-    Refusal,
-    encode_record,
-)
-from mapweave.wire.messages import encode, encode_view
+from mapweave.wire.messages import KeptHistory, KeptPruned, KeptPruning, encode, encode_view
 from mapweave.wire.ros2.attachment import Attachment, encode_attachment
 from mapweave.wire.ros2.messages import encode as encode_ros2
 from mapweave.wire.ros2.messages import make
@@ -76,42 +65,46 @@ class Samples:
         others, other_edges = take_map(world, MapId("r1", 1), stops, rng)
         self.bodies = changes_of(nodes, edges)
         self.changes = [Change(self.map_id, k + 1, 10**18 + k, body) for k, body in enumerate(self.bodies)]
-        merged = merge_parts(
+        self.merged = merge_parts(
             {self.map_id: HybridMap(self.bodies), MapId("r1", 1): HybridMap(changes_of(others, other_edges))},
             ManualConstraints(),
         )
         self.map_files = [
-            pack_map_file(MapFile("agent", "r0.1", tuple(self.bodies))), pack_map_file(map_file_of(merged))
+            pack_map_file(MapFile("agent", "r0.1", tuple(self.bodies))),
+            pack_map_file(map_file_of(self.merged)),
         ]  # fmt: skip
         self.view = take_view(world, stops[0], rng)[0]
         self.nodes: list[Node] = [*nodes, *others]
 
-    def messages(self) -> list[bytes]:
-        """One of many kinds."""
+    def messages(self) -> dict[str, list[bytes]]:
+        """Good messages by kind: those of a real map, and those that the examples of docs/wire.md lack."""
         a, b = self.nodes[0], self.nodes[-1]
         here = next(body.edge.a_from_b for body in self.bodies if isinstance(body, EdgePut))
         legs = (RouteLeg(a, here, None), RouteLeg(b, here, EdgeKind.LOOP))
         place = Whereabouts(a.id, here, here, 0, 20, 0.9)
         retired = Change(self.map_id, 99, 10**18, NodeRetired(a.id))
-        return [
-            *(encode_change(change) for change in (*self.changes, retired)),
-            encode_view(View(self.view.pixels, self.view.codes, CAMERA)),
-            encode(RelocalizeAnswer(Certainty.FOUND, (place,), "seen")),
-            encode(RouteRequest(a.id, b.id, ((a.id, b.id),), Pose2(1, 2, 3))),
-            encode(RouteAnswer(legs, "the way")),
-            encode(KnownRequest(self.map_id, 1.5, -2.5, 9.0)),
-            encode(ExplainRequest((a.id, b.id))),
-            encode(ManualConstraint(Apart((a.id, b.id)), True, "anna", 5, "two kitchens")),
-            encode(MissionRequest("m1", "r0", MissionKind.GO, 10**18, "anna", "r0.1.3")),
-            encode(MissionOrder.new("r0", MissionKind.GO, "anna", a.id, 0)),
-            Mark(7, 2**63).encode(),
-            Head(5, 7, {"s0": 3}).encode(),
-            Ack(self.map_id, 5, 7, (Refusal(3, "because"),)).encode(),
-            KeptNodes(3, (1, 2**53)).encode(),
-            LogRequest(3, 200).encode(),
-            LogAnswer(5, 3, 6, ((3, b"abc"), (5, b""))).encode(),
-            encode_record({"a": 1, "b": 0.5, "c": "text", "d": True}),
-        ]
+        event = MapEvent(10**18, MapEventKind.JOINED, "r0.1 and r1.1 are one map now")
+        link = Linked(
+            a.id, b.id, Pose2(0.5), (1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4), ((0, 1),), (("inliers", 9.0),)
+        )
+        left = PrunedNode(b.id, Pose2(1.0, 2.0, 0.5), 10**18)
+        values = (
+            RelocalizeAnswer(Certainty.FOUND, (place,), "seen"), RouteAnswer(legs, "the way"),
+            ManualConstraint(Apart((a.id, b.id)), True, "anna", 5, "two kitchens"),
+            Annotation("kitchen", Place(a.id), False, "anna", 10**18),
+            KeptHistory(
+                (event,), (frozenset({a.id.map, b.id.map}),), frozenset({(a.id.map, b.id.map)}),
+                frozenset({a.id.map}), frozenset({(a.id, b.id)}), frozenset({(a.id, b.id)}),
+                frozenset({b.id.map}), ((b.id.map, "2000 landmarks"),),
+            ),
+            KeptPruning((link,), ((a.id, b.id),), ((a.id, 5),), ((a.id, b.id, 5),), 10**18, 1),
+            KeptPruned(((a.id, left),)),
+        )  # fmt: skip
+        return {
+            "change": [encode_change(change) for change in (*self.changes, retired)],
+            "view": [encode_view(View(self.view.pixels, self.view.codes, CAMERA))],
+            **{type(value).__name__: [encode(value)] for value in values},
+        }
 
     def keys(self) -> tuple[bytes, bytes]:
         """The list of a fleet's identities, with one that was revoked, and that of its tokens."""

@@ -8,6 +8,7 @@ that it is not.
 from __future__ import annotations
 
 import dataclasses
+import json
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -19,7 +20,7 @@ from typing import TYPE_CHECKING, Any
 import msgspec
 import numpy as np
 
-from benchmarks.fuzz import cluster_messages
+from benchmarks.fuzz import cluster_messages, server_files
 from benchmarks.fuzz.recordings import RECORDINGS, RecordingTarget
 from benchmarks.fuzz.texts import (
     CAMERA_TOML,
@@ -75,6 +76,7 @@ from mapweave.wire.log_messages import (
 )
 from mapweave.wire.messages import LIMITS, decode_view, encode_view
 from mapweave.wire.pose_messages import PoseNews
+from mapweave.wire.refusal import decode_refusal
 from mapweave.wire.ros2.attachment import decode_attachment
 from mapweave.wire.ros2.messages import decode as decode_ros2
 from mapweave.wire.zenoh_config import session_values
@@ -83,6 +85,7 @@ if TYPE_CHECKING:
     from benchmarks.fuzz.http_application import HttpApplication
     from benchmarks.fuzz.samples import Samples
 
+WIRE_VECTORS = Path(__file__).parents[2] / "docs" / "wire_vectors.json"
 ROS2_KINDS = (
     "sensor_msgs/msg/Image",
     "sensor_msgs/msg/CompressedImage",
@@ -111,27 +114,37 @@ class Target:
     most: int = 8192
 
 
+DECODERS: dict[str, Callable[[bytes], Any]] = {
+    "change": decode_change, "view": decode_view, "flat record": decode_record, "attachment": Mark.decode,
+    "beacon": Head.decode, "acknowledgement": Ack.decode, "newest map": NewestMap.decode,
+    "kept nodes": KeptNodes.decode, "log question": LogRequest.decode, "log answer": LogAnswer.decode,
+    "merged poses": lambda body: PoseNews.decode(body, "r0"), "refusal": decode_refusal,
+    **{kind.__name__: partial(messages.decode, kind=kind) for kind in LIMITS},
+}  # fmt: skip
+"""Of messages, by the words of docs/wire.md."""
+
+
 def _messages(data: bytes, _: Path) -> None:
     """The first byte chooses the kind."""
     if not data:
         return
-    kinds: list[Callable[[bytes], Any]] = [
-        decode_change, decode_view, decode_record, Mark.decode, Head.decode, Ack.decode, NewestMap.decode,
-        KeptNodes.decode, LogRequest.decode, LogAnswer.decode, lambda body: PoseNews.decode(body, "r0"),
-        *(partial(messages.decode, kind=kind) for kind in LIMITS),
-    ]  # fmt: skip
-    value = kinds[data[0] % len(kinds)](data[1:])
+    name = [*DECODERS][data[0] % len(DECODERS)]
+    value = DECODERS[name](data[1:])
     check_finite(value)
     if type(value) in LIMITS:
         check_again(value, messages.encode, lambda body: messages.decode(body, type(value)))
-    elif data[0] % len(kinds) == 0:
+    elif name == "change":
         check_again(value, encode_change, decode_change)
-    elif data[0] % len(kinds) == 1:
+    elif name == "view":
         check_again(value, encode_view, decode_view)
 
 
 def _messages_samples(samples: Samples) -> list[bytes]:
-    return [bytes([kind]) + body for body in samples.messages() for kind in range(10 + len(LIMITS))]
+    """Good messages of every kind: the examples of docs/wire.md, and what they lack."""
+    good = samples.messages()
+    for example in json.loads(WIRE_VECTORS.read_text()):
+        good.setdefault(example["what"], []).append(bytes.fromhex(example["hex"]))
+    return [bytes([k]) + body for k, name in enumerate(DECODERS) for body in good[name]]
 
 
 def _map_file(data: bytes, _: Path) -> None:
@@ -320,6 +333,10 @@ def check_finite(value: Any, nan_allowed: bool = False) -> None:
 
 TARGETS: dict[str, Target] = {
     "messages": Target(_messages, _messages_samples),
+    "sealed": Target(server_files.run_sealed, server_files.sealed_samples, 65536),
+    "shown": Target(server_files.run_shown, server_files.shown_samples),
+    "learned": Target(_file("r0.learned.toml", server_files.run_learned), server_files.learned_samples),
+    "views": Target(server_files.run_view, server_files.view_samples, 16384),
     "cluster": Target(cluster_messages.run, lambda _: cluster_messages.cluster_messages().samples, 65536),
     "map_file": Target(_map_file, lambda s: s.map_files, 65536),
     "bases": Target(_base, lambda s: s.bases()),

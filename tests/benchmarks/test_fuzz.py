@@ -11,7 +11,7 @@ from types import SimpleNamespace
 
 import pytest
 
-from benchmarks.fuzz import benchmark, http_application, process, targets
+from benchmarks.fuzz import benchmark, http_application, process, server_files, targets
 from benchmarks.fuzz.http_application import HttpApplication
 from benchmarks.fuzz.recordings import RECORDINGS
 from benchmarks.fuzz.samples import Samples
@@ -81,6 +81,7 @@ def test_a_finding_is_counted_at_once(tmp_path: Path) -> None:
 
 
 NEW = [*RECORDINGS, "cluster", "plans", "live", "nav2_map", "world", "fleet_file", "tokens"]
+NEW += ["messages", "sealed", "shown", "learned", "views"]
 
 
 @pytest.mark.parametrize("name", NEW)
@@ -91,6 +92,16 @@ def test_good_samples_are_taken(name: str, samples: Samples, tmp_path: Path) -> 
     assert len(good) >= 1 and max(map(len, good)) <= TARGETS[name].most
     for sample in good:
         TARGETS[name].run(sample, tmp_path)
+
+
+def test_every_kind_of_message_and_of_sealed_file_has_a_good_sample(samples: Samples) -> None:
+    """The last kinds had none: what they were mutated of was refused at its first byte."""
+    kinds = {sample[0] for sample in TARGETS["messages"].samples(samples)}
+    assert kinds == {*range(len(targets.DECODERS))}
+    assert {"KeptPruned", "KeptPruning", "MissionReport", "PlanPiece", "refusal"} <= targets.DECODERS.keys()
+    assert len(TARGETS["sealed"].samples(samples)) == len(server_files.SEALED)
+    magics = {line.partition(b"\n")[0] for line in server_files.SEALED}
+    assert magics == {b"mapweave superseded", b"mapweave verdicts", b"mapweave merge"}
 
 
 def test_uploads_of_good_samples_are_kept(samples: Samples, application: HttpApplication) -> None:
