@@ -114,6 +114,8 @@ def reconstruct(views: Sequence[View], spacing: float, step_share: float = STEP_
     # goes with the others.
     whole = [_grown(views, start, relations, (spacing, step_share)) for start in starts[:BEGINNINGS]]
     best = max(whole, key=lambda structure: int((_misses(views, structure) < GATE_PX).sum()))
+    if not best.placed.all():
+        raise InvalidValue(f"photograph {int(np.argmin(best.placed)) + 1} cannot be placed by what it shows")
     determined = np.isfinite(best.points[:, 0])
     return replace(best, points=best.points[determined], features=best.features[:, determined])
 
@@ -126,7 +128,7 @@ def _grown(
 ) -> Structure:
     """All cameras, one after the other, from two on."""
     structure = start
-    while not structure.placed.all():
+    for _ in range(int((~start.placed).sum())):
         structure = _triangulated(views, _extended(views, structure, relations))
         structure = _triangulated(views, _bundled(views, structure, steps, True))
     refuted = ~(_misses(views, structure) < GATE_PX)
@@ -173,7 +175,8 @@ def _extended(
         rotations[k] = cv2.Rodrigues(pose.turn)[0].T
         centres[k] = -rotations[k] @ pose.shift[:, 0]
     else:
-        neighbour = high if k > high else (low if k < low else k - 1)
+        # A gap between placed cameras is two wide at most, so one beside it is placed.
+        neighbour = k - 1 if k - 1 in placed else k + 1
         step = relations[min(k, neighbour), max(k, neighbour)]
         length = float(np.linalg.norm(centres[high] - centres[low])) / (high - low)
         if k > neighbour:

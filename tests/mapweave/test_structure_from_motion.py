@@ -118,6 +118,28 @@ def test_points_that_determine_no_camera_place_none(points: np.ndarray) -> None:
     assert pose_by_points(points * 1e-3, np.full((len(points), 2), 100.0), CAMERA) is None
 
 
+def test_far_points_place_every_camera() -> None:
+    """Things so far away that only the first and the fourth photograph, and so on, determine them, and few.
+
+    They begin the map, the two cameras between are placed by their steps, the third before the second.
+    """
+    rng = np.random.default_rng(7)
+    across = rng.uniform([-0.5, -0.4], [0.5, 0.4], (20, 2))
+    distance = np.where(np.arange(20) < 11, 90.0, 900.0)[:, None]
+    points = np.column_stack([across * distance, distance])
+    codes = quantise(random_vectors(20, rng))
+    views = []
+    for k in range(5):
+        local = points - [0.6 * k, 0.0, 0.0]
+        pixels = local[:, :2] / local[:, 2:] * [CAMERA.fx, CAMERA.fy] + [CAMERA.cx, CAMERA.cy]
+        seen = np.arange(1 if k == 1 else 0, 20)
+        views.append(View(pixels[seen].astype(np.float32), codes[seen], CAMERA))
+    found = reconstruct(views, 0.6)
+    assert found.placed.all()
+    turns = Rotation.from_matrix(found.rotations[0].T @ found.rotations)
+    assert turns.magnitude().max() < math.radians(1.0)
+
+
 def test_invalid_walks_are_refused() -> None:
     walk, other = Walk(1), Walk(2)
     with pytest.raises(InvalidValue, match="two photographs"):
