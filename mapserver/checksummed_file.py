@@ -8,7 +8,6 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-import tokenize
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, TypeVar
@@ -113,7 +112,6 @@ def _arrays(file: io.BytesIO, size: int) -> Iterator[NDArray[Any]]:
     while file.tell() < size:
         try:
             part: NDArray[Any] = np.lib.format.read_array(file, allow_pickle=False)
-        except (tokenize.TokenError, MemoryError):
-            # Of a head that is cut off, and of one that claims more than there is room for.
-            raise ValueError("an array is none") from None
+        except Exception as error:  # noqa: BLE001 - of heads NumPy raises what its parsers do, and MemoryError
+            raise ValueError(f"an array is none ({type(error).__name__})") from None
         yield part

@@ -22,6 +22,7 @@ MAGIC = b"a kind\n"
         (b"(3,), }       ", b"(10**17,), }  "),
         (b"(3,), }             ", b"(99999999999999,), }"),
         (b"'<f8'", b"'|O' "),
+        (b"'<f8'", b"',  '"),
     ],
 )
 def test_heads_of_arrays_that_are_none_are_refused(word: bytes, instead: bytes, tmp_path: Path) -> None:
