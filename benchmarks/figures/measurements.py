@@ -26,6 +26,7 @@ MEASUREMENTS: dict[str, str] = {
     "rules_graphs": "python -m benchmarks.rules --g2o DATA/posegraph/intel.g2o DATA/posegraph/manhattan.g2o "
     "--json",
     "rules_trials": "python -m benchmarks.rules --trials warehouse twin-corridor --runs 2 --seed 722 --json",
+    "rules_warehouse": "python -m benchmarks.rules --trials warehouse --runs 4 --seed 872 --json",
     "rules_places": "python -m benchmarks.rules --places 1000 --seed 865 --json",
     "rules_loops": "python -m benchmarks.rules --loops 10 --seed 861 --json",
     "rules_pairs": "python -m benchmarks.rules --pairs 400 --seed 863 --json",

@@ -250,6 +250,13 @@ MERGING = Question(
             "none",
         ),
         Row(
+            "four more warehouses of three robots: false links, wrong joins",
+            "{trials/warehouse/all rules/false_links} of {trials/warehouse/all rules/links}, "
+            "{trials/warehouse/all rules/false_merges}",
+            "rules_warehouse",
+            "none",
+        ),
+        Row(
             "a real street (KITTI odometry 03) cut into two robots: components, false links, error",
             "{components}, {false_links} of {links}, {merged_ate_m:.2f} m",
             "kitti_two",

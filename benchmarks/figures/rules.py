@@ -34,13 +34,13 @@ def _fleets(rule: str) -> tuple[str, str]:
     return words, "rules_fleets"
 
 
-def _trials(rule: str, scenario: str) -> tuple[str, str]:
+def _trials(rule: str, scenario: str, source: str = "rules_trials") -> tuple[str, str]:
     """What comes of simulated trials without a rule, and with all."""
     found, whole = (
         f"{{trials/{scenario}/{way}/false_links}} of {{trials/{scenario}/{way}/links}}"
         for way in (rule, "all rules")
     )
-    return f"{scenario}: false links {found} instead of {whole}", "rules_trials"
+    return f"{scenario}: false links {found} instead of {whole}", source
 
 
 def _places(rule: str) -> tuple[str, str]:
@@ -273,14 +273,7 @@ RULES = (
     Rule(
         "aliased landmarks",
         "merge/outlier_rejection/distinctness.py",
-        (
-            (
-                "warehouse: {trials/warehouse/aliased landmarks/links} links instead of "
-                "{trials/warehouse/all rules/links}, maps in {trials/warehouse/aliased landmarks/components} "
-                "pieces instead of {trials/warehouse/all rules/components}",
-                "rules_trials",
-            ),
-        ),
+        (_trials("aliased landmarks", "warehouse", "rules_warehouse"),),
     ),
     Rule(
         "aliased regions",
