@@ -10,7 +10,7 @@ from mapweave.hybridmap.ids import NodeId
 FORGET = 120.0
 """How long a blockage counts after it was reported last, s."""
 MOST = 256
-"""Blockages that are kept, those that were reported last."""
+"""Blockages that are kept; beyond that the oldest of the robot that has most go first."""
 
 
 Pair = tuple[NodeId, NodeId]
@@ -27,27 +27,41 @@ class Blockages:
     def __init__(self, forget: float = FORGET, most: int = MOST) -> None:
         """Nothing is blocked."""
         self._forget, self._most = forget, most
-        self._reported: dict[Pair, float] = {}
+        self._reported: dict[str, dict[Pair, float]] = {}
         self._turn = threading.Lock()
 
-    def report(self, pairs: Collection[Pair], now: float) -> None:
+    def report(self, pairs: Collection[Pair], now: float, robot: str = "") -> None:
         """Add pairs between which a robot could not drive.
 
         Args:
             pairs: of nodes, in either order.
             now: of the server's clock, s.
+            robot: its name; empty if it has given none.
         """
         with self._turn:
+            own = self._reported.setdefault(robot, {})
             for a, b in pairs:
                 pair = (a, b) if a <= b else (b, a)
-                self._reported.pop(pair, None)
-                self._reported[pair] = now
-            while len(self._reported) > self._most:
-                del self._reported[next(iter(self._reported))]
+                own.pop(pair, None)
+                own[pair] = now
+            over = sum(map(len, self._reported.values())) - self._most
+            for _ in range(over):
+                # One robot that reports without end displaces its own.
+                largest = max(self._reported.values(), key=len)
+                del largest[next(iter(largest))]
+            self._reported = {name: some for name, some in self._reported.items() if some}
 
     def known(self, now: float) -> list[Pair]:
-        """What still counts at a time of the server's clock, s."""
+        """What still counts at a time of the server's clock, s; each once, that of the last report last."""
         forget = self._forget
         with self._turn:
-            self._reported = {pair: stamp for pair, stamp in self._reported.items() if now - stamp < forget}
-            return list(self._reported)
+            kept = (
+                (name, {pair: stamp for pair, stamp in some.items() if now - stamp < forget})
+                for name, some in self._reported.items()
+            )
+            self._reported = {name: some for name, some in kept if some}
+            last: dict[Pair, float] = {}
+            for some in self._reported.values():
+                for pair, stamp in some.items():
+                    last[pair] = max(stamp, last.get(pair, stamp))
+            return sorted(last, key=lambda pair: last[pair])

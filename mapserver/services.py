@@ -201,7 +201,7 @@ class Services(BusClient):
         # Of robots the server knows itself where they stand.
         things = self._barred([one for one in request.obstacles if not one.robot], router, now)
         hops = (tuple(sorted(hop)) for hop in Discs(router.roads, things).barred)
-        self._blockages.report([*request.blocked, *((a, b) for a, b in hops)], now)
+        self._blockages.report([*request.blocked, *((a, b) for a, b in hops)], now, robot)
         wary = self._blockages.known(now)
 
         def route(parked: Sequence[Disc]) -> RouteAnswer:

@@ -35,6 +35,21 @@ def test_without_a_clock_nothing_is_forgotten_but_the_oldest() -> None:
     assert blockages.known(1e9) == [(A, B), (A, C)]
 
 
+def test_no_robot_displaces_what_others_have_reported() -> None:
+    """One that says that all is blocked displaced the reports of all others."""
+    blockages = Blockages(most=8)
+    blockages.report([(A, B), (B, C)], 0.0, "r0")
+    blockages.report([(A, C)], 0.0, "r1")
+    ends = [NodeId("z", 1, number) for number in range(100)]
+    for now in range(3):
+        blockages.report([*pairwise(ends)], float(now), "r9")
+    known = blockages.known(3.0)
+    assert len(known) == 8 and {(A, B), (B, C), (A, C)} < {*known}
+    assert known[3:] == [*pairwise(ends)][-5:], "of its own the last ones are kept"
+    blockages.report([(A, B)], 100.0, "r9")
+    assert blockages.known(122.5) == [(A, B)], "it counts from its last report, whoever has made it"
+
+
 @pytest.fixture(scope="module")
 def ring() -> tuple[Router, list[NodeId]]:
     """Nine nodes on a circle of 0.8 m radius; the chain's ends stand close together, and so are joined."""
