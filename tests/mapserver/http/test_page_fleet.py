@@ -41,7 +41,9 @@ setInterval(() => {
 """
 LISTED = """
 const words = document.getElementById('robots').textContent, { robots } = mapweave.painter;
-return robots.every(({ name, alive, doing }) => !alive || words.includes(`${name} alive ${doing}`));
+// On a busy machine nothing may be heard of one for a while.
+const state = name => mapweave.page.robots.find(({ robot }) => robot === name).age > 5 ? 'silent' : 'alive';
+return robots.every(({ name, alive, doing }) => !alive || words.includes(`${name} ${state(name)} ${doing}`));
 """
 WHERE = """
 const robot = mapweave.painter.robots.find(one => one.name === 'r0'), m = mapweave.model, row = m.rowOf('{}');
