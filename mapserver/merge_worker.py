@@ -6,6 +6,7 @@ import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
+from datetime import UTC, datetime
 from functools import partial
 from itertools import islice
 
@@ -385,6 +386,13 @@ class MergeWorker:
             return (self._schedule.monotonic() - began) * (1.0 / self._share_of_time - 1.0)
         return LOOK if self._adoption.reason or self._unmerged.seconds else None
 
+    @property
+    def _lacking(self) -> str:
+        """How old the map is, in words that stay the same while nothing is merged."""
+        began = self._schedule.time_ns() * 1e-9 - self._unmerged.seconds
+        since = datetime.fromtimestamp(began, UTC)
+        return f"the map lacks what came since {since:%Y-%m-%d %H:%M} UTC"
+
     def _leaders_trouble(self) -> str:
         """Why the server that leads, and is there, hands over nothing new though something waits for it."""
         if self._adoption is None or self._sharing is None or self._unmerged.seconds < LATE:
@@ -392,12 +400,13 @@ class MergeWorker:
         leader = self._sharing.leader or "another server"
         try:
             if trouble := self._sharing.trouble:
-                return f"{leader} leads, and says: {trouble}"
+                return f"{leader} leads, and says: {trouble}; {self._lacking}"
         except InvalidFile:  # the store is away, which is said elsewhere
             return ""
         if min(self._unmerged.seconds, self._adoption.unchanged) < SILENT:
             return ""
-        return f"{leader} leads, and for more than {SILENT:.0f} s has not merged what this server knows"
+        words = f"{leader} leads, and for more than {SILENT:.0f} s has not merged what this server knows"
+        return f"{words}; {self._lacking}"
 
     def _adopt(self) -> None:
         if self._adoption is None:
@@ -555,8 +564,8 @@ class MergeWorker:
             self._answers = made[-1] if made else self._answers_from(merged)
         except Exception:  # questions are answered from the map before; the next change is the next chance
             log.exception("merging failed")
-            self._problem = self._trouble = FAILED
-            self._history.failed(self._problem)
+            self._problem, self._trouble = f"{FAILED}; {self._lacking}", FAILED
+            self._history.failed(FAILED)
             return
         finally:
             self._done, self._begun = self._applied, self._read_all

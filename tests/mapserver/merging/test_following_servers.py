@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -11,6 +12,7 @@ import threading
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, suppress
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -310,9 +312,13 @@ def test_a_follower_says_that_its_leader_cannot_merge_and_how_old_its_map_is(
         began = time.monotonic()
         servers.send(changes[24:30])
         words = f"{leader} leads, and says: merging failed: see the server's log"
-        eventually(lambda: follower.status()["delay"] == words, PATIENCE)
+        eventually(lambda: str(follower.status()["delay"]).startswith(words), PATIENCE)
         status = follower.status()
-        assert status["event"] == words and status["behind"]
+        assert status["event"] == status["delay"] and status["behind"]
+        since = re.fullmatch(r"; the map lacks what came since (.*) UTC", str(status["delay"])[len(words) :])
+        assert since
+        oldest = datetime.strptime(f"{since[1]}+0000", "%Y-%m-%d %H:%M%z").timestamp()
+        assert time.time() - (time.monotonic() - began) - 61.0 <= oldest <= time.time()
         assert 0.0 < float(status["unmerged_s"]) <= time.monotonic() - began + 0.05  # It is rounded.
         assert float(servers.leader.status()["unmerged_s"]) > 0.0
         # One that comes meanwhile hears it as well.
