@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.recordings.camera_info_check import doubts
-from mapweave.agent.recordings.damaged_bag import DamagedBag, standard_messages
+from mapweave.agent.recordings.damaged_bag import DamagedBag, full_type, standard_messages
 from mapweave.agent.recordings.geometry_file import LIMITS
 from mapweave.agent.recordings.incomplete import CameraGiven, Incomplete, complete
 from mapweave.agent.recordings.options import RecordingOptions
@@ -154,6 +154,7 @@ class WholeBag:
         from rosbags.highlevel import AnyReader
 
         ros1 = path.suffix == ".bag"
+        self._is_sqlite = any(file.suffix.lower() == ".db3" for file in files_of(path))
         self._standard = standard_messages(ros1)
         # A bag of ROS 1 always has its own definitions.
         self._reader = AnyReader([path], default_typestore=None if ros1 else self._standard)
@@ -162,7 +163,8 @@ class WholeBag:
         self.topics: dict[str, tuple[str, int]] = {}
         for connection in self._reader.connections:
             _, count = self.topics.get(connection.topic, ("", 0))
-            self.topics[connection.topic] = connection.msgtype, count + connection.msgcount
+            kind = self._type_of(connection)
+            self.topics[connection.topic] = kind, count + connection.msgcount
         begin, end = self._reader.start_time, self._reader.end_time
         self.span_ns = (begin, end) if self._reader.message_count else ()
         storage = getattr(self._reader.readers[0], "storage", None)
@@ -177,10 +179,14 @@ class WholeBag:
         connections = [c for c in self._reader.connections if c.topic == topic]
         if not connections:
             return
-        for kind in {connection.msgtype for connection in connections}:
+        for kind in {self._type_of(connection) for connection in connections}:
             self._check_fields(kind)
         for connection, arrived, data in self._reader.messages(connections):
-            yield arrived, self._reader.deserialize(data, connection.msgtype)
+            yield arrived, self._reader.deserialize(data, self._type_of(connection))
+
+    def _type_of(self, connection: Any) -> str:
+        kind: str = connection.msgtype
+        return full_type(kind) if self._is_sqlite else kind
 
     def _check_fields(self, kind: str) -> None:
         """A bag has its own definitions of the types: they may lack what the standard has.

@@ -37,6 +37,12 @@ def standard_messages(ros1: bool) -> Any:
     return get_typestore(Stores.ROS1_NOETIC) if ros1 else typestore()
 
 
+def full_type(kind: str) -> str:
+    """A type as ROS 2 names it, also in a .db3 of a recorder before ROS 2 Dashing: without /msg/."""
+    package, _, name = kind.rpartition("/")
+    return kind if "/" in package or not package else f"{package}/msg/{name}"
+
+
 class DamagedBag:
     """One file of a bag, as far as it can be read.
 
@@ -196,7 +202,8 @@ def _sqlite(path: Path) -> Iterator[Item]:
     try:
         # Without this SQLite refuses a file that is shorter than its header says.
         file.execute("PRAGMA writable_schema = ON")
-        yield from file.execute("SELECT id, name, type FROM topics")
+        for number, name, kind in file.execute("SELECT id, name, type FROM topics"):
+            yield number, name, full_type(kind)
         last: Item | None = None
         for row in file.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY rowid"):
             if last is not None:

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
+import sqlite3
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
@@ -161,6 +163,26 @@ def test_a_bag_is_read_as_it_was(encoding: str, ros1: bool, drive: Drive, tmp_pa
     for observation, grey, (forward, turn) in zip(seen, drive.images, drive.increments, strict=True):
         assert np.array_equal(observation.image, grey)
         assert (observation.odometry.forward, observation.odometry.turn) == pytest.approx((forward, turn))
+
+
+def test_a_bag_of_the_first_recorders_of_ros2_is_read(drive: Drive, tmp_path: Path) -> None:
+    """They wrote the types without /msg/: as a bag's folder, its file alone, and its file cut off."""
+    write_bag(tmp_path / "bag", drive, "bgra8")
+    (file,) = (tmp_path / "bag").glob("*.db3")
+    metadata = tmp_path / "bag" / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace("/msg/", "/"))
+    with contextlib.closing(sqlite3.connect(file)) as database:
+        database.execute("UPDATE topics SET type = replace(type, '/msg/', '/')")
+        database.commit()
+    cut = tmp_path / "cut.db3"
+    cut.write_bytes(file.read_bytes()[: file.stat().st_size * 3 // 4])
+    for path in (tmp_path / "bag", file, cut):
+        recording = open_recording(path, RecordingOptions(camera_height=0.3))
+        assert np.array_equal(recording.read(1), drive.images[1])
+        assert recording.bag is not None
+        assert {topic.kind for topic in recording.bag.topics} == {
+            "sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "nav_msgs/msg/Odometry"
+        }  # fmt: skip
 
 
 def test_a_single_mcap_file_is_read_without_its_folder(drive: Drive, tmp_path: Path) -> None:
