@@ -21,7 +21,7 @@ from mapweave.mapserver.own_maps import maps_of
 from mapweave.scenarios.actions import TryLies
 from mapweave.scenarios.figures import measured
 from mapweave.scenarios.fleet import TrialFleet, TrialStage
-from mapweave.scenarios.liar.lies import EVERY, UNDECIDABLE, Map
+from mapweave.scenarios.liar.lies import EVERY, WAYS, Map
 from mapweave.scenarios.liar.trial import ContainmentOutcome, LiarTrial, row, totals
 from mapweave.sim.camera import CameraSetup
 from mapweave.sim.floorplan import BuildingPlan
@@ -99,7 +99,7 @@ def lie(
         note(row("an honest fourth robot", trial.beside), not trial.beside.contained)
         for name in action.ways or EVERY:
             outcomes[name] = one = trial.outcome(EVERY[name])
-            note(row(name, one), name not in UNDECIDABLE and not (one.contained and one.accused))
+            note(row(name, one), name in WAYS and not (one.contained and one.accused))
     return Lies(action.robot, outcomes)
 
 

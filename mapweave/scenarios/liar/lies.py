@@ -37,6 +37,8 @@ and of the depth as a share of it."""
 ASIDE, MISSED, NEAREST = (0.15, 0.15, 0.1), 0.3, 0.3
 """How far aside, standard deviations in m, m and rad; which share of the landmarks is missed; from which
 depth on they are seen, m."""
+SCALE, DEEPER, LENSES = 1.05, 1.3, (0.7, 1.5)
+"""By how many times lengths, depths and focal lengths are wrong."""
 CODE_SIGMA = 0.12
 """Of the coordinates of decoded descriptors that belong to nothing: norms are then those of real ones."""
 
@@ -278,6 +280,36 @@ def mixed_landmarks(s: LieInputs) -> LyingMessages:
     return LyingMessages({s.map: messages(s.map, bodies((nodes, edges)))})
 
 
+def scaled_way(s: LieInputs) -> LyingMessages:
+    """True views, with way and depths 5 % too long: as by wheels of another size."""
+    nodes = [_with_depths(node, SCALE) for node in s.own[0]]
+    poses = [_scaled(node.map_from_robot.mean) for node in nodes]
+    edges = [
+        replace(edge, a_from_b=PoseGaussian(_scaled(edge.a_from_b.mean), edge.a_from_b.covariance))
+        for edge in s.own[1]
+    ]
+    placed = [
+        replace(node, map_from_robot=PoseGaussian(pose, node.map_from_robot.covariance))
+        for node, pose in zip(nodes, poses, strict=True)
+    ]
+    return LyingMessages({s.map: messages(s.map, bodies((placed, edges)))})
+
+
+def wrong_depths(s: LieInputs) -> LyingMessages:
+    """A true way and true views, but for depths that are 30 % too long."""
+    nodes = [_with_depths(node, DEEPER) for node in s.own[0]]
+    return LyingMessages({s.map: messages(s.map, bodies((nodes, s.own[1])))})
+
+
+def other_lenses(s: LieInputs) -> LyingMessages:
+    """A true way and true views, by focal lengths that are too short and too long in turns."""
+    nodes = []
+    for k, node in enumerate(s.own[0]):
+        camera, by = node.camera, LENSES[k % 2]
+        nodes.append(replace(node, camera=replace(camera, fx=by * camera.fx, fy=by * camera.fy)))
+    return LyingMessages({s.map: messages(s.map, bodies((nodes, s.own[1])))})
+
+
 def altered(node: Node, rng: np.random.Generator) -> Node:
     """A node as another view from the same place would be."""
     marks = node.landmarks
@@ -323,6 +355,17 @@ def joined(some: Sequence[Landmarks]) -> Landmarks:
     """All of several."""
     columns = zip(*((one.pixels, one.codes, one.depths, one.depth_sigmas) for one in some), strict=True)
     return Landmarks(*(np.concatenate(column) for column in columns))
+
+
+def _scaled(pose: Pose2) -> Pose2:
+    return Pose2(SCALE * pose.x, SCALE * pose.y, pose.heading)
+
+
+def _with_depths(node: Node, factor: float) -> Node:
+    """A node whose landmarks are so many times as far away, as well known as they were."""
+    marks = node.landmarks
+    depths, sigmas = ((factor * column).astype(np.float32) for column in (marks.depths, marks.depth_sigmas))
+    return replace(node, landmarks=Landmarks(marks.pixels, marks.codes, depths, sigmas))
 
 
 def _filled(node: Node, rng: np.random.Generator) -> Landmarks:
@@ -390,4 +433,11 @@ UNDECIDABLE: dict[str, Callable[[LieInputs], LyingMessages]] = {
 }
 """Maps that are right in themselves and could be of a second building that looks the same: nothing that a
 server knows tells which of the two robots lies. Answers may become ambiguous."""
-EVERY: Mapping[str, Callable[[LieInputs], LyingMessages]] = {**WAYS, **UNDECIDABLE}
+OPEN: dict[str, Callable[[LieInputs], LyingMessages]] = {
+    "a way of 1.05": scaled_way,
+    "depths of 1.3": wrong_depths,
+    "lenses in turns": other_lenses,
+}
+"""Maps that contradict themselves or others a little, which no rule finds out yet. Answers may become
+ambiguous, and a scaled one may part the maps of others."""
+EVERY: Mapping[str, Callable[[LieInputs], LyingMessages]] = {**WAYS, **UNDECIDABLE, **OPEN}
