@@ -166,6 +166,30 @@ def test_a_session_is_a_cookie_that_pages_cannot_read_or_send_elsewhere(keyed: K
     assert keyed.ask("GET", "/robots", **session) == 401
 
 
+def test_no_one_chooses_the_secret_of_a_session(keyed: Keyed) -> None:
+    """Else who has planted a cookie in a browser would share the session of who logs in there."""
+    name = keyed.session("otto")["Cookie"].partition("=")[0]
+    planted = {"Cookie": f"{name}={'a' * 43}", "Origin": f"http://{keyed.site}"}
+    assert keyed.ask("GET", "/robots", **planted) == 401
+    cookies = [keyed.log_in(keyed.tokens["otto"], **planted)[1]["Set-Cookie"].partition(";")[0] for _ in "ab"]
+    assert len({planted["Cookie"], *cookies}) == 3, "each login has a new one"
+    assert keyed.ask("GET", "/robots", **planted) == 401
+
+
+def test_a_token_in_an_address_lets_no_one_in_and_is_in_no_log(
+    keyed: Keyed, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.DEBUG)
+    token = keyed.tokens["otto"]
+    for path in (f"/robots?token={token}", f"/robots?access_token={token}", f"/static/{token}"):
+        assert keyed.ask("GET", path) in (401, 404)
+    with pytest.raises(InvalidStatus), connect(f"ws://{keyed.site}/live?token={token}"):
+        pass
+    assert keyed.log_in(token)[0] == 200 and keyed.log_in(token + "a")[0] == 401
+    said = [one.getMessage() for one in caplog.records if one.name != "websockets.client"]
+    assert any("otto logs in" in words for words in said) and not any(token in words for words in said)
+
+
 @pytest.mark.parametrize("path", ["/stop", "/robots/r0/stop", "/constraints", "/annotations", "/logout"])
 def test_a_page_of_another_site_cannot_use_a_session(keyed: Keyed, path: str) -> None:
     """As bytes: a browser may be old, and the cookie be sent along in spite of SameSite."""
@@ -319,6 +343,28 @@ def test_who_logs_in_over_https_sees_the_certificate_of_the_authority(
         folder.add("s0", Role.SERVER)
         load(tls, read_key_file(server).credentials)
         assert json.load(urllib.request.urlopen(asked, context=trusting, timeout=20))["nodes"] == 12
+
+
+@pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1, ssl.TLSVersion.TLSv1_1])
+@pytest.mark.filterwarnings("ignore:ssl.TLSVersion:DeprecationWarning")
+def test_https_is_of_this_day(version: ssl.TLSVersion, services: StubServices, tmp_path: Path) -> None:
+    """Older versions of TLS, and plain HTTP, are given nothing."""
+    folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, ["127.0.0.1"], "s0")
+    context = server_context(read_key_file(folder.key_file("s0")).credentials)
+    old = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
+    old.check_hostname, old.verify_mode = False, ssl.CERT_NONE
+    with Web(("127.0.0.1", 0), services, logins=Logins(folder.path), tls=context) as web:
+        with socket.create_connection(("127.0.0.1", web.port)) as tcp, old.wrap_socket(tcp) as tls:
+            assert tls.version() in ("TLSv1.2", "TLSv1.3")
+        old.set_ciphers("ALL:@SECLEVEL=0")
+        old.minimum_version = old.maximum_version = version
+        with socket.create_connection(("127.0.0.1", web.port)) as tcp, pytest.raises(ssl.SSLError):
+            old.wrap_socket(tcp)
+        with socket.create_connection(("127.0.0.1", web.port)) as tcp:
+            tcp.settimeout(20)
+            tcp.sendall(b"GET / HTTP/1.1\r\nHost: localhost\r\n\r\n")
+            with suppress(ConnectionError):
+                assert b"HTTP" not in tcp.recv(1000)
 
 
 def test_handshakes_that_are_never_begun_make_room(services: StubServices, tmp_path: Path) -> None:
