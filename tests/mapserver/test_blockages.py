@@ -47,7 +47,7 @@ def test_no_robot_displaces_what_others_have_reported() -> None:
     assert len(known) == 8 and {(A, B), (B, C), (A, C)} < {*known}
     assert known[3:] == [*pairwise(ends)][-5:], "of its own the last ones are kept"
     blockages.report([(A, B)], 100.0, "r9")
-    assert blockages.known(122.5) == [(A, B)], "it counts from its last report, whoever has made it"
+    assert blockages.known(122.5) == [(A, B)], "it counts from the last report of any robot"
 
 
 @pytest.fixture(scope="module")
