@@ -163,8 +163,10 @@ def read_shown(path: Path) -> LastShown:
     try:
         kept = json.loads(zlib.decompress(data[len(MAGIC) :]))
         events = [MapEvent(stamp, MapEventKind(kind), words) for stamp, kind, words in kept["history"]]
+        if not isinstance(kept["map"], str) or not all(isinstance(one, dict) for one in kept["robots"]):
+            raise TypeError("no map, or no robots")
         return LastShown(kept["map"], tuple(kept["robots"]), tuple(events))
-    except (zlib.error, ValueError, KeyError, TypeError):
+    except (zlib.error, ValueError, KeyError, TypeError, RecursionError):
         log.warning("%s: is damaged; the map is shown once it is loaded", path)
         return NOTHING
 
