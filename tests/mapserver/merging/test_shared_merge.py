@@ -95,10 +95,12 @@ class Follower:
         self.adoption = MergeAdoption(MergeSharing(cast(Store, results), "s1"), None, lambda: self.now)
         self.merged = MergedMap.empty()
         self.last: dict[MapId, int] = {}
+        self.taken = 0
 
     def take(self, changes: list[Change]) -> None:
         for change in changes:
-            self.adoption.hold(change)
+            self.taken += 1
+            self.adoption.hold(self.taken, change)
 
     def read(self, changes: list[Change]) -> None:
         self.last |= {change.map: change.sequence for change in changes}
