@@ -151,7 +151,7 @@ def test_an_excerpt_of_kitti_has_the_times_that_its_images_are_named_by(drive: D
 
 
 @pytest.mark.parametrize(
-    ("write", "calibration"), [(kitti, "calib.txt"), (euroc, "mav0/cam0/sensor.yaml")], ids=lambda f: str(f)
+    ("write", "calibration"), [(kitti, "calib.txt"), (euroc, "mav0/cam0/sensor.yaml")], ids=["kitti", "euroc"]
 )
 @pytest.mark.parametrize("text", [None, "intrinsics: [fx: 277.0]\nP0: 1\n"], ids=["missing", "another form"])
 def test_the_calibration_of_others_is_not_needed_beside_a_camera_file(
