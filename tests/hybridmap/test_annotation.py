@@ -164,5 +164,5 @@ def test_kinds_of_a_newer_program_are_left_out_of_files_and_refused_alone() -> N
     assert [one.body for one in record.made] == [Place(A)]
     with pytest.raises(InvalidMessage, match="`kind` must be one of place"):
         decode(pack(entry), Annotation)
-    with pytest.raises(InvalidMessage, match="either a node"):
+    with pytest.raises(InvalidMessage, match="a place is a node or an area"):
         decode(pack({**entry, "body": {"kind": "place"}}), Annotation)
