@@ -5,11 +5,17 @@ from __future__ import annotations
 import logging
 import os
 import threading
+import time
+from collections.abc import Callable
 from pathlib import Path
 
 from mapweave.hybridmap.errors import InvalidFile
 
 log = logging.getLogger(__name__)
+
+CALM = 1.0
+"""s in which a database must not fail before it counts as written again: where its disk has no room at all,
+its pages still have some, for less than what failed."""
 
 
 class FullDisk(InvalidFile):
@@ -43,26 +49,34 @@ class FullDisk(InvalidFile):
 class _FullDisks:
     """Those of this process, each with the places where nothing was written since."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._lock = threading.Lock()
+        self._clock = clock
         self._failing: dict[str, set[str]] = {}
+        self._failed_at: dict[str, float] = {}
 
     def noted(self, error: FullDisk) -> bool:
         """Whether it is news that a disk is full."""
         with self._lock:
             news = error.disk not in self._failing
             self._failing.setdefault(error.disk, set()).add(error.place)
+            self._failed_at[error.disk] = self._clock()
             return news
 
-    def written(self, place: str) -> bool:
-        """Whether it is news that a place takes something."""
+    def written(self, place: str, calm: float) -> bool:
+        """Whether it is news that a place takes something, if its disk has not failed for so long, s."""
         # Without the lock: most processes never have a full disk, and this is asked at each commit.
         if not self._failing:
             return False
         with self._lock:
-            disks = [disk for disk, places in self._failing.items() if place in places]
+            now = self._clock()
+            disks = [
+                disk
+                for disk, places in self._failing.items()
+                if place in places and now - self._failed_at[disk] >= calm
+            ]
             for disk in disks:
-                del self._failing[disk]
+                del self._failing[disk], self._failed_at[disk]
             return bool(disks)
 
 
@@ -83,8 +97,8 @@ def logged(error: Exception) -> bool:
 
 def written(place: str | Path) -> None:
     """Take note that a file, or a database at an address, was written."""
-    where = str(place.absolute()) if isinstance(place, Path) else place
-    if _full_disks.written(where):
+    where, calm = (str(place.absolute()), 0.0) if isinstance(place, Path) else (place, CALM)
+    if _full_disks.written(where, calm):
         log.warning("%s: the disk has room again; what waited is written", place)
 
 

@@ -52,9 +52,21 @@ def test_each_disk_is_one_line_until_it_has_room(tmp_path: Path, caplog: pytest.
 
 
 def test_other_errors_are_the_callers_to_log(caplog: pytest.LogCaptureFixture) -> None:
-    assert not logged(InvalidFile("damaged"))
-    assert logged(FullDisk.of_database("postgresql://host/maps: no space", "postgresql://host/maps"))
-    written("postgresql://host/maps")
+    assert not logged(InvalidFile("damaged")) and not caplog.messages
+
+
+def test_a_database_that_takes_a_little_now_and_then_has_no_room_yet(
+    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Its pages have room for one change where its disk has none for ten: each was two lines of the log."""
+    now = [0.0]
+    monkeypatch.setattr(full_disks, "_full_disks", full_disks._FullDisks(lambda: now[0]))
+    for now[0] in (0.0, 0.9, 1.8):
+        assert logged(FullDisk.of_database("postgresql://host/maps: no space", "postgresql://host/maps"))
+        written("postgresql://host/maps")
+    now[0] += 1.1 * full_disks.CALM
+    for _ in range(2):
+        written("postgresql://host/maps")
     assert caplog.messages == [
         "postgresql://host/maps: no space",
         "postgresql://host/maps: the disk has room again; what waited is written",
