@@ -437,9 +437,12 @@ def test_a_robot_is_killed_between_two_steps(tmp_path: Path, method: str, when: 
 
 
 class Calendar(LiveSchedule):
-    """The machine's clock, put forward."""
+    """The machine's clocks, some days later: time has passed."""
 
     days = 0.0
+
+    def monotonic(self) -> float:
+        return super().monotonic() + self.days * 86400.0
 
     def time_ns(self) -> int:
         return super().time_ns() + round(self.days * DAY_NS)
