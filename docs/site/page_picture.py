@@ -47,6 +47,10 @@ STEPS = 10
 """That the recorded robots drive, of half a second."""
 SHARP = "mapweave.painter.drawn?.scale === mapweave.viewport.scale && !mapweave.painter.waiting"
 LIVE = "document.getElementById('connection').textContent === 'live'"
+IMAGE_HAS_COME = (
+    "performance.getEntriesByType('resource')"
+    ".some(one => one.name.includes('plan-images/') && one.responseEnd)"
+)
 SHOWN = """
 const { painter: { robots }, model } = mapweave, m = x => x.toFixed(1);
 return { words: document.body.innerText.replace(/battery \\d+ %/g, ""), links: model.links.length,
@@ -94,7 +98,8 @@ def lay_plan(page: Browser, building: Building, image_path: Path) -> None:
         "kind.dispatchEvent(new Event('change'))"
     )
     page.type("#plan-file", str(image_path))
-    eventually(lambda: page.run("return mapweave.planEditor.pane.image?.naturalWidth"))
+    eventually(lambda: page.run("return mapweave.planEditor.pane.image?.width"))
+    eventually(lambda: page.run(f"return {IMAGE_HAS_COME}"))
     rng = np.random.default_rng(3)
     for k, room in enumerate(ROOMS, 1):
         robot, number = np.argwhere(building.rooms == room)[0]
