@@ -71,7 +71,7 @@ class Mapper:
         self._keyframes = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
         self._retirement = NodeRetirement(self._keyframes.map, released)
         self._trajectory = TrajectoryRecorder(description)
-        self._composed = HERE, HERE, HERE
+        self._composed = HERE, HERE, 0.0, HERE
         self._anchor: PendingKeyframe | None = None
         self._further: list[PendingKeyframe] = []
         # A thread extracts features, which are used when the next tick begins, by waiting for them: no result
@@ -141,11 +141,11 @@ class Mapper:
     @property
     def map_from_robot(self) -> PoseGaussian:
         """Pose in the agent's map."""
-        anchor, moved = self._keyframes.map_from_anchor, self._tracking.pose
-        if self._composed[0] is not anchor or self._composed[1] is not moved:
+        anchor, moved, turn = self._keyframes.map_from_anchor, self._tracking.pose, self._turn_off
+        if self._composed[0] is not anchor or self._composed[1] is not moved or self._composed[2] != turn:
             # Many ask for it in a tick.
-            self._composed = anchor, moved, anchor @ moved
-        return self._composed[2]
+            self._composed = anchor, moved, turn, anchor @ _turned_further(moved, turn)
+        return self._composed[3]
 
     @property
     def description(self) -> RobotDescription:
@@ -267,7 +267,10 @@ class Mapper:
         self._pending = description, lens, old_from_new, scale
 
     def correct_turn(self, turn: float) -> None:
-        """Know that the robot has turned further than the filter says, rad: the next edge does so, too."""
+        """Know that the robot has turned further than the filter says, rad.
+
+        `map_from_robot` has it at once, and the next edge; what is relative to the anchor is the filter's.
+        """
         self._turn_off += turn
 
     def forget_clock(self) -> None:
@@ -408,5 +411,7 @@ class Mapper:
 
 def _turned_further(moved: PoseGaussian, turn: float) -> PoseGaussian:
     """A way along which the robot has turned further by so much, rad, evenly."""
+    if not turn:
+        return moved
     half = Pose2(0.0, 0.0, 0.5 * turn)
     return PoseGaussian(half @ moved.mean @ half, moved.covariance)

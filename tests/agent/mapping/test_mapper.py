@@ -331,9 +331,13 @@ def test_an_edge_turns_further_if_the_images_say_so(walls, description):
         mapper.finish(drive(mapper, walls, list(np.arange(0.0, 0.51, 0.025))))
         mapper.finish_pending()
         last = drive(mapper, walls, list(np.arange(0.5, 0.91, 0.025)), start=50)
+        before = mapper.map_from_robot.mean
         mapper.correct_turn(turn)
+        known = mapper.map_from_robot.mean
+        assert known.heading - before.heading == pytest.approx(turn, abs=1e-9), "the robot knows it at once"
         mapper.finish(last)
         mapper.finish_pending()
+        assert mapper.map_from_robot.mean.distance(known) < 1e-6, "its pose does not jump where the edge ends"
         mapper.finish(drive(mapper, walls, list(np.arange(0.9, 1.31, 0.025)), start=100))
         mapper.finish_pending()
         edges.append([edge.a_from_b.mean for edge in mapper.map.edges.values()][:2])
