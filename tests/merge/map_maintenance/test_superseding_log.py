@@ -151,7 +151,9 @@ def test_a_node_that_a_pruned_one_superseded_before_is_judged_again() -> None:
     assert step.without(frozenset()) == step
 
 
-@pytest.mark.parametrize("seed", SEEDS)
+@pytest.mark.parametrize(
+    "seed", [SEEDS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in SEEDS[1:])]
+)
 @settings(max_examples=6, deadline=None)
 @given(
     order=st.permutations(HONEST),
