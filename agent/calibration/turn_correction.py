@@ -13,13 +13,12 @@ import math
 from typing import NamedTuple
 
 FIRST = math.radians(0.05)
-"""Standard deviation of the filter's turn over a pair before any has shown it, rad."""
+"""Standard deviation of the filter's turn over a pair before any has shown it, rad: between what was measured
+in buildings (0.03 degrees) and on a street (0.085); see docs/decisions/turns-by-pairs.md."""
 ADAPTATION = 0.1
-"""Share of what a pair shows of it that is taken over at once, 0 ... 1."""
-
-
+"""Share of what a pair shows of it that is taken over at once, 0 ... 1; chosen."""
 MOST = 4.0
-"""Sigmas of the two together: what is further apart counts as this far (Huber 1981)."""
+"""Sigmas of the two together: what is further apart counts as this far (Huber 1981); chosen."""
 
 
 class PairTurn(NamedTuple):
