@@ -62,7 +62,11 @@ def _key(mission: MissionOrder | MissionRequest) -> _Key:
 
 
 class MissionRelay:
-    """Takes missions from any thread. `hear` and `retry` are called by the server."""
+    """Takes missions from any thread. `hear` and `retry` are called by the server.
+
+    Attributes:
+        given: called whenever a person gives a mission, also one that is known; must not wait.
+    """
 
     def __init__(
         self,
@@ -92,6 +96,7 @@ class MissionRelay:
         self._later, self._noted = later, note
         self._bus, self._keys, self._store, self._places, self._time_ns = bus, keys, store, places, time_ns
         self.roster: Roster | None = None
+        self.given: Callable[[], None] = lambda: None
         # A commit may wait for a standby of PostgreSQL: what is known is never held up by it.
         self._turn, self._writing = threading.RLock(), threading.Lock()
         self._reports: dict[_Key, MissionReport] = {}
@@ -131,6 +136,11 @@ class MissionRelay:
             return Missions.newest(list(self._reports.values()))
 
     def command(self, request: MissionRequest) -> MissionReport:
+        """Take a mission of a person; see `hand_on`."""
+        self.given()
+        return self.hand_on(request)
+
+    def hand_on(self, request: MissionRequest) -> MissionReport:
         """Hand a mission on to its robot; returns what has become of it. It waits for the robot's answer.
 
         Raises:

@@ -25,6 +25,8 @@ from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.admission_control import AdmissionControl, AdmissionSettings
 from mapweave.mapserver.annotator import AnnotationRecord, Annotator
 from mapweave.mapserver.answers import Answers
+from mapweave.mapserver.attendance import ATTENDED, Attendance, AttendanceSettings
+from mapweave.mapserver.attendance import EVERY as ATTENDANCE_EVERY
 from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.blockages import Blockages
 from mapweave.mapserver.cluster.cluster import Cluster
@@ -74,12 +76,14 @@ class ServerSettings:
         merge: how maps are merged.
         quotas: what it takes of one robot.
         cluster: among whose processes the place index is split.
+        attendance: what robots do once no operator is there.
     """
 
     admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
     quotas: QuotaSettings = field(default_factory=QuotaSettings)
     cluster: ClusterSettings = field(default_factory=ClusterSettings)
+    attendance: AttendanceSettings = field(default_factory=AttendanceSettings)
 
 
 STATUS_EVERY = 0.5
@@ -192,6 +196,10 @@ class MapServer:
             self._bus, self._keys, clock.monotonic, self._hear, self._quotas, lambda: self._ingest.lags()
         )
         self._missions.roster = self._roster
+        self._attendance = Attendance(
+            self._settings.attendance, self._name, self._missions, self._store, self._roster.alive,
+            clock.monotonic,
+        )  # fmt: skip
         self._ingest = Ingest(
             self._bus, self._keys, self._store, self._name, worker.take, None,
             lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
@@ -231,12 +239,14 @@ class MapServer:
         self.put_plan_image, self.kept_image = self._plans.put, self._plans.images.get
         self.resolve, self.why_no_view, self.view = self._annotator.resolve, views.why_none, views.view
         self.command, self.missions = self._missions.command, self._missions.missions
+        self.attend = self._attendance.attend
         self.portal_done, self.metrics = self._missions.portal_done, self._metrics.scrape
         self._broadcast = PoseBroadcast(self._bus, self._keys, self._name, clock=clock.monotonic)
         self._metrics.read(self._sources())
         clock.every(STATUS_EVERY, self._publish)
         clock.every(RETRY_EVERY, self._missions.retry)
         clock.every(RETRY_EVERY, self._commands.write)
+        clock.every(ATTENDANCE_EVERY, self._attendance.check)
         self._store.follow(self._follow)
         # Behind the reading of the store: its map can be seen meanwhile.
         for job in library_jobs():
@@ -291,6 +301,7 @@ class MapServer:
         return {
             **merged.counts(),
             **(self._merging() if self._store.shared else {}),
+            **({"unattended": words} if (words := self._settings.attendance.words) else {}),
             "over_quota": ", ".join(self._quotas.over())[:1000],
             "damaged": damaged,
             "event": self._ingest.failure or unread or self._worker.event,
@@ -366,6 +377,8 @@ class MapServer:
             self._apply_annotations(self._annotations.annotations)
         if news.names(MISSIONS):
             self._missions.reload()
+        if news.records is not None and ATTENDED in news.records:
+            self._attendance.follow()
         if news.names(COMMANDS):
             self._commands.reload()
         if news.names(HISTORY) and not self._store.leads:

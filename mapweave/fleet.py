@@ -40,7 +40,7 @@ from mapweave.login import login
 from mapweave.refusals import listed
 from mapweave.wire.bus import Bus, Sample
 from mapweave.wire.bus_settings import BusSettings
-from mapweave.wire.credentials import Credentials
+from mapweave.wire.credentials import Credentials, Role
 from mapweave.wire.each_robot import alive_robots, each_robot, in_parallel
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Scalar, decode_record
@@ -319,6 +319,8 @@ class Fleet(FleetMap, FleetConstraints):
     ) -> MissionReport:
         """Wait until a mission is over; returns its last report, which is open if the time is over first.
 
+        The map server hears meanwhile that an operator is there, see `[attendance]` of its settings.
+
         Args:
             mission: as it was given.
             seconds: at most.
@@ -350,6 +352,7 @@ class Fleet(FleetMap, FleetConstraints):
             while mission.open and not over.wait(min(SILENT, max(end - time.monotonic(), 0.0))):
                 if (now := time.monotonic()) >= end:
                     break
+                self._attend(order)
                 if now - heard[0] > SILENT:
                     on_silence(now - heard[0])
         finally:
@@ -359,6 +362,17 @@ class Fleet(FleetMap, FleetConstraints):
                 self._finished.pop(next(iter(self._finished)), None)
             self._finished[_key(last[0])] = last[0]
         return last[0]
+
+    def _attend(self, order: MissionOrder) -> None:
+        """Give a mission again, by which the map server knows that someone waits for it."""
+        if self._key_holder is not None and self._key_holder.role is not Role.OPERATOR:
+            return
+        goal = "" if order.node is None else order.goal or str(order.node)
+        request = MissionRequest(
+            order.id, order.robot, order.kind, order.stamp_ns, order.by, goal, tuple(map(str, order.via)),
+            order.because,
+        )  # fmt: skip
+        self._bus.ask(sent_by(self._keys.any_mission(), self._sender), encode(request), ANSWERED)
 
     def _give(
         self,

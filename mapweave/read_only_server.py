@@ -122,6 +122,9 @@ class ReadOnlyServer:
         """Nothing can be changed."""
         return True
 
+    def attend(self) -> None:
+        """Nothing: there is no robot."""
+
     def merged(self) -> MergedMap:
         """The map."""
         return self._merged

@@ -12,6 +12,7 @@ from mapweave.agent.recordings.settings import RecordingSettings
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.mapserver.admission_control import AdmissionSettings
+from mapweave.mapserver.attendance import AttendanceSettings
 from mapweave.mapserver.cluster.settings import ClusterSettings
 from mapweave.mapserver.quotas import QuotaSettings
 from mapweave.merge.settings import MergeSettings
@@ -50,6 +51,7 @@ class Settings:
         agent: of a robot's program.
         admission_control: how a map server shares out the questions that take long.
         quotas: what a map server takes of one robot at most.
+        attendance: what robots do once no operator is there.
         merge: how maps are merged.
         cluster: of machines that help a map server.
     """
@@ -60,6 +62,7 @@ class Settings:
     agent: AgentSettings = field(default_factory=AgentSettings)
     admission_control: AdmissionSettings = field(default_factory=AdmissionSettings)
     quotas: QuotaSettings = field(default_factory=QuotaSettings)
+    attendance: AttendanceSettings = field(default_factory=AttendanceSettings)
     merge: MergeSettings = field(default_factory=MergeSettings)
     cluster: ClusterSettings = field(default_factory=ClusterSettings)
 

@@ -19,7 +19,7 @@ ROLES = (
     ("a robot: `mapweave agent`, `replay`", "`[network]`, `[robot]`, `[agent]`"),
     (
         "the server: `mapweave server`",
-        "`[network]`, `[admission_control]`, `[merge]`, `[quotas]`, `[cluster]`",
+        "`[network]`, `[admission_control]`, `[merge]`, `[quotas]`, `[attendance]`, `[cluster]`",
     ),
     ("people who ask a server: `mapweave relocalize`, `map`", "`[network]`"),
     ("people with map files: `mapweave map`", "`[merge]`"),

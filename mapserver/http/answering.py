@@ -56,6 +56,9 @@ class Answering(Protocol):
     def read_only(self) -> bool:
         """Whether nothing can be changed, and no robot be moved, as with a map file."""
 
+    def attend(self) -> None:
+        """An operator is there; must not wait."""
+
     def robots(self) -> FleetStatus:
         """The robots, and where they are."""
 

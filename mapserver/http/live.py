@@ -53,7 +53,7 @@ MOST_VIEWERS = 64
 LOADING = "loading"
 NOT_THERE, NOT_MERGED = f"{LOADING}; all is as last shown", "merging; the map is as last shown"
 """What is said meanwhile: until the server is there, and until it has merged."""
-SERVER_FIELDS = ("summary", "settled", "event", "loading")
+SERVER_FIELDS = ("summary", "settled", "event", "loading", "unattended")
 """Of the server's status, which are sent along."""
 
 
@@ -101,13 +101,22 @@ class LiveUpdates:
         self._begin()
         hearing = asyncio.create_task(_until_gone(viewer))
         showing = asyncio.create_task(self._show(viewer, person))
+        tasks = {hearing, showing}
+        if not self._access.described(person, self._server.read_only)["why_not"]:
+            tasks.add(asyncio.create_task(self._attend()))
         try:
-            await asyncio.wait({hearing, showing}, return_when=asyncio.FIRST_COMPLETED)
+            await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         finally:
             self._viewers -= 1
-            for task in (hearing, showing):
+            for task in tasks:
                 task.cancel()
-            await asyncio.gather(hearing, showing, return_exceptions=True)
+            await asyncio.gather(*tasks, return_exceptions=True)
+
+    async def _attend(self) -> None:
+        """A page of an operator is open, whatever becomes of what it shows."""
+        while True:
+            self._server.attend()
+            await asyncio.sleep(EVERY)
 
     def expect(self) -> None:
         """A viewer comes soon: look at the server already. In the server's thread."""

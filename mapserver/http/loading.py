@@ -35,6 +35,11 @@ class LoadingServer:
         """Whether nothing can be changed, as with a map file."""
         return self._server is not None and self._server.read_only
 
+    def attend(self) -> None:
+        """An operator is there: no robot is sent before the server is there, and it waits at its start."""
+        if self._server is not None:
+            self._server.attend()
+
     def annotations(self) -> Annotations:
         """What people say about the map."""
         return Annotations() if self._server is None else self._server.annotations()

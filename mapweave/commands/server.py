@@ -174,7 +174,9 @@ def run(arguments: argparse.Namespace) -> int:
         gc.freeze()
         gc.enable()
         looking.result()
-        how = ServerSettings(settings.admission_control, settings.merge, settings.quotas, cluster)
+        how = ServerSettings(
+            settings.admission_control, settings.merge, settings.quotas, cluster, settings.attendance
+        )
         schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
         if arguments.demo:
             from mapweave.recorded_fleet.fleet import RecordedFleet, prepare

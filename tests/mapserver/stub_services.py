@@ -70,6 +70,9 @@ class StubServices:
     def merged(self) -> MergedMap:
         return self.map or two_maps()
 
+    def attend(self) -> None:
+        pass
+
     def robots(self) -> FleetStatus:
         return self.fleet
 

@@ -246,6 +246,10 @@ watch({
   state({ server, robots }) {
     showRobots(robots);
     byId("summary").textContent = server.summary + (server.settled === false ? ", still merging" : "");
+    if (!server.loading) {
+      byId("unattended").textContent = server.unattended || "";
+      byId("unattended").hidden = !server.unattended;
+    }
     if (page.loading && !server.loading) listCorrections();
     page.loading = Boolean(server.loading);
     // Lists are shown once they are filled, so that nothing jumps.

@@ -2,21 +2,26 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
+from websockets.sync.client import connect
 
 from mapweave.evaluation.map_score import pose_error
+from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.mission_order import MissionKind, MissionReport, MissionState
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.children import Children
 from mapweave.sim.ground_truth_client import SimControl
 from mapweave.storage.map_file import unpack_map_file
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
+from mapweave.wire.messages import decode
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.http.person import Person
@@ -27,6 +32,8 @@ PATIENCE = 120.0
 """s, on a machine that does other things."""
 FLEET = "watched"
 ROBOTS = ("r0", "r1")
+GRACE = 15.0
+"""s for which robots that were sent drive on without an operator."""
 SEEN = """
 window.seen = {}; window.ways = {};
 setInterval(() => {
@@ -60,9 +67,11 @@ class Fleet:
     """
 
     def __init__(self, folder: Path, children: Children, bus: ZenohBus, endpoint: str) -> None:
+        settings = folder / "server.toml"
+        settings.write_text(f'[attendance]\nunattended = "stand"\ngrace = {GRACE}\n')
         self.children, self.http, self._bus = children, free_port(), bus
         self._server = ["server", "--fleet", FLEET, "--listen", endpoint, "--data", str(folder / "server")]
-        self._server += ["--http", str(self.http)]
+        self._server += ["--http", str(self.http), "--settings", str(settings)]
         self.start_server()
         eventually(bus.connected, PATIENCE)
         network = ["--fleet", FLEET, "--connect", endpoint]
@@ -81,7 +90,18 @@ class Fleet:
         changes = unpack_map_file(packed).changes
         (node,) = (one.node for one in changes if getattr(getattr(one, "node", None), "id", None) == goal)
         (made,) = self._control.truth_at("r0", [node.stamp_ns])
-        return made, self._control.status().robots["r0"].world_from_robot
+        return made, self.stands("r0")
+
+    def mission(self, robot: str) -> MissionReport:
+        """What a robot itself says."""
+        (reply,) = self._bus.ask(Keys(FLEET).agent_status(robot), b"", 20)
+        report = decode(reply.payload, AgentStatus).mission
+        assert report is not None
+        return report
+
+    def stands(self, robot: str) -> Pose2:
+        """Where a robot is."""
+        return self._control.status().robots[robot].world_from_robot
 
 
 @pytest.fixture
@@ -162,6 +182,47 @@ def test_robots_that_drive_are_watched_and_sent(fleet: Fleet, browser: Browser) 
     assert browser.run("return mapweave.model.order.length") >= nodes
     # What failed while there was no server is no error of the page.
     assert not [line for line in browser.errors() if "ERR_CONNECTION" not in line and "WebSocket" not in line]
+
+
+@pytest.mark.slow
+@needs_simulator
+@pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
+@pytest.mark.timeout(600)
+def test_robots_that_were_sent_stand_once_the_last_page_is_closed(fleet: Fleet, browser: Browser) -> None:
+    """Of two pages the first may close, and the last one be loaded again; what no person has sent goes on."""
+    person = Person(browser)
+    eventually(lambda: fleet.children.check() or serves(browser, fleet.http), PATIENCE)
+    both = "return mapweave.page.robots.filter(one => one.alive).length === 2"
+    eventually(lambda: fleet.children.check() or browser.run(both), PATIENCE)
+    words = "Robots that were sent stand 15 s after the last operator's page was closed."
+    eventually(lambda: person.text("unattended") == words)
+    given = browser.run(
+        "return fetch('robots/r0/explore?by=anna', { method: 'POST' }).then(one => one.json())"
+    )
+    assert given["state"] == "running"
+    # A page that is loaded again and again, for longer than the grace.
+    end = time.monotonic() + 2.0 * GRACE
+    while time.monotonic() < end:
+        serves(browser, fleet.http)
+        assert fleet.mission("r0").order.by == "anna"
+    with connect(f"ws://127.0.0.1:{fleet.http}/live") as other:
+        browser.open("about:blank")
+        end = time.monotonic() + 1.5 * GRACE
+        while time.monotonic() < end:
+            other.recv(timeout=20)
+        assert fleet.mission("r0").order.by == "anna", "another operator looks on"
+    closed = time.monotonic()
+    eventually(lambda: fleet.mission("r0").order.kind is MissionKind.STOP, PATIENCE)
+    assert time.monotonic() - closed > GRACE - 1.0
+    eventually(lambda: fleet.mission("r0").state is MissionState.DONE)
+    assert fleet.mission("r0").order.by == "s0"
+    assert fleet.mission("r1").order.by == "start" and fleet.mission("r1").state is MissionState.RUNNING
+    before = fleet.stands("r0")
+    time.sleep(3.0)
+    assert pose_error(fleet.stands("r0"), before)[0] < 0.01
+    eventually(lambda: serves(browser, fleet.http))
+    person.press("tab-events")
+    eventually(lambda: "no operator was there for 15 s" in person.text("events"))
 
 
 def serves(browser: Browser, port: int) -> bool:

@@ -1,0 +1,182 @@
+"""What robots do once no operator is there: pages, shells that wait, robots that were away, two servers."""
+
+from __future__ import annotations
+
+import json
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from websockets.sync.client import connect
+
+from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
+from mapweave.hybridmap.pose import Pose2
+from mapweave.mapserver.attendance import Attendance, AttendanceSettings, Unattended
+from mapweave.mapserver.http.live import EVERY
+from mapweave.mapserver.http.web import Web
+from mapweave.mapserver.server import MapServer
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from synthetic.postgres_server import PostgresServer
+from tests.mapserver.house import House
+from tests.mapserver.stub_services import StubServices
+from tests.mapserver.test_missions import THERE
+from tests.waiting import eventually
+
+GRACE = 30.0
+DRIVES = Status("servoing", "", 7, 0, Pose2(0.0, 0.1, 0.0), False, "go", located=True)
+
+
+class Watch:
+    """Attendance on a clock of its own, at the server of a house; `after` looks at a time."""
+
+    def __init__(self, house: House, unattended: Unattended = Unattended.STAND) -> None:
+        self.now = 0.0
+        server, settings = house.server, AttendanceSettings(unattended, GRACE)
+        self.attendance = Attendance(
+            settings, "s0", server._missions, server._store, server._roster.alive, lambda: self.now
+        )
+
+    def after(self, seconds: float) -> None:
+        self.now += seconds
+        self.attendance.check()
+
+
+def test_a_robot_that_a_person_has_sent_stands_once_no_operator_is_there(house: House) -> None:
+    watch, (link, control) = Watch(house), house.robot()
+    watch.after(GRACE + 1.0)
+    sent = house.person.go("r0", str(THERE), because="a parcel")
+    watch.after(GRACE - 1.0)
+    assert control.report == sent, "the grace begins with the mission"
+    watch.attendance.attend()
+    watch.after(GRACE - 1.0)
+    assert control.report == sent, "an open page"
+    watch.after(2.0)
+    ended = control.report
+    assert ended is not None and ended.order.kind is MissionKind.STOP
+    assert (ended.order.by, ended.order.because) == ("s0", "no operator was there for 30 s")
+    states = [report.state for report in house.person.missions()]
+    assert states == [MissionState.REPLACED, MissionState.RUNNING]
+    events = [event.words for event in house.server._commands.events]
+    assert "no operator was there for 30 s" in events[-1]
+    watch.after(100.0)
+    assert control.report == ended, "once"
+    assert house.person.go("r0", str(THERE)).state is MissionState.RUNNING, "it takes orders as before"
+    link.close()
+
+
+def test_it_goes_home_and_is_let_go_home(house: House) -> None:
+    watch, (link, control) = Watch(house, Unattended.HOME), house.robot()
+    house.person.go("r0", str(THERE))
+    watch.after(GRACE + 1.0)
+    home = control.report
+    assert home is not None and home.order.node == min(house.mapped.truth) and home.order.goal == "home"
+    watch.after(GRACE + 1.0)
+    assert control.report == home
+    link.close()
+
+
+def test_a_robot_that_has_no_home_stands(house: House) -> None:
+    watch, (link, control) = Watch(house, Unattended.HOME), house.robot("r5")
+    house.person.explore("r5")
+    watch.after(GRACE + 1.0)
+    assert control.report is not None and control.report.order.kind is MissionKind.STOP
+    link.close()
+
+
+def test_robots_that_no_person_has_sent_go_on(house: House) -> None:
+    watch, (link, control) = Watch(house), house.robot()
+    control.begin(MissionKind.EXPLORE)
+    link.report(DRIVES, 2)
+    eventually(lambda: house.person.missions())
+    watch.after(GRACE + 1.0)
+    assert control.report is not None and control.report.order.by == "start"
+    house.person.carried("r0")
+    watch.after(GRACE + 1.0)
+    assert control.report.order.kind is MissionKind.CARRIED, "a person is beside it"
+    link.close()
+
+
+def test_by_default_all_go_on(house: House) -> None:
+    assert AttendanceSettings().words == ""
+    watch, (link, control) = Watch(house, Unattended.GO_ON), house.robot()
+    sent = house.person.go("r0", str(THERE))
+    watch.after(1e6)
+    assert control.report == sent
+    link.close()
+
+
+def test_a_robot_that_was_away_stands_when_it_is_back(house: House) -> None:
+    watch, (link, control) = Watch(house), house.robot()
+    house.person.go("r0", str(THERE))
+    link.close()
+    eventually(lambda: not house.server._roster.alive("r0"))
+    watch.after(GRACE + 1.0)
+    assert len(house.person.missions()) == 1, "nothing waits for it"
+    back, _ = house.robot()
+    order = control.report
+    assert order is not None
+    eventually(lambda: house.server._roster.alive("r0"))
+    watch.after(1.0)
+    assert [report.order.kind for report in house.person.missions()] == [MissionKind.GO, MissionKind.STOP]
+    back.close()
+
+
+def test_who_waits_for_a_mission_is_there(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As `mapweave go --wait` and `fleet.go(..., wait=60)` do."""
+    monkeypatch.setattr("mapweave.fleet.SILENT", 0.05)
+    watch, (link, control) = Watch(house), house.robot()
+    report = house.person.go("r0", str(THERE), via=[str(min(house.mapped.truth))])
+    waited: list[MissionReport] = []
+    waiting = threading.Thread(target=lambda: waited.append(house.person.wait(report, 60.0)))
+    waiting.start()
+    for _ in range(5):
+        watch.now += GRACE - 1.0
+        eventually(lambda: watch.attendance._seen == watch.now)
+        watch.attendance.check()
+    assert control.report == report and len(house.person.missions()) == 1, "it is the same mission"
+    control.take(MissionOrder.new("r0", MissionKind.STOP, "bert", after_ns=report.order.stamp_ns))
+    link.report(DRIVES, 3)
+    waiting.join(20)
+    assert waited[0].state is MissionState.REPLACED
+    link.close()
+
+
+def test_a_page_that_may_only_look_is_no_operator(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without keys another machine, by way of a proxy, only reads."""
+    services, seen = StubServices(), [0]
+    monkeypatch.setattr(services, "attend", lambda: seen.__setitem__(0, seen[0] + 1))
+    with Web(("127.0.0.1", 0), services) as web:
+        where = f"ws://127.0.0.1:{web.port}/live"
+        with connect(where, additional_headers={"X-Forwarded-For": "10.0.0.9"}) as viewer:
+            # All that a page gets at its start: it is not asked whether it is there.
+            kinds = {json.loads(viewer.recv(timeout=20))["kind"] for _ in range(3)}
+            assert "state" in kinds and seen == [0]
+        with connect(where):
+            eventually(lambda: seen[0] > 2)
+        # A look is taken twice a second: two in a row without one.
+        eventually(lambda: _still(lambda: seen[0]), 20.0)
+
+
+def _still(count: Callable[[], int]) -> bool:
+    before = count()
+    time.sleep(3.0 * EVERY)
+    return count() == before
+
+
+def test_servers_that_share_a_store_hear_of_each_others_operators(
+    postgres: PostgresServer, tmp_path: Path
+) -> None:
+    hub = MemoryHub()
+    address = postgres.database()
+    with (
+        MapServer(MemoryBus(hub), Keys("demo"), address, "s0", cache=tmp_path) as one,
+        MapServer(MemoryBus(hub), Keys("demo"), address, "s1", cache=tmp_path) as other,
+    ):
+        before = other._attendance._seen
+        one.attend()
+        eventually(lambda: other._attendance._seen > before)
+        assert other._attendance._here < before, "what is heard of others is not said again as the own"
