@@ -25,6 +25,10 @@ class InvalidFile(MapweaveError):
     """A file is truncated, altered, or of another kind."""
 
 
+class StoreAway(InvalidFile):
+    """A database cannot be reached, or the connection with it was lost."""
+
+
 class SettingsError(MapweaveError):
     """A setting is unknown or has a value that cannot work."""
 

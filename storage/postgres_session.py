@@ -16,7 +16,7 @@ from typing import Any
 import psycopg
 from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
-from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.errors import InvalidFile, InvalidValue, StoreAway
 from mapweave.storage.full_disks import FullDisk
 from mapweave.storage.os_errors import reason_of
 
@@ -246,7 +246,12 @@ class PostgresSession:
 
     @contextmanager
     def guard(self) -> Iterator[None]:
-        """Turn PostgreSQL's errors into InvalidFile with one line; what is broken is not used again."""
+        """Turn PostgreSQL's errors into InvalidFile with one line; what is broken is not used again.
+
+        Raises:
+            StoreAway: there is no connection, or it was lost.
+            InvalidFile: any other error.
+        """
         if not self._uses:
             self._used_since = time.monotonic()
         self._uses += 1
@@ -254,11 +259,12 @@ class PostgresSession:
             yield
         except psycopg.Error as error:
             reason, full = _reason(error), isinstance(error, psycopg.errors.DiskFull)
+            away = self._connection is None or self._connection.broken
             if self._connection is not None and self._connection.broken:
                 if self._given_up:
                     reason = f"{self._place}: PostgreSQL answers nothing"
                 self._drop()
-            unusable, address = self._unusable(reason), self.address.words
+            unusable, address = self._unusable(reason, StoreAway if away else InvalidFile), self.address.words
             raise FullDisk.of_database(str(unusable), address) if full else unusable from None
         finally:
             self._uses -= 1
@@ -297,8 +303,8 @@ class PostgresSession:
             raise self._unusable(SHARED)
         connection.execute(SET, ([*self._options], [*self._options.values()]))
 
-    def _unusable(self, reason: str) -> InvalidFile:
-        return InvalidFile(f"{self.address.words}: the map store cannot be used ({reason})")
+    def _unusable(self, reason: str, kind: type[InvalidFile] = InvalidFile) -> InvalidFile:
+        return kind(f"{self.address.words}: the map store cannot be used ({reason})")
 
     def _drop(self) -> None:
         connection, self._connection = self._connection, None

@@ -51,7 +51,8 @@ SAID_AGAIN = 10.0
 MOST_VIEWERS = 64
 """More are refused."""
 LOADING = "loading"
-NOT_THERE, NOT_MERGED = f"{LOADING}; all is as last shown", "merging; the map is as last shown"
+BEFORE = "; all is as last shown"
+NOT_THERE, NOT_MERGED = LOADING + BEFORE, "merging; the map is as last shown"
 """What is said meanwhile: until the server is there, and until it has merged."""
 SERVER_FIELDS = ("summary", "settled", "event", "loading", "unattended")
 """Of the server's status, which are sent along."""
@@ -177,7 +178,7 @@ class LiveUpdates:
         """Take over what is new; returns whether the links' probabilities are due."""
         status = self._server.status()
         if self._holds(status):
-            self._hold(bool(status.get("loading")))
+            self._hold(status)
             return False
         merged, floors = self._server.merged(), self._server.annotations().floors
         with self._turn:
@@ -213,12 +214,11 @@ class LiveUpdates:
             robots = sorted((*heard, *unheard), key=lambda robot: str(robot["robot"]))
         return robots
 
-    def _hold(self, loading: bool) -> None:
+    def _hold(self, status: Mapping[str, Scalar]) -> None:
         """Show what was there before, with the robots and events that are known by now."""
-        before, summary = self._before, LOADING
+        before, loading = self._before, bool(status.get("loading"))
         robots, history = before.unheard, before.history
-        if before:
-            summary = NOT_THERE if loading else NOT_MERGED
+        summary = f"{status['summary']}{BEFORE if before else ''}" if loading else NOT_MERGED
         if not loading:
             robots, history = (
                 before.fleet(self._server.robots(), self._server.merged()),

@@ -25,6 +25,11 @@ class LoadingServer:
     def __init__(self) -> None:
         """Begin without a server."""
         self._server: Answering | None = None
+        self._waits_for = ""
+
+    def wait(self, words: str) -> None:
+        """What the server waits for, in one line; empty once it has come. From any thread."""
+        self._waits_for = words
 
     def take(self, server: Answering) -> None:
         """The server is there; from any thread."""
@@ -49,9 +54,12 @@ class LoadingServer:
         return PlacedPlans() if self._server is None else self._server.plans()
 
     def status(self) -> dict[str, Scalar]:
-        """What the server holds and does; `loading` until it is there."""
+        """What the server holds and does; `loading` until it is there, `event` if it waits for something."""
         if self._server is None:
-            return {"summary": LOADING, "loading": True, "settled": False}
+            status: dict[str, Scalar] = {"summary": LOADING, "loading": True, "settled": False}
+            if self._waits_for:
+                status |= {"summary": self._waits_for, "event": self._waits_for}
+            return status
         return self._server.status()
 
     def __getattr__(self, name: str) -> Any:

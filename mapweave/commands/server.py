@@ -44,6 +44,9 @@ TURN = 0.001
 waited 5 ms for the merge each time, which is Python's own."""
 REMOVALS = 10
 """How often the files of a demo are removed that ends amid its start, while they are still being made."""
+STORE_WAIT = 600.0
+"""s: a PostgreSQL that was killed replays its log before it takes sessions."""
+STOPPED = "stopped while it was starting"
 LARGE = 20_000_000
 """Bytes of a store whose reading is announced, since it takes long."""
 
@@ -63,6 +66,11 @@ def add_to(commands: Any) -> None:
         "--store", metavar="postgresql://...",
         help="a PostgreSQL database for the store, which several servers may share; --data is then the "
         "folder for what can be computed again. A password belongs in ~/.pgpass (default: a file in --data)",
+    )  # fmt: skip
+    parser.add_argument(
+        "--store-wait", type=values.seconds, default=STORE_WAIT, metavar="S",
+        help="longest wait at the start for that database, where it is not up yet (default: "
+        f"{STORE_WAIT:g})",
     )  # fmt: skip
     parser.add_argument(
         "--demo", action="store_true",
@@ -170,6 +178,7 @@ def run(arguments: argparse.Namespace) -> int:
         from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
         from mapweave.mapserver.server import MapServer, ServerSettings
         from mapweave.processes.service_manager import ServiceManager
+        from mapweave.processes.store_wait import Waiting, made_with_store
 
         gc.freeze()
         gc.enable()
@@ -197,7 +206,24 @@ def run(arguments: argparse.Namespace) -> int:
         if arguments.map is not None:
             given = opened(arguments.map)
             base = BaseMap.of(str(given.path), given.content)
-        server = MapServer(bus, keys, arguments.store or path, name, how, schedule, base, data)
+
+        def make() -> MapServer:
+            return MapServer(bus, keys, arguments.store or path, name, how, schedule, base, data)
+
+        def tell(words: str) -> None:
+            print(stamped(words), flush=True)
+
+        def may_help() -> bool:
+            from mapweave.storage.postgres_reachability import waiting_may_help
+            from mapweave.storage.postgres_session import PostgresAddress
+
+            return waiting_may_help(PostgresAddress.read(arguments.store))
+
+        waiting = Waiting(tell, loading.wait if web is not None else lambda words: None)
+        server = made_with_store(make, may_help, waiting, stop, arguments.store_wait)
+        if server is None:
+            tell(STOPPED)
+            return 0
         if base is not None:
             print(stamped(f"with {base}"), flush=True)
         started = end_if_stopped_before(stop, data if arguments.demo else None)
@@ -269,7 +295,7 @@ def end_if_stopped_before(stop: threading.Event, temporary: Path | None = None) 
         if not started.is_set():
             from mapweave.terminal import stamped
 
-            print(stamped("stopped while it was starting"), flush=True)
+            print(stamped(STOPPED), flush=True)
             # The server goes on writing until the process ends.
             if temporary is not None:
                 for _ in range(REMOVALS):

@@ -9,6 +9,8 @@ import time
 
 PERIOD = 1.0
 """s between two signs of life; the watchdog of the units waits 30 s."""
+START = 600
+"""s that a start may go on after each time that it says what it waits for; as TimeoutStartSec of the unit."""
 
 
 class ServiceManager:
@@ -19,6 +21,10 @@ class ServiceManager:
         # A name that begins with @ is in the abstract namespace of Linux.
         self._address = os.environ.get("NOTIFY_SOCKET", "").replace("@", "\0", 1)
         self._next = 0.0
+
+    def starts(self, words: str) -> None:
+        """The start waits for something, which `systemctl status` shows; its time begins again."""
+        self._send(f"EXTEND_TIMEOUT_USEC={START * 1_000_000}\nSTATUS={words}")
 
     def ready(self) -> None:
         """The process does its work from now on."""

@@ -139,6 +139,25 @@ def test_a_robot_that_no_common_node_places_is_shown_without_a_place() -> None:
     assert (entry["merged_from_robot"], entry["component"]) == (None, -1)
 
 
+@pytest.mark.parametrize("shown", [NOTHING, before()])
+def test_what_a_server_waits_for_is_said(shown: LastShown) -> None:
+    loading = LoadingServer()
+    loading.wait("waiting: no database")
+    with Web(("127.0.0.1", 0), loading, before=shown) as web, viewer(web) as person:
+        assert answer(web, "/status") == (
+            200,
+            {
+                "summary": "waiting: no database",
+                "loading": True,
+                "settled": False,
+                "event": "waiting: no database",
+            },
+        )
+        assert person.until("state")["server"]["summary"].startswith("waiting: no database")
+        loading.wait("")
+        eventually(lambda: person.until("state")["server"]["summary"] == (NOT_THERE if shown else "loading"))
+
+
 def test_without_a_map_of_before_the_page_says_that_the_server_loads() -> None:
     with Web(("127.0.0.1", 0), LoadingServer()) as web, viewer(web) as person:
         assert person.until("state")["server"]["summary"] == "loading"

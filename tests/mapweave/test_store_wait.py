@@ -1,0 +1,177 @@
+"""A server that starts before its database: it waits where that can help, and ends with a line where not."""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from urllib.request import urlopen
+
+import pytest
+
+from mapweave.exit_status import FAILED
+from mapweave.hybridmap.errors import InvalidFile, StoreAway
+from mapweave.processes.store_wait import Waiting, made_with_store
+from synthetic.postgres_server import PostgresServer
+from tests.postgres import started
+from tests.waiting import eventually, free_port
+
+PATIENCE = 120.0
+LATE = 5.0
+"""s that the database starts after the server."""
+
+
+class Store:
+    """One that is there after some attempts."""
+
+    def __init__(self, *failures: Exception) -> None:
+        self.failures = [*failures]
+        self.log: list[str] = []
+        self.shown: list[str] = []
+        self.asked = 0
+        self.helps = True
+
+    def make(self) -> str:
+        if self.failures:
+            raise self.failures.pop(0)
+        return "made"
+
+    def may_help(self) -> bool:
+        self.asked += 1
+        return self.helps
+
+    def wait(self, longest: float = 60.0, stop: threading.Event | None = None) -> str | None:
+        waiting = Waiting(self.log.append, self.shown.append)
+        return made_with_store(self.make, self.may_help, waiting, stop or threading.Event(), longest)
+
+
+@pytest.fixture(autouse=True)
+def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("mapweave.processes.store_wait.EVERY", 0.01)
+
+
+def test_a_store_that_is_there_is_not_waited_for() -> None:
+    store = Store()
+    assert store.wait() == "made"
+    assert (store.log, store.shown, store.asked) == ([], [], 0)
+
+
+def test_a_wait_is_one_line_and_its_end_another() -> None:
+    store = Store(*[StoreAway("refused")] * 3, *[StoreAway("it starts")] * 3)
+    assert store.wait() == "made"
+    assert store.log == ["waiting for at most 60 s: refused", "the map store is there, after 0 s"]
+    assert store.shown == [*["waiting: refused"] * 3, *["waiting: it starts"] * 3, ""]
+    assert store.asked == 2, "only a failure with other words is looked into"
+
+
+def test_what_waiting_does_not_mend_ends_at_once_also_later() -> None:
+    store = Store(StoreAway("no such database"))
+    store.helps = False
+    with pytest.raises(StoreAway, match="no such database"):
+        store.wait()
+    assert not store.log and not store.shown
+    store = Store(StoreAway("refused"), InvalidFile("another format"))
+    with pytest.raises(InvalidFile, match="another format"):
+        store.wait()
+
+
+def test_a_wait_ends_after_its_time_and_when_it_is_stopped() -> None:
+    store = Store(*[StoreAway("refused")] * 1000)
+    with pytest.raises(StoreAway, match="refused"):
+        store.wait(0.1)
+    stop = threading.Event()
+    threading.Timer(0.1, stop.set).start()
+    assert store.wait(60.0, stop) is None
+
+
+@contextmanager
+def server(folder: Path, store: str, *options: str, **environment: str) -> Iterator[subprocess.Popen[bytes]]:
+    """A map server as people start it, with its log in a file."""
+    command = [
+        sys.executable, "-m", "mapweave", "server", "--store", store, "--data", str(folder / "data"),
+        "--listen", f"tcp/127.0.0.1:{free_port()}", *options,
+    ]  # fmt: skip
+    with (folder / "log").open("wb") as log:
+        process = subprocess.Popen(command, stdout=log, stderr=log, env=os.environ | environment)
+    try:
+        yield process
+    finally:
+        process.kill()
+        process.wait()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(300)
+def test_a_server_waits_for_a_database_that_starts_later(tmp_path: Path) -> None:
+    databases = started()
+    database, http = next(databases), free_port()
+    address = database.database()
+    database.stop()
+
+    def status() -> dict:
+        try:
+            with urlopen(f"http://127.0.0.1:{http}/status", timeout=10) as reply:
+                return json.load(reply)
+        except OSError:
+            return {}
+
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
+        manager.bind(str(tmp_path / "notify"))
+        manager.settimeout(PATIENCE)
+        try:
+            with server(
+                tmp_path, address, "--http", str(http), NOTIFY_SOCKET=manager.getsockname()
+            ) as process:
+                eventually(lambda: status().get("event"), PATIENCE)
+                assert status()["loading"] and str(database.folder) in str(status()["event"])
+                assert status()["summary"] == status()["event"]
+                time.sleep(LATE)
+                database.start()
+                eventually(lambda: status().get("leads") and not status()["event"], PATIENCE)
+                process.send_signal(signal.SIGINT)
+                assert process.wait(PATIENCE) == 0
+        finally:
+            databases.close()
+        messages = []
+        while messages[-1:] != [b"READY=1"]:
+            messages.append(manager.recv(1000))
+    assert len(messages) >= LATE, "each second"
+    assert all(re.match(rb"EXTEND_TIMEOUT_USEC=600000000\nSTATUS=postgresql://", one) for one in messages[:-1])
+    lines = (tmp_path / "log").read_text().splitlines()
+    waits = [line for line in lines if "waiting" in line or "store is there" in line]
+    assert len(waits) == 2 and "waiting for at most 600 s: postgresql://" in waits[0]
+    assert "the map store is there, after " in waits[1]
+
+
+@pytest.mark.slow
+def test_a_server_ends_at_once_where_there_is_no_such_database(
+    postgres: PostgresServer, tmp_path: Path
+) -> None:
+    with server(tmp_path, postgres.address("none")) as process:
+        assert process.wait(PATIENCE) == FAILED
+    (line,) = (tmp_path / "log").read_text().splitlines()
+    assert 'database "none" does not exist' in line
+
+
+@pytest.mark.slow
+def test_a_server_that_waits_can_be_stopped_and_gives_up(tmp_path: Path) -> None:
+    pytest.importorskip("psycopg")
+    nowhere = f"postgresql://anna@127.0.0.1:{free_port()}/maps"
+    with server(tmp_path, nowhere) as process:
+        eventually(lambda: "waiting for at most 600 s" in (tmp_path / "log").read_text(), PATIENCE)
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(PATIENCE) == 0
+    assert (tmp_path / "log").read_text().splitlines()[-1].endswith("stopped while it was starting")
+    with server(tmp_path, nowhere, "--store-wait", "2") as process:
+        assert process.wait(PATIENCE) == FAILED
+    first, last = (tmp_path / "log").read_text().splitlines()
+    assert "waiting for at most 2 s" in first and "Connection refused" in last

@@ -1,0 +1,143 @@
+"""Whether waiting may help, of real servers that are down, starting, frozen, or that refuse."""
+
+from __future__ import annotations
+
+import signal
+import subprocess
+from collections.abc import Iterator
+
+import psycopg
+import pytest
+
+from mapweave.hybridmap.errors import InvalidFile, StoreAway
+from mapweave.storage.postgres_reachability import waiting_may_help
+from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
+from synthetic import postgres_server
+from synthetic.postgres_server import PostgresServer
+from tests.pgbouncer import pooled
+from tests.postgres import started
+from tests.waiting import eventually, free_port
+
+
+@pytest.fixture(scope="module")
+def server() -> Iterator[PostgresServer]:
+    yield from started()
+
+
+def away(address: str) -> bool:
+    """What is said of an address that cannot be connected, as for a writer."""
+    read = PostgresAddress.read(address)
+    session = PostgresSession(read, "test")
+    with pytest.raises(StoreAway):
+        _ = session.connection
+    session.close()
+    return waiting_may_help(read)
+
+
+def test_a_server_that_is_down_may_come(server: PostgresServer) -> None:
+    server.stop()
+    try:
+        assert away(server.address())
+        assert away(f"postgresql://anna@127.0.0.1:{free_port()}/maps")
+    finally:
+        server.start()
+
+
+def test_a_host_whose_name_is_not_known_yet_may_come() -> None:
+    assert away("postgresql://anna@none.invalid/maps")
+
+
+def test_a_frozen_server_may_go_on(server: PostgresServer) -> None:
+    server.freeze()
+    try:
+        assert away(server.address())
+    finally:
+        server.thaw()
+
+
+def test_a_server_that_recovers_takes_sessions_later(
+    server: PostgresServer, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It refuses all sessions while it replays its log, as a standby does that may not be read."""
+    server.stop()
+    (server.data / "standby.signal").touch()
+    settings = server.data / "postgresql.auto.conf"
+    before = settings.read_text()
+    settings.write_text(f"{before}hot_standby = off\n")
+    monkeypatch.setattr(postgres_server, "STARTS", 1.0)
+    try:
+        with pytest.raises(AssertionError):
+            server.start()
+        eventually(lambda: "the database system is" in refused(server.address()))
+        assert away(server.address())
+    finally:
+        monkeypatch.undo()
+        server.process.send_signal(signal.SIGQUIT)
+        server.process.wait(60)
+        settings.write_text(before)
+        (server.data / "standby.signal").unlink()
+        server.start()
+
+
+def refused(address: str) -> str:
+    try:
+        psycopg.connect(address, connect_timeout=5).close()
+    except psycopg.OperationalError as error:
+        return str(error)
+    return ""
+
+
+def test_no_database_user_or_password_comes_by_waiting(server: PostgresServer) -> None:
+    assert not away(server.address("none"))
+    assert not away(server.address().replace("mapweave@", "stranger@"))
+    # A machine that is down beside it changes nothing.
+    assert not away(f"postgresql://mapweave@/none?host=/none,{server.folder}")
+    rules = server.data / "pg_hba.conf"
+    before = rules.read_text()
+    rules.write_text("local all all scram-sha-256\n")
+    server.process.send_signal(signal.SIGHUP)
+    try:
+        eventually(lambda: "no password supplied" in refused(server.address()))
+        assert not away(server.address())
+    finally:
+        rules.write_text(before)
+        server.process.send_signal(signal.SIGHUP)
+        eventually(lambda: not refused(server.address()))
+
+
+def test_one_of_several_standbys_may_become_the_primary() -> None:
+    servers = started("-c", "default_transaction_read_only=on")
+    try:
+        assert away(next(servers).address())
+    finally:
+        servers.close()
+
+
+def test_a_pooler_whose_server_is_down_is_waited_for() -> None:
+    servers = started()
+    server = next(servers)
+    try:
+        with pooled(server, "session") as pooler:
+            address = pooler.through(server.address())
+            server.stop()
+            pooler.process.terminate()
+            pooler.process.wait(30)
+            pooler.process = subprocess.Popen(
+                pooler.process.args, user=server.user, stderr=subprocess.DEVNULL
+            )
+            eventually(lambda: "/.s.PGSQL" not in refused(address))
+            assert away(address)
+    finally:
+        servers.close()
+
+
+def test_what_is_wrong_with_a_session_that_was_made_is_no_reason_to_wait(postgres: PostgresServer) -> None:
+    session = PostgresSession(PostgresAddress.read(postgres.database()), "test")
+    with pytest.raises(InvalidFile) as wrong, session.guard():
+        session.connection.execute("SELECT * FROM none")
+    assert not isinstance(wrong.value, StoreAway)
+    with pytest.raises(StoreAway), session.guard():
+        with psycopg.connect(postgres.address(), autocommit=True) as other:
+            other.execute("SELECT pg_terminate_backend(%s)", [session.connection.info.backend_pid])
+        session.connection.execute("SELECT 1")
+    session.close()
