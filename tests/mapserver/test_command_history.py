@@ -16,12 +16,15 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.hybridmap.mission_order import AT_START, MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.command_history import MOST, CommandHistory
+from mapweave.mapserver import command_history
+from mapweave.mapserver.command_history import CommandHistory
 from mapweave.mapserver.http.web import Web
 from tests.mapserver.house import House, ask
 from tests.waiting import eventually
 
 THERE = NodeId("r0", 1, 3)
+MOST = 40
+"""Events that are kept here: with as many as a server keeps each further one takes milliseconds."""
 
 
 def commands(house: House) -> list[str]:
@@ -114,6 +117,12 @@ class Record:
         self.values[name] = value
 
 
+@pytest.fixture
+def kept_few(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(command_history, "MOST", MOST)
+
+
+@pytest.mark.usefixtures("kept_few")
 def test_a_robot_that_reports_mission_after_mission_displaces_no_other() -> None:
     record, clock = Record(), iter(range(1, 10**9))
     history = CommandHistory(record, lambda: next(clock), lambda job: None)
@@ -155,6 +164,7 @@ def test_a_robots_first_report_of_an_order_that_a_person_gave_it_names_the_robot
     assert commands(house) == ["r0: explore, by eve (mission ID, as r0 says)"], "no person has said the first"
 
 
+@pytest.mark.usefixtures("kept_few")
 def test_a_clock_that_was_put_back_loses_no_command() -> None:
     """A machine without a clock of its own begins in another year: what is noted then is the newest all the
     same.

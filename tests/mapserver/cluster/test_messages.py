@@ -6,6 +6,7 @@ import pickle
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import replace
+from functools import cache
 from itertools import combinations
 from typing import Any
 
@@ -261,27 +262,30 @@ def test_columns_of_nodes_that_do_not_belong_together_are_refused() -> None:
         Overlaps(nodes)
 
 
-SAMPLES: list[tuple[bytes, Callable[[bytes], object]]] = [
-    (encoded(ShardChange(STATE, ComparedNodes.of(NODES[:2]), Ids.of([NODES[0].id]))), SERVER.call),
-    (encoded(Ask(State(SERVER._state.incarnation, 0), encoded(NEAREST))), SERVER.call),
-    (encoded(NEAREST), lambda data: SHARD.answer(decoded(data, Question))),
-    (encoded(OVERLAPS), lambda data: SHARD.answer(decoded(data, Question))),
-    (encoded(answered()), lambda data: answer_to(NEAREST, data)),
-    (encoded(answer_message(SHARD.overlaps(NODES[5]))), lambda data: answer_to(OVERLAPS, data)),
-    (encoded(STATE), lambda data: decoded(data, State)),
-    (
-        encoded(ComparisonAnswer.of(compare(PAIRS[:4]))),
-        lambda data: decoded(data, ComparisonAnswer).verdicts_on(PAIRS[:4]),
-    ),
-    (encoded(Comparison.of(PAIRS[:2])), lambda data: decoded(data, Comparison).node_pairs()),
-    (GatewayRequest(7, 2, b"abc").packed(), GatewayRequest.read),
-    (GatewayReply(7, words="it failed").packed(), GatewayReply.read),
-]  # fmt: skip
+@cache
+def samples() -> list[tuple[bytes, Callable[[bytes], object]]]:
+    """Messages, and what reads each."""
+    return [
+        (encoded(ShardChange(STATE, ComparedNodes.of(NODES[:2]), Ids.of([NODES[0].id]))), SERVER.call),
+        (encoded(Ask(State(SERVER._state.incarnation, 0), encoded(NEAREST))), SERVER.call),
+        (encoded(NEAREST), lambda data: SHARD.answer(decoded(data, Question))),
+        (encoded(OVERLAPS), lambda data: SHARD.answer(decoded(data, Question))),
+        (encoded(answered()), lambda data: answer_to(NEAREST, data)),
+        (encoded(answer_message(SHARD.overlaps(NODES[5]))), lambda data: answer_to(OVERLAPS, data)),
+        (encoded(STATE), lambda data: decoded(data, State)),
+        (
+            encoded(ComparisonAnswer.of(compare(PAIRS[:4]))),
+            lambda data: decoded(data, ComparisonAnswer).verdicts_on(PAIRS[:4]),
+        ),
+        (encoded(Comparison.of(PAIRS[:2])), lambda data: decoded(data, Comparison).node_pairs()),
+        (GatewayRequest(7, 2, b"abc").packed(), GatewayRequest.read),
+        (GatewayReply(7, words="it failed").packed(), GatewayReply.read),
+    ]  # fmt: skip
 
 
 @settings(max_examples=300, deadline=None)
 @given(
-    which=st.integers(0, len(SAMPLES) - 1),
+    which=st.deferred(lambda: st.integers(0, len(samples()) - 1)),
     changes=st.lists(st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(0, 255)), max_size=4),
     length=st.floats(0.0, 1.0) | st.just(1.0),
 )
@@ -289,7 +293,7 @@ def test_a_damaged_message_is_taken_or_refused(
     which: int, changes: list[tuple[float, int]], length: float
 ) -> None:
     """Nothing but a MapweaveError comes of it."""
-    sample, read = SAMPLES[which]
+    sample, read = samples()[which]
     data = bytearray(sample)
     for place, value in changes:
         data[int(place * len(data))] = value
