@@ -6,6 +6,7 @@ import math
 import tracemalloc
 from collections.abc import Callable
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -116,11 +117,17 @@ def test_a_height_that_is_declared_wrongly_is_said_which_way(declared_m: float, 
     assert f"% {truly} than declared" in str(cause)
 
 
+@cache
+def with_long_wheels(seed: int) -> OnlineCalibration:
+    """Wheels that go 4 % less than they are declared to."""
+    run = drive(np.random.default_rng(seed), TRUE, 60.0)
+    return watched(run, replace(TRUE, wheel_scale=1.04), seed)
+
+
 @pytest.mark.parametrize("seed", first_quick([2, 3, 4], 1))
 def test_wheels_and_height_that_contradict_each_other_are_named_and_not_corrected(seed: int) -> None:
     """That the two do not go together is sure; which of them is wrong is not."""
-    run = drive(np.random.default_rng(seed), TRUE, 60.0)
-    online = watched(run, replace(TRUE, wheel_scale=1.04), seed)
+    online = with_long_wheels(seed)
     assert [cause.parameter for cause in online.causes] == [Parameter.WHEEL_SCALE]
     assert online.geometry.wheel_scale == 1.04
 
@@ -128,8 +135,7 @@ def test_wheels_and_height_that_contradict_each_other_are_named_and_not_correcte
 @pytest.mark.parametrize("lengths", [Lengths.RANGERS, Lengths.BOTH])
 def test_wheels_that_proximity_sensors_show_are_named_by_their_own_sigma(lengths: Lengths) -> None:
     """Then it is not the height that may be wrong instead."""
-    online = watched(drive(np.random.default_rng(2), TRUE, 60.0), replace(TRUE, wheel_scale=1.04), 2)
-    estimate = online.estimate
+    estimate = with_long_wheels(2).estimate
     assert estimate is not None
     assert causes(estimate)
     assert not causes(replace(estimate, lengths=lengths))
