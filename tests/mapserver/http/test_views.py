@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import struct
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
@@ -241,6 +242,56 @@ def test_a_photo_is_found_where_it_was_taken(
     assert page.run("const v = mapweave.viewport; return [v.x, v.y]") == pytest.approx([x, y])
     eventually(
         lambda: "photo, " in page.run("return mapweave.painter.labels.texts.map(one => one.text).join()")
+    )
+
+
+def of_phone(image: np.ndarray, path: Path, megapixels: float) -> Path:
+    """A JPEG file as a phone writes it that is held across: lying on its side, which the file says (Exif)."""
+    scale = np.sqrt(megapixels * 1e6 / image.size)
+    large = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+    lying = cv2.rotate(large, cv2.ROTATE_90_COUNTERCLOCKWISE)
+    data = cv2.imencode(".jpg", lying)[1].tobytes()
+    orientation = struct.pack("<HHIHH", 0x0112, 3, 1, 6, 0)
+    tiff = b"II*\0" + struct.pack("<IH", 8, 1) + orientation + bytes(4)
+    segment = b"Exif\0\0" + tiff
+    path.write_bytes(data[:2] + b"\xff\xe1" + struct.pack(">H", len(segment) + 2) + segment + data[2:])
+    return path
+
+
+@pytest.mark.parametrize("megapixels", [0.3, 12.0])
+@pytest.mark.parametrize("give", [choose, drop])
+def test_a_photo_of_a_phone_is_found_upright(
+    page: Browser,
+    photo: Callable[[np.ndarray], Path],
+    give: Callable[[Browser, Path], None],
+    megapixels: float,
+) -> None:
+    """A small one is sent as it is, and a large one made smaller by the page."""
+    taken = Pose2(0.3, 0.2, 0.1)
+    image = PhotoWalls().render(taken)
+    file = of_phone(image, photo(image).with_name("phone.jpg"), megapixels)
+    assert cv2.imread(str(file), cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION).shape[0] > 600
+    give(page, file)
+    eventually(lambda: page.run(ANSWER.format("dataset.certainty")) == "found", 60.0)
+    x, y, heading = page.run("return mapweave.page.photo[0].merged_from_robot.mean")
+    assert (x, y, heading) == pytest.approx((taken.x, taken.y, taken.heading), abs=0.03)
+    eventually(lambda: page.run("return document.getElementById('shown').naturalWidth") > 0)
+    width, height = page.run(
+        "const one = document.getElementById('shown'); return [one.naturalWidth, one.naturalHeight]"
+    )
+    assert width > height, "shown as it was held"
+
+
+def test_a_photo_that_no_browser_here_reads_is_refused_in_one_line(page: Browser, tmp_path: Path) -> None:
+    """Phones of one maker write HEIC, which Chromium does not read."""
+    file = tmp_path / "IMG_0001.heic"
+    file.write_bytes(struct.pack(">I", 24) + b"ftypheic" + bytes(4) + b"mif1heic" + bytes(5000))
+    drop(page, file)
+    line = "IMG_0001.heic is no image that can be read: choose a JPEG or PNG."
+    eventually(lambda: page.run(ANSWER.format("textContent")) == line)
+    assert (
+        page.run("return document.getElementById('shown').hidden")
+        and page.run(ANSWER.format("className")) == "box failed"
     )
 
 
