@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from mapweave.agent.observation import Odometry as Odometry
     from mapweave.agent.observation import RobotDescription as RobotDescription
     from mapweave.agent.recordings.camera_file import read_camera as read_camera
+    from mapweave.file_map import FileMap as FileMap
+    from mapweave.file_map import open as open
     from mapweave.fleet import Fleet as Fleet
     from mapweave.fleet import connect as connect
     from mapweave.fleet_events import FleetEvent as FleetEvent
@@ -52,9 +54,7 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.query import Certainty as Certainty
     from mapweave.hybridmap.query import RelocalizeAnswer as RelocalizeAnswer
     from mapweave.hybridmap.query import View as View
-    from mapweave.map import FileMap as FileMap
     from mapweave.map import Map as Map
-    from mapweave.map import open as open
     from mapweave.mapserver.own_maps import maps_of as maps_of
     from mapweave.mapserver.relocalization.relocalizer import Relocalizer as Relocalizer
     from mapweave.node_table import NodeTable as NodeTable
@@ -72,6 +72,7 @@ else:
         "mapweave.agent.drivers.robot": ("Robot",),
         "mapweave.agent.observation": ("Command", "Observation", "Odometry", "RobotDescription"),
         "mapweave.agent.recordings.camera_file": ("read_camera",),
+        "mapweave.file_map": ("FileMap", "open"),
         "mapweave.fleet": ("Fleet", "connect"),
         "mapweave.fleet_events": ("FleetEvent", "MapChanged"),
         "mapweave.hybridmap.agent_status": ("AgentStatus", "FleetStatus", "RobotEntry"),
@@ -87,7 +88,7 @@ else:
         "mapweave.hybridmap.node": ("Edge", "EdgeKind", "Landmarks", "Node"),
         "mapweave.hybridmap.pose": ("Pose2", "PoseGaussian"),
         "mapweave.hybridmap.query": ("Certainty", "RelocalizeAnswer", "View"),
-        "mapweave.map": ("FileMap", "Map", "open"),
+        "mapweave.map": ("Map",),
         "mapweave.mapserver.own_maps": ("maps_of",),
         "mapweave.mapserver.relocalization.relocalizer": ("Relocalizer",),
         "mapweave.node_table": ("NodeTable",),

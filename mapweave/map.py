@@ -1,4 +1,4 @@
-"""A map to look at and to ask, in one form: from a file (`mapweave.open`) or of a fleet (`mapweave.connect`).
+"""A map to look at and to ask, in one form: from a file (`file_map.py`) or of a fleet (`fleet_map.py`).
 
 import mapweave
 
@@ -10,11 +10,8 @@ office.plot()
 from __future__ import annotations
 
 import os
-import time
-import warnings
 from abc import ABC, abstractmethod
 from collections.abc import Iterable
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
@@ -22,12 +19,10 @@ from typing import TYPE_CHECKING, overload
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.annotation_methods import AnnotationMethods
-from mapweave.constraint_methods import ConstraintMethods
 from mapweave.extras import need
-from mapweave.hybridmap.annotation import Annotation, Annotations
+from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.constraint_subject import Subject, read_end, read_ends
+from mapweave.hybridmap.constraint_subject import read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue, Refused
 from mapweave.hybridmap.explanation import (
     Explanation,
@@ -37,17 +32,13 @@ from mapweave.hybridmap.explanation import (
     RouteExplanation,
     route_over,
 )
-from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
+from mapweave.hybridmap.floor_plan import PlacedPlans
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.manual_constraint import ManualConstraint
-from mapweave.hybridmap.named_nodes import NodeWord, asked_of, ids_of, word_of
+from mapweave.hybridmap.named_nodes import NodeWord, ids_of, word_of
 from mapweave.hybridmap.node import Node
-from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
-from mapweave.login import login
 from mapweave.map_reading import MapReading
-from mapweave.merge.settings import MergeSettings
 from mapweave.node_table import NodeTable
 from mapweave.refusals import check_component, listed, refusals
 from mapweave.storage.map_file import MapFile, write_map_file
@@ -57,7 +48,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
     from mapweave.mapserver.plan_answers import AnswerOnPlan
-    from mapweave.mapserver.routes import Router
 
 Image = NDArray[np.uint8] | str | os.PathLike[str]
 """(H, W) grey, or its file."""
@@ -389,157 +379,6 @@ class Map(ABC):
             InvalidFile: the disk does not take it.
         """
         write_map_file(Path(path), self.content)
-
-
-class FileMap(Map, ConstraintMethods, AnnotationMethods):
-    """A map from a file; it asks no server.
-
-    Corrections (`link`, `unlink`, `retire`, `undo`) merge the map again, in memory: its nodes, components and
-    ways are then those with the correction. What is said about it (`place`, `close_way`, `prefer`, `floor`,
-    `portal`, `plan`, `pin`, `withdraw`) is kept in memory, too. A file has both once the map is saved.
-    """
-
-    def __init__(self, content: MapFile, settings: MergeSettings | None = None, by: str = "") -> None:
-        """Take the content of a map file.
-
-        Args:
-            content: as `read_map_file` and `merge_map_files` give it.
-            settings: with which it was merged.
-            by: who corrects the map, for its record; the login name by default.
-        """
-        self._read = MapReading(content, settings)
-        self._by = by or login()
-        self._images = dict(content.images)
-
-    @property
-    def _reading(self) -> MapReading:
-        return self._read
-
-    def _answer(self, view: View) -> RelocalizeAnswer:
-        router = self._router()
-        from mapweave.mapserver.places import PlaceResolver
-
-        return PlaceResolver(router, router.annotations).named(self._read.relocalizer.answer(view))
-
-    def _explained(self, request: ExplainRequest) -> Explanation:
-        router = self._router()
-        from mapweave.mapserver.explanations import explained
-
-        with refusals():
-            return explained(request, router, self._read.settings.consistency)
-
-    def constraints(self) -> tuple[ManualConstraint, ...]:
-        """What people have linked, unmerged, retired and taken back, in order; the first is number 1."""
-        return tuple(self.content.constraints)
-
-    def constrain(self, about: Subject, holds: bool, because: str = "", *, check: bool = False) -> str:
-        """Set a manual constraint of any kind, or take it back; see `link`. The map is merged again.
-
-        Raises:
-            Refused: the map contradicts it, or it has no effect: the evidence, and what to do.
-            MissingExtra: that needs the extra "server".
-        """
-        before, settings = self._read.merged, self._read.settings
-        from mapweave.offline_constraints import CHECKED, checked_constraint, with_constraint
-        from mapweave.opened_map import MapSource, OpenedMap
-
-        asked = ManualConstraint(about, holds, self._by, time.time_ns(), because)
-        constraint, words = checked_constraint(self.content, before, asked, settings)
-        if check:
-            return CHECKED + words
-        one = OpenedMap("the map", MapSource.FILE, self.content, tuple(before.maps), {})
-        _, content = with_constraint(one, before, constraint, settings)
-        self._read = MapReading(content, settings)
-        return words
-
-    def annotations(self) -> Annotations:
-        """What people say about the map: what the file has, and what was said since it was opened."""
-        return Annotations(self.content.annotations)
-
-    def plan_image(self, sha256: str) -> bytes:
-        """The PNG file of a plan, by the name of its image.
-
-        Raises:
-            Refused: the map does not have it.
-        """
-        if sha256 not in self._images:
-            raise Refused(f"the map does not have the image {sha256[:12]} of a plan: put it first")
-        return self._images[sha256]
-
-    def put_plan_image(self, png: bytes) -> PlanImage:
-        """Keep the image of a plan, a PNG file, for the annotation that names it.
-
-        Raises:
-            InvalidValue: it is no PNG file, or too large.
-        """
-        from mapweave.storage.plan_image import check_plan_png
-
-        image = check_plan_png(png)
-        self._images[image.sha256] = png
-        return image
-
-    def plans(self) -> PlacedPlans:
-        """Floor plans under the map."""
-        return self._read.plans
-
-    def resolve(self, request: ResolveRequest | NodeWord | Iterable[NodeWord]) -> ResolveAnswer:
-        """Nodes for words; see Map."""
-        asked = asked_of(request)
-        router = self._router()
-        from mapweave.mapserver.places import PlaceResolver
-
-        with refusals():
-            return PlaceResolver(router, router.annotations).answer(asked)
-
-    def _check_writable(self, check: bool) -> None:
-        need("server")
-
-    def _say(self, annotation: Annotation, check: bool) -> str:
-        from mapweave.mapserver.annotator import CHECKED
-        from mapweave.offline_annotations import checked_annotation, with_annotation
-
-        words = checked_annotation(self.content, self._read.router, annotation, self.plan_image)
-        if check:
-            return CHECKED + words
-        content = with_annotation(self.content, annotation, self._images)
-        if not isinstance(annotation.body, Pin):
-            self._read = self._read.with_content(content)
-            return words
-        moved = MapReading(content, self._read.settings)
-        if content.poses:
-            moved = moved.with_content(replace(content, poses=dict(moved.merged.poses)))
-        self._read = moved
-        return words
-
-    def _router(self) -> Router:
-        """The router over the ways that are open now."""
-        return self._read.router.at(self.annotations(), time.time_ns())
-
-
-def open(path: str | os.PathLike[str], by: str = "") -> FileMap:
-    """Open a map file, a server's store, also one in PostgreSQL, or an agent's journal. It is never changed.
-
-    Several maps of a store or journal are merged first, and so is a single one that people have corrected. Of
-    a damaged one what can be read is opened, with a warning that says what is lost.
-
-    Args:
-        path: of the file, or the address of the database.
-        by: who corrects the map, for its record; the login name by default.
-
-    Raises:
-        InvalidFile: it cannot be read, is damaged, in use, or none of these.
-        MissingExtra: maps are merged with the extra "server".
-    """
-    # A fleet's map comes over the network: who connects need not wait for what reads stores and journals.
-    from mapweave.opened_map import open_map
-
-    opened = open_map(os.fspath(path))
-    for complaint in opened.complaints.values():
-        warnings.warn(complaint, stacklevel=2)
-    if opened.decided:
-        return FileMap(opened.content, by=by)
-    need("server")
-    return FileMap(opened.file(opened.merged()), by=by)
 
 
 def _is_map(name: str) -> bool:

@@ -1,7 +1,7 @@
 """Annotations of a map without a server: by the shell (`--map`) and from Python the same.
 
-`OfflineAnnotations` has the methods of mapweave.fleet.Fleet, and writes files. `mapweave.map.FileMap` changes
-its map in memory by the same two functions.
+`OfflineAnnotations` has the methods of mapweave.fleet.Fleet, and writes files. `mapweave.file_map.FileMap`
+changes its map in memory by the same two functions.
 """
 
 from __future__ import annotations

@@ -17,6 +17,7 @@ import pytest
 
 from mapweave.cli import main
 from mapweave.exit_status import FAILED, NO, USAGE
+from mapweave.file_map import FileMap
 from mapweave.fleet import Fleet
 from mapweave.hybridmap.errors import InvalidValue, Refused
 from mapweave.hybridmap.floor_plan import PIECE, PlanPiece
@@ -25,7 +26,6 @@ from mapweave.hybridmap.map_event import MapEventKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ResolveRequest
 from mapweave.login import login
-from mapweave.map import FileMap
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.map_files import map_file_of, merged_of
 from mapweave.mapserver.plan_answers import answer_on_plan, goal_on_plan
