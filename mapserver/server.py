@@ -149,8 +149,10 @@ class MapServer:
         # In lock-step nothing may depend on when another process has merged.
         shares = self._store.shared and not isinstance(clock, LockstepSchedule)
         self._worker = MergeWorker(
-            clock, MERGE_SHARE, places, s.merge, findings, self._history, self._cluster.compare,
-            self._metrics.merged, pruning, MergeSharing(self._store, name) if shares else None,
+            clock, MERGE_SHARE, places, s.merge,
+            keeper=findings, history=self._history, compare=self._cluster.compare,
+            observe=self._metrics.merged, pruning=pruning,
+            sharing=MergeSharing(self._store, name) if shares else None,
         )  # fmt: skip
         self._constraints = ConstraintRecord(self._store, self._base)
         self._annotations = AnnotationRecord(self._store, self._base.annotations)
@@ -189,46 +191,51 @@ class MapServer:
         base = self._base
         self._commands = CommandHistory(self._store, clock.time_ns, clock.post)
         self._missions = MissionRelay(
-            self._bus, self._keys, self._store, self._named_places, clock.time_ns, clock.post,
-            self._commands.order, clock.monotonic,
+            self._bus, self._keys, self._store, self._named_places, clock.time_ns,
+            later=clock.post, note=self._commands.order, monotonic=clock.monotonic,
         )  # fmt: skip
         self._roster = Roster(
-            self._bus, self._keys, clock.monotonic, self._hear, self._quotas, lambda: self._ingest.lags()
-        )
+            self._bus, self._keys, clock.monotonic, self._hear, self._quotas,
+            lags=lambda: self._ingest.lags(),
+        )  # fmt: skip
         self._missions.roster = self._roster
         self._attendance = Attendance(
             self._settings.attendance, self._name, self._missions, self._store, self._roster.alive,
             clock.monotonic,
         )  # fmt: skip
         self._ingest = Ingest(
-            self._bus, self._keys, self._store, self._name, worker.take, None,
-            lambda stored: worker.read(base.before(stored)), base.objection, [*base.maps],
-            self._quotas, self._gone, worker.unmerged, worker.note_refusal, worker.note_disbelief,
-            self._metrics.acknowledged, self._roster.status_period_of, self._was_pruned,
+            self._bus, self._keys, self._store, self._name,
+            on_change=worker.take, replay=lambda stored: worker.read(base.before(stored)),
+            objection=base.objection, taken=[*base.maps], quotas=self._quotas, retired=self._gone,
+            unmerged=worker.unmerged, note_refusal=worker.note_refusal, note_disbelief=worker.note_disbelief,
+            observe_ack=self._metrics.acknowledged, status_period=self._roster.status_period_of,
+            pruned=self._was_pruned,
         )  # fmt: skip
         self._roster.remind = self._ingest.remind
         clock.give_way(lambda: self._ingest.busy or self._admission.busy)
         self._plans = PlanService(
-            self._bus, self._keys, self._name, lambda: worker.current().merged,
-            lambda: self._annotations.annotations, self._path, base.images,
-            self._store if self._store.shared else None,
+            self._bus, self._keys, self._name,
+            merged=lambda: worker.current().merged, annotations=lambda: self._annotations.annotations,
+            store=self._path, beside=base.images, shared=self._store if self._store.shared else None,
         )  # fmt: skip
         self._services = Services(
-            self._bus, self._keys, self._name, self._answers, self._admission, self._blockages, self.status,
-            self._events, self._missions, self._roster,
-            clock.executor(RELAYS), clock.monotonic, clock.executor(1), self._named_places, self._plans.files,
-            self._quotas, self._metrics.relocalized,
+            self._bus, self._keys, self._name, self._answers, self._admission, self._blockages,
+            status=self.status, history=self._events, missions=self._missions, roster=self._roster,
+            relays=clock.executor(RELAYS), clock=clock.monotonic, executor=clock.executor(1),
+            places=self._named_places, images=self._plans.files, quotas=self._quotas,
+            observe=self._metrics.relocalized,
         )  # fmt: skip
         self._explainer = Explainer(
             self._bus, self._keys, self._name, self._answers, self._admission, self._constraints,
-            lambda _: self._constrain(), lambda: worker.settled, self._settings.merge,
-            lambda: self._blockages.known(clock.monotonic()),
-            lambda: (*self._events(), *self._commands.events),
-            lambda: self._annotations.annotations,
+            constrain=lambda _: self._constrain(), settled=lambda: worker.settled,
+            settings=self._settings.merge, wary=lambda: self._blockages.known(clock.monotonic()),
+            events=lambda: (*self._events(), *self._commands.events),
+            annotations=lambda: self._annotations.annotations,
         )  # fmt: skip
         self._annotator = Annotator(
-            self._bus, self._keys, self._name, self._named_places, self._annotations, self._plans.check,
-            lambda: self._constraints.constraints, self._apply_annotations, clock.time_ns,
+            self._bus, self._keys, self._name, self._named_places, self._annotations,
+            check=self._plans.check, constraints=lambda: self._constraints.constraints,
+            changed=self._apply_annotations, time_ns=clock.time_ns,
         )  # fmt: skip
         self._views = views = NodeViews(self._bus, self._keys, lambda: worker.current().merged)
         # What people ask, from any thread; see mapserver.http.answering.
@@ -360,13 +367,24 @@ class MapServer:
     def _sources(self) -> Sources:
         worker, ingest = self._worker, self._ingest
         return Sources(
-            self._path, ingest.counters, worker.counters, lambda: worker.answers.merged.counts(),
-            self._quotas.totals, lambda: self._bus.dropped, self._admission.counters, ingest.lags,
-            self._roster.presence, self._quotas.over, self._damaged,
-            lambda: {"ingest": ingest.waiting, **worker.queues()},
-            lambda: bool(ingest.failure), lambda: worker.settled,
-            lambda: self._store.leads, lambda: bool(worker.alone), lambda: worker.unmerged_seconds,
-        )  # fmt: skip
+            store=self._path,
+            ingest=ingest.counters,
+            merger=worker.counters,
+            counts=lambda: worker.answers.merged.counts(),
+            held_back=self._quotas.totals,
+            dropped=lambda: self._bus.dropped,
+            admission=self._admission.counters,
+            lags=ingest.lags,
+            robots=self._roster.presence,
+            over_quota=self._quotas.over,
+            damaged=self._damaged,
+            queues=lambda: {"ingest": ingest.waiting, **worker.queues()},
+            failing=lambda: bool(ingest.failure),
+            settled=lambda: worker.settled,
+            leads=lambda: self._store.leads,
+            merges_itself=lambda: bool(worker.alone),
+            unmerged=lambda: worker.unmerged_seconds,
+        )
 
     def _follow(self, news: News) -> None:
         """Take over what another server has written to the store; in the store's thread."""
