@@ -63,14 +63,17 @@ class Mapper:
         self._description = description
         self._settings = settings
         self._lens = lens or Lens(description.camera, description.distortion)
-        self._pending: tuple[RobotDescription, Lens, Pose2, float] | None = None
+        # What `recalibrate` was told, until the episode ends.
+        self._next_geometry: tuple[RobotDescription, Lens, Pose2, float] | None = None
         self._way_moved: WayCorrection | None = None
-        self._turn_off = 0.0
+        # rad, by which the robot has turned further since the anchor view than the filter says.
+        self._missed_turn = 0.0
         self._sift = Sift(self._lens, settings.sift)
         self._tracking = Tracking(description, self._lens, settings)
         self._keyframes = KeyframeBuilder(map_id, description, settings.landmarks, contents, next_number)
         self._retirement = NodeRetirement(self._keyframes.map, released)
         self._trajectory = TrajectoryRecorder(description)
+        # Many ask for `map_from_robot` in a tick: it is kept, behind the three values of which it was made.
         self._composed = HERE, HERE, 0.0, HERE
         self._anchor: PendingKeyframe | None = None
         self._further: list[PendingKeyframe] = []
@@ -141,9 +144,8 @@ class Mapper:
     @property
     def map_from_robot(self) -> PoseGaussian:
         """Pose in the agent's map."""
-        anchor, moved, turn = self._keyframes.map_from_anchor, self._tracking.pose, self._turn_off
+        anchor, moved, turn = self._keyframes.map_from_anchor, self._tracking.pose, self._missed_turn
         if self._composed[0] is not anchor or self._composed[1] is not moved or self._composed[2] != turn:
-            # Many ask for it in a tick.
             self._composed = anchor, moved, turn, anchor @ _turned_further(moved, turn)
         return self._composed[3]
 
@@ -264,14 +266,21 @@ class Mapper:
             old_from_new: of the robot's frame: the axle is elsewhere, as seen from the camera.
             scale: of the wheels: true over assumed way, since the map was begun or this was last called.
         """
-        self._pending = description, lens, old_from_new, scale
+        self._next_geometry = description, lens, old_from_new, scale
 
     def correct_turn(self, turn: float) -> None:
         """Know that the robot has turned further than the filter says, rad.
 
         `map_from_robot` has it at once, and the next edge; what is relative to the anchor is the filter's.
         """
-        self._turn_off += turn
+        self._missed_turn += turn
+
+    def doubt_lever(self, error: float) -> None:
+        """Know that the camera may stand so far from where it is assumed on the robot, m, for this episode.
+
+        In turns image and wheels are then apart without either being wrong.
+        """
+        self._tracking.doubt_lever(error)
 
     def forget_clock(self) -> None:
         """The clock has jumped: see KeyframeBuilder."""
@@ -298,9 +307,9 @@ class Mapper:
 
         With nodes it is astray and must `resume`; without any it may `begin` again.
         """
-        self._turn_off = 0.0
+        self._missed_turn = 0.0
         self._keyframes.lose(self._tracking.pose)
-        self._take_up_pending()
+        self._take_up_geometry()
         self._tracking = Tracking(self._description, self._lens, self._settings)
         self._anchor, self._further = None, []
         self._extracting = None
@@ -356,8 +365,8 @@ class Mapper:
         tracking, anchor, further = self._tracking, self._anchor, self._further
         tracking.remember(force=True)
         estimate = tracking.estimate
-        moved = _turned_further(tracking.reanchor(), self._turn_off)
-        self._turn_off = 0.0
+        moved = _turned_further(tracking.reanchor(), self._missed_turn)
+        self._missed_turn = 0.0
 
         def take(features: Features) -> None:
             self._anchor = tracking.take(observation, features, HERE)
@@ -376,9 +385,9 @@ class Mapper:
 
         # The tick that waits for the features leaves the landmarks to the next one.
         self._keyframes.place(anchor, further, estimate, self._trajectory, moved, known)
-        if self._pending is not None:
+        if self._next_geometry is not None:
             self._use_extracted()
-        if self._take_up_pending():
+        if self._take_up_geometry():
             # Tracks and features of another lens are of no use to a filter of this one.
             self._tracking = Tracking(self._description, self._lens, self._settings)
             self._tracking.step(observation)
@@ -394,11 +403,12 @@ class Mapper:
             (features, take), self._extracting = self._extracting, None
             take(features.result())
 
-    def _take_up_pending(self) -> bool:
+    def _take_up_geometry(self) -> bool:
         """Change to another geometry, between two episodes; returns whether there was any."""
-        if self._pending is None:
+        if self._next_geometry is None:
             return False
-        (self._description, self._lens, old_from_new, scale), self._pending = self._pending, None
+        self._description, self._lens, old_from_new, scale = self._next_geometry
+        self._next_geometry = None
         self._sift = Sift(self._lens, self._settings.sift)
         way = self._keyframes.recalibrate(self._description, old_from_new, scale)
         self.typical_depth *= scale

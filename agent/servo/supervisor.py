@@ -46,8 +46,6 @@ LAW_BONUS_M = 0.05
 """And besides up to this extra cost, m."""
 HORIZON = 0.15
 """Look-ahead of the last check before a command leaves, s."""
-CRUISE = 1.0
-"""Share of the robot's speed limits that is used."""
 
 
 class Servo:
@@ -66,10 +64,7 @@ class Servo:
             description: camera, footprint and limits.
         """
         self._description = description
-        share = CRUISE
-        self._limits = SpeedLimits(
-            max(description.max_forward, 1e-3) * share, max(description.max_turn, 1e-3) * share
-        )
+        self._limits = SpeedLimits(max(description.max_forward, 1e-3), max(description.max_turn, 1e-3))
         self.start(Pose2(), np.zeros((0, 3)))
 
     def start(self, goal_from_robot: Pose2, points_in_goal: NDArray[Any]) -> bool:
