@@ -73,7 +73,8 @@ export function updateFacts(parent, rows) {
     say(there, String(value));
   });
 }
-// No -0.
+// No -0, nor -0.00.
+export const fixed = (value, digits = 2) => (Math.round(value * 10 ** digits) / 10 ** digits + 0).toFixed(digits);
 export const degrees = rad => `${Math.round(rad * 180 / Math.PI) + 0}\u00b0`;
 export const percent = share => share > 0.9999 ? "over 99.99 %" : `${(100 * share).toFixed(share > 0.99 ? 2 : 0)} %`;
 export const metres = ([x, y, turn]) =>

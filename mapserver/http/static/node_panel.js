@@ -1,5 +1,5 @@
 // One node: GET /nodes/NODE.
-import { add, ask, button, byId, counted, draw, facts, retitled, when } from "./dom.js";
+import { add, ask, button, byId, counted, draw, facts, fixed, retitled, when } from "./dom.js";
 import { onPlans } from "./plans.js";
 import { drawView } from "./views.js";
 
@@ -7,8 +7,8 @@ const box = byId("selected");
 let latest = "";
 
 function pose({ mean, sigma }) {
-  const turn = rad => `${(rad * 180 / Math.PI).toFixed(1)}\u00b0`;
-  return `${mean[0].toFixed(2)}, ${mean[1].toFixed(2)} m, ${turn(mean[2])} ` +
+  const turn = rad => `${fixed(rad * 180 / Math.PI, 1)}\u00b0`;
+  return `${fixed(mean[0])}, ${fixed(mean[1])} m, ${turn(mean[2])} ` +
     `(sigma ${sigma[0].toFixed(3)}, ${sigma[1].toFixed(3)} m, ${turn(sigma[2])})`;
 }
 function picture(parent, node) {

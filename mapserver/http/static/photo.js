@@ -1,5 +1,5 @@
 // Where a photo was taken, or why that is not known: POST /relocalize.
-import { add, ask, button, byId, degrees, side } from "./dom.js";
+import { add, ask, button, byId, degrees, fixed, side } from "./dom.js";
 import { onPlans } from "./plans.js";
 
 const LONGEST = 2048; // px; the server makes photos smaller anyway
@@ -24,8 +24,7 @@ function table(candidates, show) {
   for (const name of ["place", "ahead", "left", "turned", "probability"]) add(head, "th", name);
   for (const c of candidates) {
     const [x, y, turn] = c.node_from_robot.mean, row = made.insertRow();
-    // No -0.00.
-    const away = m => c.distance_known ? (Math.round(100 * m) / 100 + 0).toFixed(2) + " m" : "not known";
+    const away = m => c.distance_known ? `${fixed(m)} m` : "not known";
     const place = add(row, "td");
     button(place, c.node, () => show(c.node));
     const where = [c.place, c.floor && `floor ${c.floor}`].filter(Boolean).join(", ");

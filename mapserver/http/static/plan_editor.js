@@ -1,6 +1,6 @@
 // The form of a floor plan: an image, pairs of places by clicking the plan and the map in turn, and how well they fit.
 // After each pair the server fits the plan and says the residuals; nothing is kept before Save.
-import { add, button, byId, say } from "./dom.js";
+import { add, button, byId, fixed, say } from "./dom.js";
 import { change } from "./changes.js";
 import { colours } from "./colours.js";
 import { draft, planNamed, planNames } from "./plans.js";
@@ -163,7 +163,7 @@ export class PlanEditor {
     if (this.fit?.reason) add(words, "p", this.fit.reason, "warn");
     this.pairs.forEach((pair, k) => {
       const item = add(list, "li"), off = fitted.get(k + 1);
-      const place = pair.x || pair.y ? `${pair.node} ${pair.x.toFixed(2)}, ${pair.y.toFixed(2)} m` : pair.node;
+      const place = pair.x || pair.y ? `${pair.node} ${fixed(pair.x)}, ${fixed(pair.y)} m` : pair.node;
       item.append(`${place} = ${pair.u.toFixed(0)}, ${pair.v.toFixed(0)} px `);
       if (off) add(item, "span", `off by ${off.off.toFixed(2)} m, from the others ${off.off_others.toFixed(2)} m `,
         off.chance * this.pairs.length < 0.01 ? "bad" : "soft");

@@ -1,6 +1,6 @@
 // Floor plans under the map: GET /plans and their images. A map file of before has none.
 import { isDark } from "./colours.js";
-import { ask, byId, degrees, inOrder } from "./dom.js";
+import { ask, byId, degrees, fixed, inOrder } from "./dom.js";
 
 const LARGEST = 16e6; // px; browsers may refuse larger canvases
 const AGAIN = 3000;   // ms, after which an image that has not come is asked for again
@@ -21,7 +21,7 @@ export function onPlans(pose, component) {
     if (!part || !pose) continue;
     const [x, y, turn] = part.plan_from_merged, c = Math.cos(turn), s = Math.sin(turn);
     const heading = Math.atan2(Math.sin(turn + pose[2]), Math.cos(turn + pose[2]));
-    words.push(`${name} ${(x + c * pose[0] - s * pose[1]).toFixed(2)}, ${(y + s * pose[0] + c * pose[1]).toFixed(2)} m, ${degrees(heading)}`);
+    words.push(`${name} ${fixed(x + c * pose[0] - s * pose[1])}, ${fixed(y + s * pose[0] + c * pose[1])} m, ${degrees(heading)}`);
   }
   return words.join("; ");
 }

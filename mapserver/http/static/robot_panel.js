@@ -1,5 +1,5 @@
 // Robots: the list of all, and one with its missions. POST /robots/...
-import { add, ask, button, byId, counted, degrees, listed, made, percent, retitled, say, seconds, updateFacts } from "./dom.js";
+import { add, ask, button, byId, counted, degrees, fixed, listed, made, percent, retitled, say, seconds, updateFacts } from "./dom.js";
 import { goalOf, wordsOf } from "./names.js";
 import { onPlans } from "./plans.js";
 
@@ -107,7 +107,7 @@ export function updateRobot(robots) {
     ["last heard", robot.lost ? "before the map server was gone" : robot.before ? "before the server began" : `${seconds(robot.age)} ago`],
     ["doing", status && `${status.status.doing}${status.status.detail ? ": " + status.status.detail : ""}`],
     ["mission", status && missionWords(status.mission)],
-    ["on the map", pose ? `${pose[0].toFixed(2)}, ${pose[1].toFixed(2)} m, ${degrees(pose[2])}${spread}` : "not known"],
+    ["on the map", pose ? `${fixed(pose[0])}, ${fixed(pose[1])} m, ${degrees(pose[2])}${spread}` : "not known"],
     ["on the plan", onPlans(pose, robot.component)],
     ["place", robot.place],
     ["floor", robot.floor],

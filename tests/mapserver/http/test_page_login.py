@@ -27,6 +27,7 @@ pytestmark = pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PR
 PICTURES = os.environ.get("PAGE_PICTURES")
 """Folder for pictures of what is seen, for people."""
 FORM = "return !document.getElementById('login').hidden"
+TITLE = "return document.querySelector('h1').getBoundingClientRect().width"
 WHO = "return document.getElementById('who').textContent"
 SELECTED = "return document.getElementById('selected').textContent"
 ROBOT = "const robot = document.querySelector('#robots button'); robot?.click(); return Boolean(robot)"
@@ -67,6 +68,11 @@ def test_a_viewer_looks_and_an_operator_commands(
             eventually(lambda: "7 nodes" in page.run(SUMMARY))
             eventually(lambda: page.run(ROBOT))
 
+        # Before the login a phone shows the name, too: its bar was empty.
+        page.look(390, 844, mobile=True)
+        page.open(f"http://127.0.0.1:{web.port}/")
+        eventually(lambda: page.run(FORM))
+        assert page.run(TITLE) > 50.0
         page.look(1100, 700)
         page.open(f"http://127.0.0.1:{web.port}/why?a=r0.1.3&b=r0.1.4")
         eventually(lambda: page.run(FORM))

@@ -86,6 +86,15 @@ def test_what_became_of_a_mission_replaces_what_was_said_when_it_was_given(
     assert person.page.run(SENT.format("className")) == "bad"
 
 
+def test_a_robot_at_the_beginning_of_its_map_is_at_zero(person: Person, services: DrivenServices) -> None:
+    """It was at -0.00 m there."""
+    services.fleet = robot_at(-0.006, 0.004)
+    select(person)
+    eventually(lambda: "on the map-0.01, 0.00 m" in person.text("selected"))
+    services.fleet = robot_at(-0.003, -0.004)
+    eventually(lambda: "on the map0.00, 0.00 m, 17\u00b0" in person.text("selected"))
+
+
 GOALS = """
 const c = mapweave.painter.canvas, m = mapweave.model, v = mapweave.viewport, ratio = mapweave.painter.ratio;
 const red = ([x, y]) => {
