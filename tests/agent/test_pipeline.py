@@ -1,4 +1,4 @@
-"""The whole mind on photographs hung on walls: pure, never surprised, and always safe."""
+"""The whole pipeline on photographs hung on walls: the same again, without any of its inputs, and safe."""
 
 from __future__ import annotations
 

@@ -105,9 +105,9 @@ def carried(description: RobotDescription, seen: list[Observation]) -> dict[int,
 
 
 def on_a_curve(walls: PhotoWalls) -> list[Observation]:
-    """Six metres, with noise of wheels."""
+    """As long as the walls are in view, with noise of wheels."""
     rng, pose, seen = np.random.default_rng(1), Pose2(), list[Observation]()
-    for k in range(140):
+    for k in range(90):
         turn = 0.05 * math.sin(0.1 * k)
         step = Odometry(0.03, turn).motion()
         pose = pose @ step
@@ -130,7 +130,7 @@ def test_a_lossless_recording_is_replayed_to_the_very_same_map(walls: PhotoWalls
     described = replay.describe()
     assert (described.axle, described.wheel_noise, described.side_slip) == (0.35, 0.06, 0.01)
     made, replayed = carried(robot, seen), carried(described, list(iter(replay.sense, None)))
-    assert len(made) >= 3 and replayed.keys() == made.keys()
+    assert len(made) >= 6 and replayed.keys() == made.keys()
     for stamp, pose in made.items():
         assert replayed[stamp].vector == pytest.approx(pose.vector, abs=1e-6)
 

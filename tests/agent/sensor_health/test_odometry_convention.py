@@ -69,7 +69,8 @@ def test_a_wrong_unit_or_sign_is_named_and_a_wrong_scale_is_not(
 )
 def test_an_image_that_is_mirrored_or_upside_down_turns_the_other_way(walls, turned, words: str) -> None:
     seen = [replace(one, image=np.ascontiguousarray(turned(one.image))) for one in drive(walls, 1.0)]
-    assert words in complaint(seen) and bool(complaint(seen)) is bool(words)
+    line = complaint(seen)
+    assert words in line and bool(line) is bool(words)
 
 
 def test_images_that_lack_and_a_robot_that_does_not_turn_say_nothing_wrong(walls: PhotoWalls) -> None:
