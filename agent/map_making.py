@@ -269,6 +269,7 @@ class MapMaking:
         calibration = self.calibration
         calibration.watch(image, *self.mapper.tracks, self.mapper.turned)
         self.mapper.correct_turn(calibration.take_turn())
+        self.mapper.doubt_lever(calibration.lever_error)
         if calibration.pending is not None:
             self.mapper.recalibrate(*calibration.pending)
 

@@ -7,6 +7,7 @@ drive shows and contradicts the geometry in use is said once, in one line, and u
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 
 import numpy as np
@@ -156,6 +157,20 @@ class OnlineCalibration:
     def estimate(self) -> Estimate | None:
         """The last solution."""
         return self._last
+
+    @property
+    def lever_error(self) -> float:
+        """How far the camera stands from where it is assumed on the robot, m, as far as images show it.
+
+        Two estimates are apart by their errors: of the squared distance to the last solution its variance is
+        taken off. What is left is in use until the difference is sure enough to be corrected.
+        """
+        last = self._last
+        if last is None:
+            return 0.0
+        lever = [P.FORWARD, P.LEFT]
+        squares = (last.vector - self._geometry.vector)[lever] ** 2 - np.diag(last.covariance)[lever]
+        return math.sqrt(np.maximum(squares, 0.0).sum())
 
     def correct(self, observation: Observation) -> Observation:
         """Count what the wheels report, and correct it by the geometry in use. Once a tick, first of all."""

@@ -3,7 +3,8 @@
 The image corrects a wheel that slips a little. But when the two contradict each other strongly, it is unknown
 which is true: a wheel may spin or an encoder be dead, or a person may carry a box through the view, which
 then seems to be fixed while the room turns. One image may mislead the filter, over a bump of the road, and
-the next ones correct it: the contradiction must last.
+the next ones correct it: the contradiction must last. And a camera that stands elsewhere on the robot than is
+assumed moves otherwise in turns: that is no dispute while calibration is about to find it out.
 """
 
 from __future__ import annotations
@@ -26,10 +27,12 @@ class OdometryConsistency:
 
     Attributes:
         contradicting: how many images in a row have contradicted the wheels.
+        lever_error: how far from where it is assumed the camera may stand on the robot, m.
     """
 
     def __init__(self) -> None:
         """The two agree."""
+        self.lever_error = 0.0
         self.settle()
 
     def settle(self) -> None:
@@ -53,5 +56,6 @@ class OdometryConsistency:
         """Hold the filter's pose after an image against the wheels': may they be so far apart?"""
         turned = abs(wrap_angle(anchor_from_robot.heading - self._reckoned.heading))
         distance = math.hypot(anchor_from_robot.x - self._reckoned.x, anchor_from_robot.y - self._reckoned.y)
-        apart = distance > APART[0] + SHARE * self._way or turned > APART[1] + SHARE * self._turned
+        may_be = APART[0] + SHARE * self._way + self.lever_error * self._turned
+        apart = distance > may_be or turned > APART[1] + SHARE * self._turned
         self.contradicting = self.contradicting + 1 if apart else 0

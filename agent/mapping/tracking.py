@@ -201,6 +201,10 @@ class Tracking:
         converged = self._filter.converged()
         return float(converged.mean()) if len(converged) else 0.0
 
+    def doubt_lever(self, error: float) -> None:
+        """Know that the camera may stand so far from where it is assumed on the robot, m."""
+        self._dispute.lever_error = error
+
     def landmarks(self) -> LandmarkEstimates:
         """The filter's landmarks, in robot."""
         return self._filter.landmarks()

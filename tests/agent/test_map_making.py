@@ -1,11 +1,17 @@
 """Who maps when, and what the floor sees of it."""
 
+from dataclasses import replace
+
+import pytest
+
 from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.map_making import MapMaking
 from mapweave.agent.mapping.mapper import Mapper
+from mapweave.agent.observation import Odometry
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.pose import Pose2
 
 
 def test_the_floor_sees_a_node_that_is_put_again_once(walls, description, monkeypatch) -> None:
@@ -18,3 +24,20 @@ def test_the_floor_sees_a_node_that_is_put_again_once(walls, description, monkey
         made.mapper.drove(None, node)
         assert made.take_changes() == (NodePut(node),)
     assert seen == [node.id.number]
+
+
+@pytest.mark.parametrize(("lever_error", "losses"), [(0.0, 1), (10.0, 0)])
+def test_wheels_that_images_contradict_in_a_turn_lose_no_pose_while_the_camera_may_stand_elsewhere(
+    lever_error: float, losses: int, walls, description, monkeypatch
+) -> None:
+    """As far as it may stand elsewhere by the calibration; whether it does is not its business here."""
+    monkeypatch.setattr(OnlineCalibration, "lever_error", lever_error)
+    made = MapMaking(MapId("r0", 1), OnlineCalibration(description), AgentSettings())
+    true = Pose2()
+    for tick in range(60):
+        step = Odometry(0.02, 0.012)
+        # Once depths are known, the wheels spin.
+        seen = walls.observe(true, true := true @ step.motion(), tick + 1)
+        seen = replace(seen, odometry=Odometry(0.02 if tick < 25 else 0.08, 0.012))
+        made.step(made.calibration.correct(seen), (), alone=False, blind=False, held=False)
+    assert made.losses == losses

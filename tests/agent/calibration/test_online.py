@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import tracemalloc
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import cache
 
@@ -14,7 +14,7 @@ import pytest
 from mapweave.agent.calibration.estimate import Lengths
 from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.online import NAMED_ONLY, OnlineCalibration, _common
-from mapweave.agent.calibration.report import causes
+from mapweave.agent.calibration.report import Cause, causes
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from tests.agent.calibration.room_drive import CAMERA, SIDE, RoomDrive, camera_poses, drive
@@ -106,6 +106,29 @@ def test_a_wrong_geometry_is_named_and_mended(parameter: Parameter, amount: floa
     assert left < 0.3 * abs(amount) or not used
     kept = [p for p in NAMED_ONLY if p is not parameter]
     assert np.allclose(online.geometry.vector[kept], TRUE.vector[kept])
+
+
+@pytest.mark.parametrize("wrong_m", [0.0, 0.3])
+def test_how_far_the_camera_stands_elsewhere_is_known_before_it_is_corrected(wrong_m: float) -> None:
+    """And no further off than that once it is corrected, nor with the right geometry."""
+    declared = replace(TRUE, forward=TRUE.forward + wrong_m)
+    camera = replace(CAMERA, mount_forward=declared.forward, mount_height=declared.height)
+    doubts: dict[bool, list[float]] = {False: [], True: []}
+
+    class Noted(OnlineCalibration):
+        def watch(self, *arguments: object, **named: object) -> Sequence[Cause]:
+            found = super().watch(*arguments, **named)  # type: ignore[arg-type]
+            doubts[abs(self.geometry.forward - TRUE.forward) < 0.1].append(self.lever_error)
+            return found
+
+    watched(
+        drive(np.random.default_rng(3), TRUE, 40.0),
+        declared,
+        3,
+        online=Noted(RobotDescription(camera, geometry=declared)),
+    )
+    assert not wrong_m or max(doubts[False]) == pytest.approx(wrong_m, abs=0.1), "before it is in use"
+    assert max(doubts[True][-20:]) < 0.05
 
 
 @pytest.mark.parametrize(("declared_m", "truly"), first_quick([(0.28, "higher"), (0.32, "lower")], 1))

@@ -75,3 +75,15 @@ def test_one_image_that_misleads_the_filter_is_no_dispute():
     dispute.compare(true @ Pose2(0.8))
     assert dispute.contradicting == 0
     assert not dispute.disputed
+
+
+def test_a_camera_that_stands_elsewhere_on_the_robot_is_no_dispute_in_turns():
+    """The camera stands 1 m further ahead than is assumed: the robot seems to go where the camera goes."""
+    lever = Pose2(1.0)
+    for lever_error, contradict in ((0.0, True), (1.0, False)):
+        dispute, true = drive([Odometry(0.3, 0.05)] * 10, lambda m: m)
+        dispute.lever_error = lever_error
+        assert disputed(dispute, lever.inverse() @ true @ lever) == contradict
+    dispute, true = drive([Odometry(0.3, 0.0)] * 10, lambda m: Odometry(0.5 * m.forward, 0.0))
+    dispute.lever_error = 1.0
+    assert disputed(dispute, true), "straight ahead it explains nothing"
