@@ -9,13 +9,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapweave.agent.mission import Carried
 from mapweave.agent.observation import Observation, Odometry
-from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.sensor_health.odometry_convention import OdometryConvention
-from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
-from tests.agent.conftest import CAMERA, DESCRIPTION, PhotoWalls
+from tests.agent.conftest import CAMERA, PhotoWalls
 
 REVERSED, DEGREES = "the other way", "in degrees"
 
@@ -101,16 +98,6 @@ def test_ways_with_the_wrong_sign_are_named(walls: PhotoWalls, direction: float,
     ]
     line = complaint(played)
     assert ("positive forward" in line) is (sign < 0.0) and REVERSED not in line
-
-
-@pytest.mark.parametrize(("times", "word"), [(1.0, ""), (-1.0, REVERSED), (math.degrees(1.0), DEGREES)])
-def test_a_robot_says_it_once(walls: PhotoWalls, times: float, word: str) -> None:
-    pipeline = Pipeline(MapId("r0", 1), DESCRIPTION)
-    pipeline.set_mission(Carried())
-    for one in drive(walls, times):
-        pipeline.step(one)
-    lines = pipeline.complaints
-    assert (len(lines) == 1 and word in lines[0]) if word else not lines
 
 
 def sideways(image: NDArray[np.uint8], times: int) -> NDArray[np.uint8]:
