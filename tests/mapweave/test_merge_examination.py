@@ -33,20 +33,30 @@ from mapweave.storage.map_file import read_map_file
 CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
 
 
-def poses() -> list[Pose2]:
+def poses(count: int) -> list[Pose2]:
     """Ahead through the corridor of an office, weaving a little, 3 cm an image."""
-    return [Pose2(0.7 + 0.03 * k, 0.1 * np.sin(0.05 * k), 0.15 * np.cos(0.05 * k)) for k in range(150)]
+    return [Pose2(0.7 + 0.03 * k, 0.1 * np.sin(0.05 * k), 0.15 * np.cos(0.05 * k)) for k in range(count)]
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A walk that is long enough for two robots' maps."""
+    return recorded(tmp_path_factory.mktemp("recordings") / "office walk", 150)
+
+
+@pytest.fixture(scope="module")
+def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The beginning of it."""
+    return recorded(tmp_path_factory.mktemp("recordings") / "office walk", 75)
+
+
+def recorded(folder: Path, count: int) -> Path:
     """Images by the simulator's renderer, odometry that is 1 % too long, truth, two robots in splits.toml."""
-    folder = tmp_path_factory.mktemp("recordings") / "office walk"
     (folder / "images").mkdir(parents=True)
     world = make_world("office", 5)
     corridor = next(room for room in world.plan.rooms if "corridor" in room.name)
     middle = Pose2(float(corridor.corners[:, 0].min()), float(corridor.corners[:, 1].mean()), 0.0)
-    way = [middle @ pose for pose in poses()]
+    way = [middle @ pose for pose in poses(count)]
     renderer, scene = Renderer(WEBCAM, world.background), Scene([PanelSet.of(world.panels)])
     rng = np.random.default_rng(1)
     before = way[0]
@@ -66,7 +76,8 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
     (folder / "times.txt").write_text("".join(f"{0.1 * k:.3f}\n" for k in range(len(way))))
     (folder / "camera.toml").write_text(CAMERA_TOML)
     (folder / "splits.toml").write_text(
-        '[[robot]]\nname = "One"\nfirst = 0\nlast = 99\n[[robot]]\nname = "two"\nfirst = 50\nlast = 149\n'
+        f'[[robot]]\nname = "One"\nfirst = 0\nlast = {2 * count // 3 - 1}\n'
+        f'[[robot]]\nname = "two"\nfirst = {count // 3}\nlast = {count - 1}\n'
     )
     return folder
 
@@ -167,7 +178,7 @@ def test_pieces_overlap_and_no_image_is_in_two(robots: int) -> None:
     ],
 )  # fmt: skip
 def test_an_unusable_recording_is_reported_in_one_line(
-    recording: Path,
+    short: Path,
     tmp_path: Path,
     capsys: pytest.CaptureFixture[str],
     break_it,
@@ -175,7 +186,7 @@ def test_an_unusable_recording_is_reported_in_one_line(
     words: str,
 ) -> None:
     folder = tmp_path / "broken"
-    shutil.copytree(recording, folder)
+    shutil.copytree(short, folder)
     break_it(folder)
     assert main(["eval", "merge", str(folder), "--out", str(tmp_path / "out"), *more]) == 1
     output = [line for line in capsys.readouterr().err.splitlines() if line.startswith("mapweave: ")]
@@ -184,9 +195,9 @@ def test_an_unusable_recording_is_reported_in_one_line(
 
 
 def test_an_image_that_cannot_be_read_is_named(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = Path(shutil.copytree(recording, tmp_path / "spoilt"))
+    folder = Path(shutil.copytree(short, tmp_path / "spoilt"))
     image = sorted((folder / "images").iterdir())[3]
     image.write_bytes(image.read_bytes()[:200])
     assert main(["eval", "merge", str(folder), "--out", str(tmp_path / "out"), "--json"]) == 0
