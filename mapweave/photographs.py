@@ -91,25 +91,29 @@ def map_of_photographs(
     for k, image in enumerate(images, 1):
         features.append(sift.extract(read_grey(image, camera)))
         progress(k, len(images))
-    stretch = stretch_of([extracted.view(camera) for extracted in features], spacing)
+    views, names = [extracted.view(camera) for extracted in features], [image.name for image in images]
+    stretch = stretch_of(views, spacing, names=names)
     for image, landmarks in zip(images, stretch.landmarks, strict=True):
         if len(landmarks) < LEAST_LANDMARKS:
             raise InvalidValue(f"{image}: only {len(landmarks)} points of it are in its neighbours too")
     return changes_of(stretch, range(len(images)), camera, map_id)
 
 
-def stretch_of(views: Sequence[View], spacing: float, step_share: float = STEP_SHARE) -> Stretch:
+def stretch_of(
+    views: Sequence[View], spacing: float, step_share: float = STEP_SHARE, names: Sequence[str] = ()
+) -> Stretch:
     """Where photographs were taken, and what they show.
 
     Args:
         views: of one camera, in the order in which they were taken.
         spacing: how far apart, on average, m.
         step_share: by how much one step differs from that, as a share of it.
+        names: of the photographs, for errors; their numbers by default.
 
     Raises:
         InvalidValue: they are not one stretch.
     """
-    structure, camera = reconstruct(views, spacing, step_share), views[0].camera
+    structure, camera = reconstruct(views, spacing, step_share, names), views[0].camera
     levels = [_level(structure, k) for k in range(len(views))]
     seen = [_landmarks(structure, k, levels[k], camera, view.codes) for k, view in enumerate(views)]
     both = [(structure.features[[k, k + 1]] >= 0).all(axis=0) for k in range(len(views) - 1)]

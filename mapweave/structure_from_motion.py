@@ -82,13 +82,16 @@ class Structure:
         return np.isfinite(self.centres[:, 0])
 
 
-def reconstruct(views: Sequence[View], spacing: float, step_share: float = STEP_SHARE) -> Structure:
+def reconstruct(
+    views: Sequence[View], spacing: float, step_share: float = STEP_SHARE, names: Sequence[str] = ()
+) -> Structure:
     """Find where photographs were taken: from the pair that fixes most points on, one photograph at a time.
 
     Args:
         views: of one camera, in the order in which they were taken.
         spacing: how far apart, on average, m: the scale, which photographs do not have.
         step_share: standard deviation of one step, as a share of it.
+        names: of the photographs, for errors; their numbers by default.
 
     Returns:
         All cameras, and the points that are determined.
@@ -102,10 +105,12 @@ def reconstruct(views: Sequence[View], spacing: float, step_share: float = STEP_
     for i, j in itertools.combinations(range(len(views)), 2):
         if j - i <= OVERLAP and (related := _relate(views[i], views[j])) is not None:
             relations[i, j] = related
+    called = names or [str(k) for k in range(1, len(views) + 1)]
     apart = next((i for i in range(len(views) - 1) if (i, i + 1) not in relations), None)
     if apart is not None:
         raise InvalidValue(
-            f"photographs {apart + 1} and {apart + 2} do not show the same things: take one in between"
+            f"photographs {called[apart]} and {called[apart + 1]} do not show the same things: take one in "
+            "between"
         )
     features = _tracks(views, {pair: related.pairs for pair, related in relations.items()})
     starts = [_start(views, features, pair, related, spacing) for pair, related in relations.items()]
@@ -115,7 +120,8 @@ def reconstruct(views: Sequence[View], spacing: float, step_share: float = STEP_
     whole = [_grown(views, start, relations, (spacing, step_share)) for start in starts[:BEGINNINGS]]
     best = max(whole, key=lambda structure: int((_misses(views, structure) < GATE_PX).sum()))
     if not best.placed.all():
-        raise InvalidValue(f"photograph {int(np.argmin(best.placed)) + 1} cannot be placed by what it shows")
+        lost = called[int(np.argmin(best.placed))]
+        raise InvalidValue(f"photograph {lost} cannot be placed by what it shows")
     determined = np.isfinite(best.points[:, 0])
     return replace(best, points=best.points[determined], features=best.features[:, determined])
 
