@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -25,24 +26,41 @@ from benchmarks.rules.switches import (
     switched_off,
 )
 from mapweave.agent.observation import RobotDescription
-from mapweave.hybridmap.change import EdgePut, NodePut
+from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.node_comparisons import compare
+from mapweave.merge.pose_graph.verdicts import Verdict
 from synthetic.wrong_geometry import SCENES, OdometryFault, draw_fleet
+
+
+@cache
+def logs() -> list[tuple[MapId, ChangeBody]]:
+    """Robots with one clock and a size: each may have been where another one was."""
+    fleet = draw_fleet(11, SCENES["room"], OdometryFault.NONE, stops=1, views=4)
+    bodies = {
+        map_id: [*(NodePut(replace(node, clock="utc", radius=0.16)) for node in nodes), *map(EdgePut, edges)]
+        for map_id, (nodes, edges) in fleet.maps.items()
+    }
+    return [(map_id, body) for map_id, some in bodies.items() for body in some]
+
+
+@cache
+def compared_once(a: NodeId, b: NodeId) -> Verdict:
+    nodes = {body.node.id: body.node for _, body in logs() if isinstance(body, NodePut)}
+    return next(iter(compare([(nodes[a], nodes[b])])))
 
 
 @pytest.mark.parametrize("rule", [*TRIAL_RULES, *PLACE_RULES])
 def test_fleets_are_merged_and_answered_without_a_rule(rule: str, caplog: pytest.LogCaptureFixture) -> None:
-    fleet = draw_fleet(11, SCENES["room"], OdometryFault.NONE, stops=1, views=4)
+    """None of these rules is on how nodes are compared, so each pair of them is compared once."""
     switches: tuple[Switch, ...] = {**TRIAL_RULES, **PLACE_RULES}[rule]
-    merger = Merger()
-    for map_id, (nodes, edges) in fleet.maps.items():
-        # Robots with one clock and a size: each may have been where another one was.
-        stamped = [NodePut(replace(node, clock="utc", radius=0.16)) for node in nodes]
-        merger.read([(map_id, body) for body in (*stamped, *map(EdgePut, edges))])
+    merger = Merger(compare=lambda pairs: [compared_once(a.id, b.id) for a, b in pairs])
+    merger.read(logs())
     with switched_off(switches):
         merged = merger.merged()
         assert merged.links
