@@ -10,6 +10,7 @@ from mapweave.hybridmap.query import ExplainRequest
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.map_explanation import explain_fleet, explain_maps
+from mapweave.merge.explanation.map_lengths import length_words
 from mapweave.merge.explanation.node_explanation import explain_nodes
 from mapweave.merge.settings import ConsistencySettings
 
@@ -33,7 +34,8 @@ def explained(
     """
     merged = router.merged
     if request.ends is None:
-        accusations = tuple(merged.accusations().values())[:MAX_MAPS_LISTED]
+        lengths = length_words(merged, consistency).values()
+        accusations = (*merged.accusations().values(), *lengths)[:MAX_MAPS_LISTED]
         return FleetExplanation(explain_fleet(merged, MAX_MAPS_LISTED), accusations)
     first, second = request.ends
     if isinstance(first, NodeId) and isinstance(second, NodeId):

@@ -20,6 +20,7 @@ from mapweave.merge.outlier_rejection.link_probability import link_probabilities
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.links import Link, RefusedLink, link_of
+from mapweave.merge.pose_graph.map_scales import corrected_again
 from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.pose_graph.pinned_frames import PinnedFrames
 from mapweave.merge.settings import MergeSettings
@@ -79,16 +80,17 @@ def merged_of(content: MapFile, settings: MergeSettings | None = None) -> Merged
     nodes = {node: content.constraints[number] for node, number in content.retired.items()}
     maps, constraints = maps_of(content), ManualConstraints(content.constraints, nodes)
     links = tuple(_links(change.edge for change in content.changes if isinstance(change, EdgePut)))
+    refused = tuple(_refused(pair) for pair in content.refused)
     try:
-        parts = fragments_of(apply_constraints(maps, (), constraints).maps, s.consistency)
-        solved = ComponentSolver(parts).solve(links)
+        also = (refusal.link for refusal in refused if refusal.link is not None)
+        corrected = corrected_again(apply_constraints(maps, (), constraints).maps, links, also)
+        solved = ComponentSolver(fragments_of(corrected[0], s.consistency)).solve(corrected[1])
     except (np.linalg.LinAlgError, RuntimeError, InvalidValue) as error:
         # The solver raises RuntimeError if a system is singular.
         reason = str(error).splitlines()[0] if str(error) else type(error).__name__
         raise InvalidFile(f"the poses of this map cannot be solved ({reason})") from None
     # Covariances are solved for where they are asked for: of a large map, all take minutes.
     poses = NodePoses(solved)
-    refused = tuple(_refused(pair) for pair in content.refused)
     components = tuple(frozenset(graph.nodes) for graph in solved)
     superseded = {node: fate for node, fate in content.superseded.items() if node in poses}
     faded = {node: mask for node, mask in content.faded.items() if node in poses}

@@ -9,13 +9,16 @@
    refuted, and the merge continues at 2 with the rest.
 6. Drives of a robot among others' nodes are checked against the result.
 
+Where links show that all lengths of a map are too long by one factor, that is undone before 2 (see
+mapweave.merge.pose_graph.map_scales); maps and links are passed on as they were measured.
+
 Links by hand join pieces before all others, and never fall. What contradicts them is reported.
 """
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence, Set
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
@@ -26,10 +29,13 @@ from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.distinctness import weigh
 from mapweave.merge.outlier_rejection.driven_edges import refuse_drives
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup
+from mapweave.merge.outlier_rejection.nearby_views import NearbyViews
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment
-from mapweave.merge.pose_graph.links import Link, RefusedLink
+from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse_edge
+from mapweave.merge.pose_graph.map_scales import MapScales
+from mapweave.merge.pose_graph.marginalization import is_marginal
 from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.pose_graph.solved_graph import PoseGraph
 from mapweave.merge.settings import MergeSettings
@@ -42,11 +48,17 @@ class MergeCache:
 
     Attributes:
         decisions: fragments of maps, and links between them, sorted.
+        corrected: fragments of maps without factors of their lengths.
+        scales: factors of lengths.
         trajectories: of the robots.
+        nearby_views: compared pairs of them.
     """
 
     decisions: DecisionCache = field(default_factory=DecisionCache)
+    corrected: DecisionCache = field(default_factory=DecisionCache)
+    scales: MapScales = field(default_factory=MapScales)
     trajectories: TrajectoryCache = field(default_factory=TrajectoryCache)
+    nearby_views: NearbyViews = field(default_factory=NearbyViews)
 
 
 def merge_maps(
@@ -94,7 +106,9 @@ def decide(
         The merged map, and the standing decisions.
     """
     s = settings
-    fragments = cache.decisions.fragments(maps, s.consistency)
+    links, certain = list(links), list(certain)
+    as_measured = maps, {link.pair: link for link in (*links, *certain)}
+    maps, fragments, links, certain = _corrected(maps, links, certain, s, cache, exact=before is None)
     solver = ComponentSolver(fragments)
     by_node = solver.by_node
     by_hand = {link.pair: link for link in certain if link.a in by_node and link.b in by_node}
@@ -122,7 +136,7 @@ def decide(
     groups = cache.decisions.groups(open_, by_node, s.consistency, refutation.verdict, exact=before is None)
     # Each round refutes a link at least, so there is a last one.
     while True:
-        solved, kept, unjoined = _joined(solver, groups, held, closed, s, whole=before is None)
+        solved, kept, unjoined = _joined(solver, groups, held, closed, s, cache.nearby_views, maps, whole=before is None)
         changed = None if before is None else solver.changed
         impossible, against_hand = refutation.impossible(solved, kept, changed, by_hand)
         contradicted |= against_hand
@@ -141,9 +155,13 @@ def decide(
     refusals += [r for fragment in fragments for r in fragment.refused]
     refusals += refuse_drives(maps, solved, s.consistency)
     merged = MergedMap(
-        dict(sorted(maps.items())),
-        tuple(sorted((link.canonical() for link in kept), key=lambda link: link.pair)),
-        tuple(sorted(refusals, key=lambda r: r.pair)),
+        dict(sorted(as_measured[0].items())),
+        tuple(
+            sorted(
+                (_as_measured(link, *as_measured).canonical() for link in kept), key=lambda link: link.pair
+            )
+        ),
+        tuple(sorted((_refused_as_measured(r, *as_measured) for r in refusals), key=lambda r: r.pair)),
         tuple(frozenset(graph.nodes) for graph in solved),
         NodePoses(solved),
         tuple(solved),
@@ -163,16 +181,75 @@ def decide(
     )
 
 
+def _corrected(
+    maps: Mapping[MapId, HybridMap],
+    links: Sequence[Link],
+    certain: Sequence[Link],
+    s: MergeSettings,
+    cache: MergeCache,
+    exact: bool,
+) -> tuple[Mapping[MapId, HybridMap], list[Fragment], list[Link], list[Link]]:
+    """Maps, their pieces, and links without the factors by which maps' lengths are too long.
+
+    What a person says has no factor. Nor have marginal links: they were made of corrected maps.
+    """
+    pieces = cache.decisions.fragments(maps, s.consistency)
+    scales = cache.scales.of(maps, pieces, links, exact)
+    logs = {which: scale.undone for which, scale in scales.items() if scale.undone}
+    changed = cache.scales.corrected_maps(maps, logs)
+    if not logs:
+        return maps, pieces, [*links], [*certain]
+    pieces = [piece for piece in pieces if piece.name.map not in logs]
+    pieces += cache.corrected.fragments(changed, s.consistency)
+
+    def corrected(link: Link) -> Link:
+        ends = logs.get(link.a.map, 0.0), logs.get(link.b.map, 0.0)
+        there = all(end.map in maps and end in maps[end.map].nodes for end in link.pair)
+        return cache.scales.corrected_link(link, maps, ends) if any(ends) and there else link
+
+    return (
+        {**maps, **changed},
+        sorted(pieces, key=lambda piece: piece.name),
+        [corrected(link) for link in links],
+        [link if is_marginal(link) or not len(link.shared) else corrected(link) for link in certain],
+    )
+
+
+def _as_measured(link: Link, maps: Mapping[MapId, HybridMap], links: Mapping[Pair, Link]) -> Link:
+    """A link as it was verified, weighed as it is."""
+    verified = links.get(link.pair)
+    if verified is None or verified.a_from_b is link.a_from_b:
+        return link
+    return verified if verified.evidence == link.evidence else replace(verified, evidence=link.evidence)
+
+
+def _refused_as_measured(
+    refusal: RefusedLink, maps: Mapping[MapId, HybridMap], links: Mapping[Pair, Link]
+) -> RefusedLink:
+    """A refusal of the link, or of the edge, as it was measured."""
+    if refusal.link is None:
+        return refusal
+    if refusal.edge is not None:
+        edge = maps[refusal.edge.map].edges[refusal.edge]
+        return (
+            refusal if edge.a_from_b.mean == refusal.link.a_from_b.mean else refuse_edge(edge, refusal.reason)
+        )
+    link = _as_measured(refusal.link, maps, links)
+    return refusal if link is refusal.link else replace(refusal, link=link)
+
+
 def _joined(
     solver: ComponentSolver,
     groups: Mapping[Pair, LinkGroup],
     held: Sequence[Link],
     closed: Set[Pair],
     s: MergeSettings,
+    nearby_views: NearbyViews,
+    maps: Mapping[MapId, HybridMap],
     whole: bool,
 ) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
     """Join and optimise: the components, the links that are kept, and those that are not."""
-    kept, unjoined = agglomerate(solver, groups, s.consistency, held, closed)
+    kept, unjoined = agglomerate(solver, groups, s.consistency, held, closed, nearby_views, maps)
     return solver.solve(kept, whole=whole), kept, unjoined
 
 

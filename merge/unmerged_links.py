@@ -9,6 +9,7 @@ from mapweave.merge.manual_constraints import apply_constraints, link_by_hand
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import fragment_by_node
+from mapweave.merge.pose_graph.map_scales import corrected_again
 from mapweave.merge.pose_graph.merged_map import MergedMap, NodePoses
 from mapweave.merge.settings import ConsistencySettings
 
@@ -37,20 +38,24 @@ def with_unmerged_links(
     inside = {which for graph in graphs for which in graph.maps}
     inside |= {which for linked in lacking for which in linked.maps if which in merged.copies}
     maps = {which: whole[which] for which in sorted(inside)}
+    links = {link.pair: link for link in merged.links if any(link.a in graph.rows for graph in graphs)}
+    in_force = apply_constraints(maps, (), merged.constraints).maps
+    corrected, measured = corrected_again(in_force, [*links.values()])
     fragments = [
         fragment
-        for fragment in fragments_of(apply_constraints(maps, (), merged.constraints).maps, settings)
+        for fragment in fragments_of(corrected, settings)
         if fragment.name.map in merged.copies or any(fragment.name in graph.rows for graph in graphs)
     ]
     by_node = fragment_by_node(fragments)
-    links = {link.pair: link for link in merged.links if any(link.a in graph.rows for graph in graphs)}
-    links |= {
+    by_hand = {
         (linked.a, linked.b): link_by_hand(linked)
         for linked in lacking
         if linked.a in by_node and linked.b in by_node
     }
+    links |= by_hand
     rest = [graph for number, graph in enumerate(merged.graphs) if number not in joined]
-    solved = [*rest, *ComponentSolver(fragments).solve([*links.values()])]
+    together = {**{link.pair: link for link in measured}, **by_hand}
+    solved = [*rest, *ComponentSolver(fragments).solve([*together.values()])]
     solved.sort(key=lambda graph: (-len(graph.nodes), graph.anchor))
     others = [link for link in merged.links if link.pair not in links]
     return replace(

@@ -158,6 +158,30 @@ def refine(stack: Stack, start: Array, scale_sigma: float, shift_sigma: float = 
     )
 
 
+def by_scales(stack: Stack, start: Array) -> Array | None:
+    """How a pose changes with the natural logarithms of the scales of the lengths of its two sides.
+
+    Args:
+        stack: its sightings.
+        start: (4,) pose m, m, rad, and pitch in sigmas.
+
+    Returns:
+        (3, 2) right perturbation of the pose, m, m, rad; of the forward points' side first. None if the
+        inliers do not determine a pose.
+    """
+    improved = improve(stack, start, GAUSS_NEWTON_STEPS)
+    if improved is None:
+        return None
+    state, moved = improved
+    linear = linearise(stack, state, moved)
+    products = normal_equations(linear, state[3])
+    if not linear.inliers.any() or not determined(of_pose_alone(products)):
+        return None
+    covariance = np.linalg.inv(products[1:, 1:])[:3]
+    changes = [covariance @ _gradient(linear, change) for change in _common_scales(stack, linear, moved)]
+    return np.stack(changes, axis=1)
+
+
 def _common_scales(stack: Stack, linear: Linear, points: Array) -> list[Array]:
     """How the residuals (N, 3) change when all points, or all depths, of one side grow together.
 

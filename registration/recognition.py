@@ -21,6 +21,8 @@ from mapweave.hybridmap.node import Landmarks, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.registration.evidence import GRID, depth_agreement, gather
+from mapweave.registration.gauss_newton import by_scales as scales_of
+from mapweave.registration.gauss_newton import stack_sightings
 from mapweave.registration.matching import MatchSettings, match
 from mapweave.registration.planar_pose import PlanarPoseSettings, solve_sightings
 from mapweave.registration.sightings import Sightings
@@ -224,6 +226,35 @@ def _examine(
     unknown = min(a.scale_share, b.scale_share) if measured else a.scale_share
     pose = of_unknown_scale(fix.node_from_robot, unknown, camera_a, camera_b)
     return Recognition(pose, inliers, len(pairs), len(usable), evidence, fix.pitch, fix.spread)
+
+
+def by_scales(
+    a: Node, b: Node, pairs: NDArray[np.int64], a_from_b: Pose2, settings: RecognitionSettings | None = None
+) -> Array | None:
+    """How the pose of two nodes that was found changes with the scales of the lengths of either.
+
+    Where both have depths and one's are longer, the pose is a compromise: a little back along the view.
+
+    Args:
+        a: one place.
+        b: the other.
+        pairs: (K, 2) landmarks of a and b that agree.
+        a_from_b: the pose that was found.
+        settings: by which it was found; None for the defaults.
+
+    Returns:
+        (3, 2) right perturbation of `a_from_b`, m, m, rad, by the natural logarithm of the scale of a, and
+        of b. None without pairs that determine a pose.
+    """
+    s = settings or RecognitionSettings()
+    forward = a.landmarks.has_depth[pairs[:, 0]]
+    if len(pairs) < s.least_inliers:
+        return None
+    sightings = [
+        _sightings(a.landmarks, a.camera, b.landmarks, b.camera, pairs[forward], s, False, 0.0),
+        _sightings(b.landmarks, b.camera, a.landmarks, a.camera, pairs[~forward][:, ::-1], s, True, 0.0),
+    ]
+    return scales_of(stack_sightings(sightings, s.pose.pitch_sigma), np.append(a_from_b.vector, 0.0))
 
 
 def of_unknown_scale(pose: PoseGaussian, share: float, of_node: Camera, of_view: Camera) -> PoseGaussian:
