@@ -29,7 +29,6 @@ from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.outlier_rejection.distinctness import weigh
 from mapweave.merge.outlier_rejection.driven_edges import refuse_drives
 from mapweave.merge.outlier_rejection.link_groups import LinkGroup
-from mapweave.merge.outlier_rejection.nearby_views import NearbyViews
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment
@@ -51,14 +50,12 @@ class MergeCache:
         corrected: fragments of maps without factors of their lengths.
         scales: factors of lengths.
         trajectories: of the robots.
-        nearby_views: compared pairs of them.
     """
 
     decisions: DecisionCache = field(default_factory=DecisionCache)
     corrected: DecisionCache = field(default_factory=DecisionCache)
     scales: MapScales = field(default_factory=MapScales)
     trajectories: TrajectoryCache = field(default_factory=TrajectoryCache)
-    nearby_views: NearbyViews = field(default_factory=NearbyViews)
 
 
 def merge_maps(
@@ -136,7 +133,7 @@ def decide(
     groups = cache.decisions.groups(open_, by_node, s.consistency, refutation.verdict, exact=before is None)
     # Each round refutes a link at least, so there is a last one.
     while True:
-        solved, kept, unjoined = _joined(solver, groups, held, closed, s, cache.nearby_views, maps, whole=before is None)
+        solved, kept, unjoined = _joined(solver, groups, held, closed, s, whole=before is None)
         changed = None if before is None else solver.changed
         impossible, against_hand = refutation.impossible(solved, kept, changed, by_hand)
         contradicted |= against_hand
@@ -244,12 +241,10 @@ def _joined(
     held: Sequence[Link],
     closed: Set[Pair],
     s: MergeSettings,
-    nearby_views: NearbyViews,
-    maps: Mapping[MapId, HybridMap],
     whole: bool,
 ) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
     """Join and optimise: the components, the links that are kept, and those that are not."""
-    kept, unjoined = agglomerate(solver, groups, s.consistency, held, closed, nearby_views, maps)
+    kept, unjoined = agglomerate(solver, groups, s.consistency, held, closed)
     return solver.solve(kept, whole=whole), kept, unjoined
 
 
