@@ -7,11 +7,13 @@ import threading
 import time
 from collections.abc import Callable
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 from websockets.sync.client import connect
 
 from mapweave.hybridmap.agent_status import Status
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.attendance import Attendance, AttendanceSettings, Unattended
@@ -159,6 +161,41 @@ def test_a_page_that_may_only_look_is_no_operator(monkeypatch: pytest.MonkeyPatc
             eventually(lambda: seen[0] > 2)
         # A look is taken twice a second: two in a row without one.
         eventually(lambda: _still(lambda: seen[0]), 20.0)
+
+
+def test_of_servers_that_share_a_store_the_one_that_leads_gives_the_order(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """And also the others say that an operator was at their pages, once for as long as nothing is new."""
+    watch, (link, control) = Watch(house), house.robot()
+    written: list[tuple[str, bytes]] = []
+    store = SimpleNamespace(shared=True, leads=False, put_result=lambda *row: written.append(row))
+    monkeypatch.setattr(watch.attendance, "_store", store)
+    sent = house.person.go("r0", str(THERE))
+    watch.after(1.0)
+    watch.after(GRACE)
+    watch.after(GRACE)
+    assert written == [("attended", b"s0")]
+    assert control.report == sent
+    store.leads = True
+    watch.after(1.0)
+    assert control.report is not None and control.report.order.kind is MissionKind.STOP
+    link.close()
+
+
+def test_a_store_that_takes_nothing_keeps_no_robot_from_standing(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise InvalidFile("the database does not answer")
+
+    watch, (link, control) = Watch(house), house.robot()
+    monkeypatch.setattr(watch.attendance, "_store", SimpleNamespace(shared=True, leads=True, put_result=full))
+    house.person.go("r0", str(THERE))
+    watch.after(1.0)
+    watch.after(GRACE)
+    assert control.report is not None and control.report.order.kind is MissionKind.STOP
+    link.close()
 
 
 def _still(count: Callable[[], int]) -> bool:
