@@ -250,47 +250,14 @@ class Pipeline:
             answers: to questions of earlier steps.
             driven: a person's command, which comes before the mission's; None if no one drives.
         """
-        command, questions = Command(), list[Question]()
-        if self._fisheye.rectifies and observation.image is not None:
-            # From here on the camera is a pinhole.
-            observation = replace(observation, image=self._fisheye.rectified(observation.image))
-        self._image = observation.image
-        self._convention.see(observation)
-        if self._command is None:
-            self._silent.see(observation)
-        observation = self.calibration.correct(observation)
-        observation = self._blind_zone.fill(self._sensors.see(observation, self._command))
-        if self._sensors.clock_jumped:
-            self.mapper.forget_clock()
-        if self._sensors.pose_lost:
-            self._blind_zone.forget()
-            self._lose_pose()
+        observation = self._believed(observation)
         self._take_over(driven)
         self._feel(observation)
         observation = self._others.mark(observation, answers, lambda: self.mapper.landmarks)
-        stands_elsewhere = self._in_the_air(observation) or self._put_elsewhere
-        if not stands_elsewhere:
+        command, questions = Command(), list[Question]()
+        if not (self._in_the_air(observation) or self._put_elsewhere):
             self._make_room()
-        lost = self._times_lost
-        match self._mission:
-            case _ if stands_elsewhere:
-                pass
-            case Idle() if self.mapper.started:
-                # Mapping that goes on later needs the motion of the wheels until then.
-                self._map_making.keep_up(observation)
-            case Idle() if self.fix is not None:
-                self.fix.follow_wheels(observation, self._map_making.description)
-            case Explore() | Carried():
-                command, questions = self._map_making.step(
-                    observation, answers, self._exploring, bool(self._blind), self._held
-                )
-                self._others.description = self._map_making.description
-            case GoTo() if self._navigator is not None:
-                command, questions = self._navigator.step(observation, answers, self._held)
-                self.mapper.drove(self._navigator.traverse, self._navigator.refined)
-        if self._times_lost > lost:
-            # It may have been carried: what the wheels say of things around it is void.
-            self._blind_zone.forget()
+            command, questions = self._by_mission(observation, answers)
         questions = [*questions, *self._who_is_near()]
         if self._blind and not self._lifted:
             command = self._sensors.trial
@@ -313,6 +280,47 @@ class Pipeline:
             Changes to the map since the last step, in order, and the images of the nodes that were made.
         """
         return self._map_making.finish(), self.mapper.take_images()
+
+    def _believed(self, observation: Observation) -> Observation:
+        """What the robot senses as it is used: of a pinhole, calibrated, without what failed sensors say."""
+        if self._fisheye.rectifies and observation.image is not None:
+            observation = replace(observation, image=self._fisheye.rectified(observation.image))
+        self._image = observation.image
+        self._convention.see(observation)
+        if self._command is None:
+            self._silent.see(observation)
+        observation = self.calibration.correct(observation)
+        observation = self._blind_zone.fill(self._sensors.see(observation, self._command))
+        if self._sensors.clock_jumped:
+            self.mapper.forget_clock()
+        if self._sensors.pose_lost:
+            self._blind_zone.forget()
+            self._lose_pose()
+        return observation
+
+    def _by_mission(
+        self, observation: Observation, answers: tuple[ServerAnswer, ...]
+    ) -> tuple[Command, list[Question]]:
+        """What the mission wants of the wheels, and to ask the fleet; what it maps goes to the mapper."""
+        command, questions, lost = Command(), list[Question](), self._times_lost
+        match self._mission:
+            case Idle() if self.mapper.started:
+                # Mapping that goes on later needs the motion of the wheels until then.
+                self._map_making.keep_up(observation)
+            case Idle() if self.fix is not None:
+                self.fix.follow_wheels(observation, self._map_making.description)
+            case Explore() | Carried():
+                command, questions = self._map_making.step(
+                    observation, answers, self._exploring, bool(self._blind), self._held
+                )
+                self._others.description = self._map_making.description
+            case GoTo() if self._navigator is not None:
+                command, questions = self._navigator.step(observation, answers, self._held)
+                self.mapper.drove(self._navigator.traverse, self._navigator.refined)
+        if self._times_lost > lost:
+            # It may have been carried: what the wheels say of things around it is void.
+            self._blind_zone.forget()
+        return command, questions
 
     def _make_room(self) -> None:
         """Drive out of the way of another robot, if this one has done its mission, and may."""
