@@ -63,7 +63,7 @@ class Mapper:
         self._description = description
         self._settings = settings
         self._lens = lens or Lens(description.camera, description.distortion)
-        # What `recalibrate` was told, until the episode ends.
+        # What `recalibrate` was given, until the episode ends.
         self._next_geometry: tuple[RobotDescription, Lens, Pose2, float] | None = None
         self._way_moved: WayCorrection | None = None
         # rad, by which the robot has turned further since the anchor view than the filter says.
