@@ -20,6 +20,7 @@ from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merging.merge_adoption import MergeAdoption
+from mapweave.mapserver.merging.merge_retry import SHORT, MergeRetry
 from mapweave.mapserver.merging.merge_sharing import MergeSharing
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.merger_counters import MergerCounters
@@ -44,6 +45,8 @@ PREPARED_AT_ONCE = 4
 """Nodes whose aliasing is evaluated at once, likewise."""
 SHARE, QUICK = 0.05, 0.05
 """Of the time that it may take to hand merges over, where one takes longer than so many seconds."""
+RETRY = 5.0
+"""s between two looks whether merging is to be tried again for which there was too little memory."""
 LOOK = 1.0
 """s between two looks for a merge that can be adopted, while there is none."""
 LATE = 2.0
@@ -70,6 +73,7 @@ class MergeWorker:
         observe: Callable[[float], None] = lambda seconds: None,
         pruning: PruningRecord | None = None,
         sharing: MergeSharing | None = None,
+        retry: MergeRetry | None = None,
     ) -> None:
         """Start with no map.
 
@@ -84,6 +88,7 @@ class MergeWorker:
             observe: called with the time that a merge has taken, s.
             pruning: prunes what has been superseded for long; None: nothing is.
             sharing: hands merges over to other servers, or from them; None: this one merges for itself.
+            retry: says when merging is tried again for which there was too little memory.
         """
         self._schedule = schedule
         self._sharing = sharing
@@ -103,7 +108,7 @@ class MergeWorker:
         """The last change of each log that was taken in."""
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._unprepared = False
-        self._read_all = self._begun = False
+        self._read_all = self._begun = self._waits_for_memory = False
         self._problem = self._trouble = ""
         self._unmerged = Unmerged(schedule.monotonic)
         self._merger.suspect(self._history.set_apart)
@@ -112,7 +117,9 @@ class MergeWorker:
         self._waiting: FairQueue[Change] = FairQueue(0, 0)
         self._counting = threading.Lock()
         self._came = self._applied = self._done = 0
+        self._retry = retry or MergeRetry(clock=schedule.monotonic)
         schedule.idle(self._idle)
+        schedule.every(RETRY, self._remind)
 
     @property
     def answers(self) -> Answers:
@@ -292,6 +299,11 @@ class MergeWorker:
             except Exception:  # the next start takes longer
                 log.exception("what was found is not kept")
 
+    def _remind(self) -> None:
+        """Have the work that can wait begun again, if it waited for memory."""
+        if self._waits_for_memory and not self._retry.pause:
+            self._schedule.post(lambda: None)
+
     def _idle(self) -> float | None:
         """A piece of the work that can wait: compare nodes, merge, prepare answers."""
         # What comes in pieces is merged when it is whole.
@@ -301,6 +313,10 @@ class MergeWorker:
             return self._follow()
         if not (self._dirty or self._unprepared):
             return self._share()
+        self._waits_for_memory = self._dirty and self._retry.pause > 0.0
+        if self._waits_for_memory:
+            self._problem = f"{self._retry.words}; {self._lacking}"
+            return None
         if self._merger.uncompared:
             self._search_pairs()
             return 0.0
@@ -529,7 +545,10 @@ class MergeWorker:
         """A part of the work before the first merge, which must not hold up new changes."""
         self._problem = f"still to be compared with others: {counted(self._merger.uncompared, 'node')}"
         try:
-            self._merger.search_pairs(SEARCHES_AT_ONCE)
+            with self._retry.attempt():
+                self._merger.search_pairs(SEARCHES_AT_ONCE)
+        except MemoryError:
+            self._retry.short()
         except Exception:  # the merge tries again, and reports if it cannot
             log.exception("nodes could not be compared")
             self._merge()
@@ -560,8 +579,15 @@ class MergeWorker:
         began = self._schedule.monotonic()
         made: list[Answers] = []
         try:
-            merged = self._merger.merged(lambda merged: made.append(self._answers_from(merged)))
+            with self._retry.attempt():
+                merged = self._merger.merged(lambda merged: made.append(self._answers_from(merged)))
             self._answers = made[-1] if made else self._answers_from(merged)
+        except MemoryError:
+            self._dirty = True
+            self._retry.short()
+            self._problem, self._trouble = f"{self._retry.words}; {self._lacking}", SHORT
+            self._history.failed(SHORT)
+            return
         except Exception:  # questions are answered from the map before; the next change is the next chance
             log.exception("merging failed")
             self._problem, self._trouble = f"{FAILED}; {self._lacking}", FAILED
@@ -570,6 +596,7 @@ class MergeWorker:
         finally:
             self._done, self._begun = self._applied, self._read_all
             self._observe(self._schedule.monotonic() - began)
+        self._retry.succeeded()
         self._unprepared, self._problem, self._trouble = True, "", ""
         self._unmerged.merged(self._applied)
         self._follow_history(merged)

@@ -39,6 +39,7 @@ from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, HISTORY, MERGE_MARK, PRUNING_MARK, News
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
+from mapweave.mapserver.merging.merge_retry import MergeRetry
 from mapweave.mapserver.merging.merge_sharing import MergeSharing
 from mapweave.mapserver.merging.pruning_record import PruningRecord
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
@@ -153,6 +154,7 @@ class MapServer:
             keeper=findings, history=self._history, compare=self._cluster.compare,
             observe=self._metrics.merged, pruning=pruning,
             sharing=MergeSharing(self._store, name) if shares else None,
+            retry=MergeRetry(None if isinstance(clock, LockstepSchedule) else path, clock.monotonic),
         )  # fmt: skip
         self._constraints = ConstraintRecord(self._store, self._base)
         self._annotations = AnnotationRecord(self._store, self._base.annotations)
@@ -291,6 +293,11 @@ class MapServer:
     def displaced(self) -> str:
         """Why this server must end, in one line: another one of its name has the store. Else empty."""
         return self._store.displaced
+
+    @property
+    def broken(self) -> str:
+        """Why this server must end and start again, in one line: it takes nothing in. Else empty."""
+        return self._ingest.broken
 
     @property
     def read_only(self) -> bool:

@@ -66,6 +66,7 @@ class Ingest:
 
     Attributes:
         busy: whether what has come is being committed now.
+        broken: why nothing is taken in any more, in one line; empty while it is.
     """
 
     def __init__(
@@ -136,7 +137,7 @@ class Ingest:
         )
         self._declared: list[Closing] = []
         self._thread = threading.Thread(target=self._run, name="ingest", daemon=True)
-        self._stopping, self.busy, self._failure = False, False, ""
+        self._stopping, self.busy, self._failure, self.broken = False, False, "", ""
         positions = self._store.positions()
         maps = sorted(positions)
         stored = (change for m in maps for change in settled(store, m, positions[m]))
@@ -174,7 +175,7 @@ class Ingest:
     @property
     def failure(self) -> str:
         """Why the disk does not take changes at present; empty if it does."""
-        return self._failure or self._group.delay
+        return self.broken or self._failure or self._group.delay
 
     def follow(self, news: News) -> None:
         """Pass on what other servers have written to the store; from any thread, in the ingest's own."""
@@ -212,6 +213,18 @@ class Ingest:
             self._quotas.hold_back(robot, "changes" if sample.attachment else "beacons")
 
     def _run(self) -> None:
+        try:
+            self._take_turns()
+        except Exception as error:
+            # Half a turn cannot be taken back here. What is on the disk is whole, and the next process reads
+            # it; robots keep the rest.
+            if not isinstance(error, MemoryError):
+                log.exception("nothing is taken in any more")
+            words = "not enough memory" if isinstance(error, MemoryError) else type(error).__name__
+            self.broken = f"changes cannot be taken in any more ({words}); none that is acknowledged is lost"
+            self.busy = False
+
+    def _take_turns(self) -> None:
         while not self._stopping:
             now = time.monotonic()
             touched: dict[MapId, AgentLog] = {}

@@ -71,7 +71,9 @@ class Isolation:
 
 
 def leave_out(
-    maps: Sequence[MapId], attempt: Callable[[Collection[MapId]], T]
+    maps: Sequence[MapId],
+    attempt: Callable[[Collection[MapId]], T],
+    fatal: type[Exception] | tuple[type[Exception], ...] = (),
 ) -> tuple[T, dict[MapId, Exception]]:
     """Attempt something with as many maps as possible.
 
@@ -81,6 +83,7 @@ def leave_out(
     Args:
         maps: the most trusted first.
         attempt: fails by any exception.
+        fatal: exceptions that are no map's fault: they are raised.
 
     Returns:
         The result, and the maps that were left out.
@@ -96,6 +99,8 @@ def leave_out(
         block = waiting.pop()
         try:
             excluded = [attempt([*kept, *block])]
+        except fatal:
+            raise
         except Exception as error:  # noqa: BLE001 - any error is one map's and is reported for it
             if len(block) > 1:
                 waiting += [block[len(block) // 2 :], block[: len(block) // 2]]

@@ -291,6 +291,9 @@ class Merger:
 
         Args:
             use: what is made of a merged map that is new; a map with which that fails is set apart as well.
+
+        Raises:
+            MemoryError: there is not enough memory; the next call begins with all maps.
         """
         while self._dirty:
             self._merge(use)
@@ -330,6 +333,10 @@ class Merger:
         maps = [kept_id for kept_id in self._kept if kept_id not in apart]
         try:
             merged = self._made(self._pipeline, self._verdicts, maps, self._touched, use)
+        except MemoryError:
+            # No map's fault. What is cached may be damaged, and takes memory.
+            self._pipeline, self._touched = self._new_pipeline(), set(self.maps)
+            raise
         except Exception as error:  # any error is of one map or a few, and not of all
             log.exception("the merge fails; looking for the map with which it does")
             merged = self._made_without_bad(maps, error, use)
@@ -420,7 +427,7 @@ class Merger:
         trusted = sorted(
             maps, key=lambda map_id: (self._suspicion(map_id), -len(self._kept[map_id].nodes), map_id)
         )
-        pipeline, bad = leave_out(trusted, attempt)
+        pipeline, bad = leave_out(trusted, attempt, fatal=MemoryError)
         for map_id, error in bad.items():
             self._isolation.add(map_id, reason_of(error))
         if not bad:

@@ -177,6 +177,7 @@ def run(arguments: argparse.Namespace) -> int:
         from mapweave.mapserver.base_map import BaseMap
         from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
         from mapweave.mapserver.server import MapServer, ServerSettings
+        from mapweave.processes.separate_stores import SeparateStores
         from mapweave.processes.service_manager import ServiceManager
         from mapweave.processes.store_wait import Waiting, made_with_store
 
@@ -231,6 +232,8 @@ def run(arguments: argparse.Namespace) -> int:
         started.set()
         if not arguments.lockstep:
             stack.callback(NameWatch(bus, keys, name).close)
+            if arguments.store is None:
+                stack.callback(SeparateStores(bus, keys, name).close)
         if web is not None:
             loading.take(server)
             stack.callback(lambda: write_shown(shown, web.shown()))
@@ -249,8 +252,8 @@ def run(arguments: argparse.Namespace) -> int:
         manager.ready()
         while not stop.wait(1.0):
             manager.alive()
-            if server.displaced:
-                raise InvalidFile(server.displaced)
+            if ends := server.displaced or server.broken:
+                raise InvalidFile(ends)
             if renewal is not None:
                 renewal.check()
             now = summary_of(server)

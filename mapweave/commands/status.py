@@ -137,6 +137,11 @@ def _shown(
 def leading(servers: Sequence[Mapping[str, Scalar]]) -> list[str]:
     """Lines that say which of the servers that share a store merges, and how far the others are behind it."""
     lines = []
+    stores = sum("leads" not in one for one in servers) + any("leads" in one for one in servers)
+    if stores > 1:
+        counts = sorted(int(one.get("constraints", 0)) for one in servers)
+        apart = f"; constraints in force: {', '.join(map(str, counts))}" if counts[0] != counts[-1] else ""
+        lines.append(f"{len(servers)} servers have {stores} stores, which do not exchange decisions{apart}")
     for one in sorted(servers, key=lambda server: str(server.get("name", ""))):
         name, leader = one.get("name", ""), one.get("leader", "")
         if one.get("merges_itself"):

@@ -26,3 +26,12 @@ def test_it_says_for_how_long_a_server_is_behind_and_what_delays_it() -> None:
 
 def test_of_a_server_without_others_it_says_nothing() -> None:
     assert leading([LEADS]) == leading([{"summary": "no nodes"}]) == leading([]) == []
+
+
+def test_it_says_that_stores_exchange_no_decisions() -> None:
+    one, other = {"summary": "no nodes", "constraints": 2}, {"summary": "no nodes", "constraints": 2}
+    words = "2 servers have 2 stores, which do not exchange decisions"
+    assert leading([one, other]) == [words]
+    assert leading([one, {**other, "constraints": 0}]) == [f"{words}; constraints in force: 0, 2"]
+    assert leading([LEADS, FOLLOWS, one])[0].startswith("3 servers have 2 stores")
+    assert not any("stores" in line for line in leading([LEADS, FOLLOWS]))
