@@ -111,6 +111,30 @@ def camera_poses(run: RoomDrive) -> tuple[Array, Array]:
     return turn @ mount, place + turn @ np.array([true.forward, true.left, true.height])
 
 
+def first_in_view(points: Array, rotation: Array, centre: Array) -> tuple[NDArray[np.intp], Array]:
+    """The first 150 points that a camera sees, as tracks are kept: their numbers (N,), and (N, 2) px.
+
+    Args:
+        points: (M, 3) m, in world.
+        rotation: (3, 3) world_from_camera.
+        centre: (3,) m, of the camera.
+    """
+    most, at_once = 150, 1000
+    ids, seen = np.zeros(0, np.intp), np.zeros((0, 2))
+    for begin in range(0, len(points), at_once):
+        local = (points[begin : begin + at_once] - centre) @ rotation
+        ahead = local[:, 2] > 0.3
+        pixels = local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None] * CAMERA.fx + [
+            CAMERA.cx,
+            CAMERA.cy,
+        ]
+        found = np.flatnonzero(ahead & CAMERA.contains(pixels, 4.0))
+        ids, seen = np.append(ids, begin + found), np.concatenate([seen, pixels[found]])
+        if len(ids) >= most:
+            break
+    return ids[:most], seen[:most]
+
+
 def pairs(
     rng: np.random.Generator, run: RoomDrive, pixel_sigma: float = 0.4, outliers: float = 0.1, step: int = 5,
     floor: bool = True, tracks: int = 150,

@@ -17,7 +17,14 @@ from mapweave.agent.calibration.online import NAMED_ONLY, OnlineCalibration, _co
 from mapweave.agent.calibration.report import Cause, causes
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from tests.agent.calibration.room_drive import CAMERA, SIDE, RoomDrive, camera_poses, drive
+from tests.agent.calibration.room_drive import (
+    CAMERA,
+    SIDE,
+    RoomDrive,
+    camera_poses,
+    drive,
+    first_in_view,
+)
 from tests.quick import first_quick
 
 BLANK = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
@@ -54,14 +61,8 @@ def watched(
             walls = (half - np.sign(ahead) * [x, y]) / np.maximum(np.abs(ahead), 1e-9)
             proximity = ranged * walls.min(keepdims=True) * (1.0 + 0.005 * rng.normal())
         online.correct(Observation(round(stamp * 1e9) + 1, wheels, proximity=proximity))
-        local = (points - centre[k]) @ rotation[k]
-        ahead = local[:, 2] > 0.3
-        pixels = local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None] * CAMERA.fx + [
-            CAMERA.cx,
-            CAMERA.cy,
-        ]
-        ids = np.flatnonzero(ahead & CAMERA.contains(pixels, 4.0))[:150]
-        online.watch(BLANK, SOURCE, ids, pixels[ids] + rng.normal(0.0, sigma, (len(ids), 2)))
+        ids, pixels = first_in_view(points, rotation[k], centre[k])
+        online.watch(BLANK, SOURCE, ids, pixels + rng.normal(0.0, sigma, (len(ids), 2)))
         online.switched()
     return online
 

@@ -14,7 +14,7 @@ from mapweave.agent.calibration.turn_correction import PairTurn, TurnCorrection
 from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.hybridmap.pose import Array
-from tests.agent.calibration.room_drive import CAMERA, SIDE, camera_poses, drive
+from tests.agent.calibration.room_drive import CAMERA, SIDE, camera_poses, drive, first_in_view
 
 BLANK = np.zeros((CAMERA.height, CAMERA.width), np.uint8)
 SOURCE = object()
@@ -43,12 +43,8 @@ def corrections(seed: int, sway: float, filtered: Callable[[Array, Array], Array
     for k, stamp in enumerate(run.stamps):
         wheels = Odometry(float(way[k] - way[max(k - 1, 0)]), float(turn[k] - turn[max(k - 1, 0)]))
         online.correct(Observation(round(stamp * 1e9) + 1, wheels))
-        local = (points - centre[k]) @ rotation[k]
-        ahead = local[:, 2] > 0.3
-        depths = np.where(ahead, local[:, 2], 1.0)
-        pixels = local[:, :2] / depths[:, None] * CAMERA.fx + [CAMERA.cx, CAMERA.cy]
-        ids = np.flatnonzero(ahead & CAMERA.contains(pixels, 4.0))[:150]
-        seen = pixels[ids] + rng.normal(0.0, 0.3, (len(ids), 2))
+        ids, pixels = first_in_view(points, rotation[k], centre[k])
+        seen = pixels + rng.normal(0.0, 0.3, (len(ids), 2))
         online.watch(BLANK, SOURCE, ids, seen, float(turned[k]))
         out.append(online.take_turn())
     return np.array(out)
