@@ -16,7 +16,7 @@ MOST_NAMED = 3
 
 
 def length_words(merged: MergedMap, settings: ConsistencySettings | None = None) -> dict[MapId, str]:
-    """What is said of maps whose lengths are all too long or too short; it is found anew, which takes time.
+    """What is said of maps whose lengths are all too long or too short; found again, which takes time.
 
     Args:
         merged: the merged map.

@@ -47,7 +47,7 @@ def test_a_corrected_map_is_adopted_bit_by_bit_and_named(tmp_path: Path) -> None
         if (edge.a, edge.b) in rows
     ]
     assert ratios and all(abs(ratio - FACTOR) < 0.01 for ratio in ratios)
-    # A merge that begins anew says the same.
+    # A merge of everything says the same.
     assert_same(leader.restarted(log), merged)
 
 
