@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -10,9 +11,11 @@ from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.intake import Intakes
 from mapweave.mapserver.log.pull_schedule import AT_ONCE, PullSchedule
 from mapweave.mapserver.log.pulled import Pulled
-from mapweave.wire.bus import Bus
+from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import LogRequest
+
+log = logging.getLogger(__name__)
 
 
 class Puller:
@@ -68,5 +71,9 @@ class Puller:
 
     def _pull(self, agent_log: AgentLog, asked: LogRequest) -> None:
         """Pull changes, in a thread of its own, because an agent may be slow."""
-        replies = self._bus.ask(self._keys.log(agent_log.map), asked.encode(), self._timeout)
+        replies: list[Reply] = []
+        try:
+            replies = self._bus.ask(self._keys.log(agent_log.map), asked.encode(), self._timeout)
+        except Exception as error:  # without an end the robot would count as asked, and not be asked again
+            log.warning("asking for %s failed (%s: %s)", agent_log.map, type(error).__name__, error)
         self._answered(Pulled(agent_log, asked, replies))

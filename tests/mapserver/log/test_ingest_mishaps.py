@@ -6,6 +6,7 @@ import logging
 import time
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -14,10 +15,10 @@ from mapweave.hybridmap.errors import InvalidFile, MapweaveError
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.store import LogChanges
 from mapweave.mapserver.quotas import BURST, Quotas, QuotaSettings
-from mapweave.wire.bus import Request
+from mapweave.wire.bus import Reply, Request
 from mapweave.wire.codec import MAX_CHANGE_BYTES
 from mapweave.wire.log_messages import LogAnswer, LogRequest, Mark, Refusal
-from mapweave.wire.memory import MemoryHub
+from mapweave.wire.memory import MemoryBus, MemoryHub
 from tests.mapserver.played import KEYS, LOG_ID, MAP, QUICK, HandAgent, Server, message
 from tests.waiting import eventually
 
@@ -60,6 +61,25 @@ def test_a_change_that_cannot_even_be_carried_is_found_and_refused(server: Serve
     agent.beacon(20)
     eventually(lambda: server.sequences == [s for s in range(1, 21) if s != 7])
     assert [refusal.sequence for refusal in server.store.refusals(MAP)] == [7]
+
+
+def test_a_question_that_fails_unforeseen_is_asked_again(
+    server: Server, agent: HandAgent, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The robot counted as asked for ever."""
+    failures = [MemoryError(), RuntimeError("unforeseen")]
+    real = MemoryBus.ask
+
+    def ask(bus: MemoryBus, key: str, *rest: Any) -> list[Reply]:
+        if failures and key == KEYS.log(MAP):
+            raise failures.pop()
+        return real(bus, key, *rest)
+
+    monkeypatch.setattr(MemoryBus, "ask", ask)
+    agent.serve(3)
+    agent.beacon(3)
+    eventually(lambda: server.sequences == [1, 2, 3])
+    assert not failures
 
 
 def test_answers_that_are_none_are_asked_again(server: Server, agent: HandAgent) -> None:
