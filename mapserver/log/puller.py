@@ -74,6 +74,6 @@ class Puller:
         replies: list[Reply] = []
         try:
             replies = self._bus.ask(self._keys.log(agent_log.map), asked.encode(), self._timeout)
-        except Exception as error:  # without an end the robot would count as asked, and not be asked again
-            log.warning("asking for %s failed (%s: %s)", agent_log.map, type(error).__name__, error)
+        except Exception:  # without an end the robot would count as asked, and not be asked again
+            log.exception("asking for %s failed", agent_log.map)
         self._answered(Pulled(agent_log, asked, replies))
