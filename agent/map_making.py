@@ -68,6 +68,7 @@ class MapMaking:
         self._carried = CarriedMapping(self.mapper)
         self._resumption: Resumption | None = None
         self._episodes = 0
+        self._carried_to: Observation | None = None
         self.losses = 0
 
     @property
@@ -163,6 +164,7 @@ class MapMaking:
         """
         if self.mapper.astray:
             return self._resume(observation, alone, blind), []
+        self._carried_to = None
         self.keep_up(observation)
         if self.mapper.doubtful or self.mapper.astray or blind:
             self.calibration.pause()
@@ -187,6 +189,7 @@ class MapMaking:
         else:
             self.floor.see(pose, observation.proximity)
         if self._explorer is None or not alone:
+            self._carried_to = observation
             return self._act(self._carried, observation), []
         if held:
             return Command(), []
@@ -202,9 +205,15 @@ class MapMaking:
     def finish(self) -> tuple[ChangeBody, ...]:
         """Make what is left of the last episode at once: no further tick is sure to come.
 
+        The view from which a robot is mapping while it is carried becomes a node as it is known by now, if
+        that is well enough: a recording ends anywhere.
+
         Returns:
             What was changed in the map since the last call of `take_changes`.
         """
+        last, self._carried_to = self._carried_to, None
+        if last is not None and self.located:
+            self.mapper.finish(last)
         self.mapper.finish_pending()
         return self.take_changes()
 

@@ -41,3 +41,17 @@ def test_wheels_that_images_contradict_in_a_turn_lose_no_pose_while_the_camera_m
         seen = replace(seen, odometry=Odometry(0.02 if tick < 25 else 0.08, 0.012))
         made.step(made.calibration.correct(seen), (), alone=False, blind=False, held=False)
     assert made.losses == losses
+
+
+def test_a_drive_by_hand_that_ends_in_the_middle_of_an_episode_leaves_a_node(walls, description) -> None:
+    """One that has not moved leaves none: it knows no depths."""
+    for steps, nodes in ((1, 0), (8, 1)):
+        made = MapMaking(MapId("r0", 1), OnlineCalibration(description), AgentSettings())
+        true = Pose2()
+        for tick in range(steps):
+            seen = walls.observe(true, true := true @ Pose2(0.02), tick + 1)
+            made.step(made.calibration.correct(seen), (), alone=False, blind=False, held=False)
+        assert not made.mapper.map.nodes, "the episode has not ended"
+        made.finish()
+        assert len(made.mapper.map.nodes) == nodes
+        assert made.finish() == (), "and none twice"
