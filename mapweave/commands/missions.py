@@ -130,8 +130,15 @@ def run(arguments: argparse.Namespace, give: Callable[[Fleet], MissionReport]) -
             report = fleet.wait(report, arguments.timeout, _progress(), _silence(arguments.robot, keys))
             if report.open:
                 print(_late(report, arguments.timeout), file=sys.stderr)
+        elif report.open and (follows := unattended(fleet)):
+            print(f"{follows.rstrip('.')}; --wait counts as a page", file=sys.stderr)
     _print([report], arguments.json)
     return _exit_status([report], arguments.wait)
+
+
+def unattended(fleet: Fleet) -> str:
+    """What robots do once no operator is there, if a map server says so."""
+    return next((str(one["unattended"]) for one in fleet.servers() if one.get("unattended")), "")
 
 
 def run_stop(arguments: argparse.Namespace) -> int:

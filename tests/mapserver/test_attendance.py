@@ -6,12 +6,15 @@ import json
 import threading
 import time
 from collections.abc import Callable
+from contextlib import nullcontext
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 from websockets.sync.client import connect
 
+from mapweave.cli import main
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
@@ -144,6 +147,26 @@ def test_who_waits_for_a_mission_is_there(house: House, monkeypatch: pytest.Monk
     link.report(DRIVES, 3)
     waiting.join(20)
     assert waited[0].state is MissionState.REPLACED
+    link.close()
+
+
+@pytest.mark.parametrize("wait", [False, True])
+def test_a_shell_that_does_not_wait_says_what_follows(
+    house: House, wait: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    link, _ = house.robot()
+    monkeypatch.setattr("mapweave.commands.missions.fleet_of", lambda _: nullcontext(house.person))
+    give = ["go", "r0", str(THERE), *(["--wait", "--timeout", "0.2"] if wait else [])]
+    assert main(give) == (4 if wait else 0)
+    assert "operator" not in capsys.readouterr().err, "by default all go on"
+    attendance = AttendanceSettings(Unattended.STAND)
+    settings = replace(house.server._settings, attendance=attendance)
+    monkeypatch.setattr(house.server, "_settings", settings)
+    assert main(give) == (4 if wait else 0)
+    said = (
+        "Robots that were sent stand 30 s after the last operator's page was closed; --wait counts as a page"
+    )
+    assert (said in capsys.readouterr().err) is not wait
     link.close()
 
 
