@@ -27,15 +27,14 @@ from benchmarks.rules.switches import (
 )
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
-from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.merging.node_comparisons import compare
-from mapweave.merge.pose_graph.verdicts import Verdict
 from synthetic.wrong_geometry import SCENES, OdometryFault, draw_fleet
+from tests.examined import examined_once
 
 
 @cache
@@ -49,19 +48,13 @@ def logs() -> list[tuple[MapId, ChangeBody]]:
     return [(map_id, body) for map_id, some in bodies.items() for body in some]
 
 
-@cache
-def compared_once(a: NodeId, b: NodeId) -> Verdict:
-    nodes = {body.node.id: body.node for _, body in logs() if isinstance(body, NodePut)}
-    return next(iter(compare([(nodes[a], nodes[b])])))
-
-
 @pytest.mark.parametrize("rule", [*TRIAL_RULES, *PLACE_RULES])
 def test_fleets_are_merged_and_answered_without_a_rule(rule: str, caplog: pytest.LogCaptureFixture) -> None:
     """None of these rules is on how nodes are compared, so each pair of them is compared once."""
     switches: tuple[Switch, ...] = {**TRIAL_RULES, **PLACE_RULES}[rule]
-    merger = Merger(compare=lambda pairs: [compared_once(a.id, b.id) for a, b in pairs])
+    merger = Merger()
     merger.read(logs())
-    with switched_off(switches):
+    with examined_once(), switched_off(switches):
         merged = merger.merged()
         assert merged.links
         node = next(iter(merged.poses))

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -21,25 +21,21 @@ from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.superseded import Superseded
-from mapweave.mapserver.merging import node_comparisons, restart_record_file, verification_cache_keeper
+from mapweave.mapserver.merging import restart_record_file, verification_cache_keeper
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.restart_record import RestartRecord
 from mapweave.mapserver.merging.restart_record_file import load, save
-from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, RecentComparisons, fingerprint_of
+from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, RecentComparisons
 from mapweave.mapserver.merging.verification_cache_keeper import (
     RECORD_SUFFIX,
     SUFFIX,
     VerificationCacheKeeper,
     made_by,
 )
-from mapweave.merge.map_maintenance import comparisons
 from mapweave.merge.map_maintenance.superseding_log import Changes, SupersedingLog
-from mapweave.merge.pose_graph import verification
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.merge.pose_graph.verdicts import Verdict
 from mapweave.merge.settings import ExclusionSettings, MergeSettings
 from synthetic.maps import changes_of
 from synthetic.world import room, take_map
@@ -48,35 +44,6 @@ from tests.quick import first_quick
 DAY_NS = 86_400_000_000_000
 NO_STEP = 10_000
 Log = Sequence[tuple[MapId, ChangeBody]]
-
-
-@cache
-def _verdict(prints: tuple[bytes, bytes], which: str) -> dict[str, Any]:
-    return {}
-
-
-def compare(pairs: Sequence[tuple[Node, Node]]) -> Iterator[Verdict]:
-    """As a server does, each pair once for all mergers."""
-    for a, b in pairs:
-        known = _verdict((fingerprint_of(a), fingerprint_of(b)), "merge")
-        if not known:
-            known["verdict"] = next(iter(node_comparisons.compare([(a, b)])))
-        yield known["verdict"]
-
-
-def verify(a: Node, b: Node) -> Verdict:
-    """As a superseder does, likewise."""
-    known = _verdict((fingerprint_of(a), fingerprint_of(b)), "superseding")
-    if not known:
-        known["verdict"] = verification.verify(a, b)
-    return known["verdict"]  # type: ignore[no-any-return]
-
-
-@pytest.fixture(scope="module", autouse=True)
-def each_pair_once() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(comparisons, "verify", verify)
-        yield
 
 
 @cache
@@ -106,7 +73,7 @@ class Server:
     """What the merging thread of a server does, over files."""
 
     def __init__(self, path: Path, log: Log, constraints: ManualConstraints | None = None) -> None:
-        self.merger = Merger(compare=compare)
+        self.merger = Merger()
         # Its clock stands still: on a slow disk not every merge is written, and another table is right then.
         self.keeper = VerificationCacheKeeper(path, clock=lambda: 0.0)
         self.keeper.restore(self.merger)
@@ -156,7 +123,7 @@ def by_drive(path: Path, log: Log) -> Server:
 
 
 @pytest.fixture(scope="module")
-def driven(each_pair_once: None, tmp_path_factory: pytest.TempPathFactory) -> tuple[Server, dict[str, bytes]]:
+def driven(tmp_path_factory: pytest.TempPathFactory) -> tuple[Server, dict[str, bytes]]:
     """A server that has merged after each drive, and the files that it leaves."""
     folder = tmp_path_factory.mktemp("driven")
     server = by_drive(folder / "store", drives())
@@ -381,7 +348,7 @@ def test_a_damaged_record_is_thrown_away(
     if damage == "version":
         # Another version may supersede by other rules.
         monkeypatch.setattr(verification_cache_keeper, "VERSION", "0.0.0")
-    merger, plain = Merger(settings=merging, compare=compare), Merger(settings=merging, compare=compare)
+    merger, plain = Merger(settings=merging), Merger(settings=merging)
     caplog.clear()
     with caplog.at_level(logging.INFO):
         VerificationCacheKeeper(tmp_path / "store").restore(merger)
@@ -409,7 +376,7 @@ def test_a_table_of_other_nodes_does_no_harm(tmp_path: Path) -> None:
     ]
     other = [(map_id, _moved(map_id, body)) for map_id, body in other if isinstance(body, NodePut)]
     for log in (drives(1), other, drives(2)[:20], drives(2)[20:]):
-        plain = Merger(compare=compare)
+        plain = Merger()
         plain.read(log)
         with TemporaryDirectory() as folder:
             for file in tmp_path.iterdir():
@@ -442,7 +409,7 @@ def test_a_slow_disk_is_used_a_twentieth_of_the_time(tmp_path: Path, monkeypatch
         save(path, record, made_by)
 
     monkeypatch.setattr(restart_record_file, "save", slowly)
-    merger, keeper = Merger(compare=compare), VerificationCacheKeeper(tmp_path / "x", clock=lambda: now[0])
+    merger, keeper = Merger(), VerificationCacheKeeper(tmp_path / "x", clock=lambda: now[0])
     for map_id, body in drives()[:12]:
         merger.on_change(Change(map_id, 1, 0, body))
         merger.merged()
@@ -456,7 +423,7 @@ def test_a_slow_disk_is_used_a_twentieth_of_the_time(tmp_path: Path, monkeypatch
 def test_a_full_disk_is_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
     now = [0.0]
     (tmp_path / "later").mkdir()
-    merger = Merger(compare=compare)
+    merger = Merger()
     keeper = VerificationCacheKeeper(tmp_path / "later" / "store", clock=lambda: now[0])
     keeper.restore(merger)
     (tmp_path / "later").rmdir()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import cast
@@ -27,20 +27,12 @@ from mapweave.mapserver.merging import merge_adoption, merge_sharing, verificati
 from mapweave.mapserver.merging.merge_adoption import MergeAdoption
 from mapweave.mapserver.merging.merge_sharing import PART, MergeSharing
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.merge.map_maintenance import comparisons
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import ExclusionSettings, MergeSettings
-from tests.mapserver.merging.test_restart_record import Log, Server, compare, decided, drives, verify
+from tests.mapserver.merging.test_restart_record import Log, Server, decided, drives
 from tests.quick import first_quick
 
 OTHERS = MapId("r0", 1), MapId("r1", 1)
-
-
-@pytest.fixture(scope="module", autouse=True)
-def each_pair_once() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(comparisons, "verify", verify)
-        yield
 
 
 class Results:
@@ -91,7 +83,7 @@ class Follower:
 
     def __init__(self, results: Results, merging: MergeSettings | None = None) -> None:
         self.now, self.results = 0.0, results
-        self.merger = Merger(compare=compare, settings=merging)
+        self.merger = Merger(settings=merging)
         self.adoption = MergeAdoption(MergeSharing(cast(Store, results), "s1"), None, lambda: self.now)
         self.merged = MergedMap.empty()
         self.last: dict[MapId, int] = {}
@@ -228,7 +220,7 @@ def test_a_follower_has_the_leaders_map_and_goes_on_from_it(
 
 @pytest.fixture(scope="module")
 def handed_over(
-    each_pair_once: None, tmp_path_factory: pytest.TempPathFactory
+    tmp_path_factory: pytest.TempPathFactory,
 ) -> tuple[Results, list[Change]]:
     """A merge of the first changes, to be looked at only."""
     results, changes = Results(), numbered(drives(1))[:24]

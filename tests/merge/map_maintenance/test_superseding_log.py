@@ -16,48 +16,28 @@ from mapweave.hybridmap.change import Change, ChangeBody
 from mapweave.hybridmap.constraint_subject import Apart, RetiredMap, Subject
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.pruned_node import PrunedNode, PrunedNodes
 from mapweave.hybridmap.superseded import Superseded
-from mapweave.mapserver.merging import node_comparisons
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.pruning import PrunePlan
-from mapweave.merge.map_maintenance import comparisons, superseding_log
+from mapweave.merge.map_maintenance import superseding_log
 from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
 from mapweave.merge.map_maintenance.superseding_log import Changes, SupersedingLog, Undone
-from mapweave.merge.pose_graph import verification
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.merge.pose_graph.verdicts import Verdict
 from synthetic.maps import changes_of
 from synthetic.world import room, take_map
+from tests.examined import examined_once
 
 HOUR_NS = 3_600_000_000_000
 HONEST = [MapId(f"r{k}", 1) for k in range(4)]
 ANOTHER = MapId("x", 1)
 SEEDS = (31, 32, 33, 34)
-_found: dict[tuple[str, int, int], tuple[Node, Node, Verdict]] = {}
-
-
-def once(kind: str, a: Node, b: Node) -> Verdict:
-    """Each pair is compared once for all mergers: drives are drawn once, so nodes are the same objects."""
-    key = kind, id(a), id(b)
-    if key not in _found:
-        found = (
-            next(iter(node_comparisons.compare([(a, b)]))) if kind == "merge" else verification.verify(a, b)
-        )
-        _found[key] = a, b, found
-    return _found[key][2]
-
-
-def compare(pairs: Sequence[tuple[Node, Node]]) -> Iterator[Verdict]:
-    return (once("merge", a, b) for a, b in pairs)
 
 
 @pytest.fixture(scope="module", autouse=True)
-def each_pair_once() -> Iterator[None]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(comparisons, "verify", lambda a, b: once("superseding", a, b))
+def examined() -> Iterator[None]:
+    with examined_once():
         yield
 
 
@@ -94,7 +74,7 @@ def constrained(*about: Subject) -> ManualConstraints:
 
 def with_another(seed: int) -> tuple[MergedMap, Merger]:
     """The merge of the honest maps, and one that another map has come to since then."""
-    merger = Merger(compare=compare)
+    merger = Merger()
     for which in HONEST:
         before = feed(merger, seed, which)
     joined = feed(merger, seed, ANOTHER, range(4, 100, 4))
@@ -105,7 +85,7 @@ def with_another(seed: int) -> tuple[MergedMap, Merger]:
 
 def restarted(merger: Merger, seed: int, maps: Sequence[MapId]) -> Merger:
     """Another process that goes on from the record of this one."""
-    again = Merger(compare=compare)
+    again = Merger()
     again.recollect(merger.findings(), merger.record())
     again.read([(which, body) for which in maps for body in drives(seed)[which]])
     again.constrain(merger.constraints)
@@ -164,7 +144,7 @@ def test_so_it_does_whatever_came_when_and_across_restarts(
     seed: int, order: Sequence[MapId], bounds: set[int], restarts: list[bool]
 ) -> None:
     """Also if the person retires it while no server runs, takes it in again, and retires it again."""
-    merger, maps, points = Merger(compare=compare), [*order], iter(restarts)
+    merger, maps, points = Merger(), [*order], iter(restarts)
 
     def go_on() -> None:
         nonlocal merger
@@ -203,7 +183,7 @@ def test_maps_that_part_because_of_it_are_joined_as_before(seed: int, at_once: b
 
     So it is with a process that goes on from the record, too.
     """
-    merger = Merger(compare=compare)
+    merger = Merger()
     for which in HONEST:
         before = feed(merger, seed, which)
     if not at_once:
@@ -237,7 +217,7 @@ def test_a_map_that_becomes_unsure_does_too(seed: int) -> None:
 def test_maps_that_came_behind_it_are_judged_again() -> None:
     """They are superseded by none of the map that is gone, and by nodes that are active."""
     seed = SEEDS[0]
-    merger = Merger(compare=compare)
+    merger = Merger()
     for which in (*HONEST[:2], ANOTHER, *HONEST[2:]):
         feed(merger, seed, which)
     merger.constrain(constrained(RetiredMap(ANOTHER)))
