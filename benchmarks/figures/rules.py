@@ -150,6 +150,14 @@ SHOWN_BY: dict[str, tuple[tuple[str, str], ...]] = {
             "",
         ),
     ),
+    "views that contradict the way": (
+        (
+            "depths that are 30 % too long, and focal lengths that change, make 23 and 11 of 24 answers "
+            "ambiguous (seeds 32001, 32002), and the robot is not named: "
+            "`tests/mapserver/merging/test_own_views.py::test_a_map_whose_views_contradict_its_own_way_is_named`",
+            "",
+        ),
+    ),
     "fragments": _margins("fragments", "small maps left behind"),
     "bent maps": _margins("bent maps", "steps a tenth too long"),
     "shuffled maps": _margins("shuffled maps", "one shuffled map"),
@@ -200,6 +208,7 @@ AGAINST_LIES = {
     "unmeasurable edges": "hybridmap/edge_limits.py",
     "implausible maps": "mapserver/plausibility.py",
     "maps that contradict themselves": "mapserver/plausibility.py",
+    "views that contradict the way": "merge/outlier_rejection/own_views.py",
     "fragments": "mapserver/plausibility.py",
     "unreliable robots": "mapserver/plausibility.py",
     "answers without implausible maps": "mapserver/active_nodes.py",

@@ -44,6 +44,7 @@ from mapweave.mapserver import active_nodes, answers
 from mapweave.mapserver.log import entry
 from mapweave.mapserver.merging import implausible_maps
 from mapweave.mapserver.merging.copies import Copies
+from mapweave.mapserver.merging.own_views_search import OwnViewsSearch
 from mapweave.merge.mutual_exclusion import trajectories
 from mapweave.merge.outlier_rejection import distinctness, wrong_geometry
 from mapweave.merge.outlier_rejection.fleet_chance import FleetChance
@@ -83,6 +84,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
         (implausible_maps, "contradict_themselves", lambda _: {}),
         (implausible_maps, "contradict_each_other", lambda _: {}),
     ),
+    "views that contradict the way": ((OwnViewsSearch, "reason", lambda *_: ""),),
     "false places of one robot": ((FleetChance, "_all_at_one_robot", lambda *_: False),),
     "optimisation in two stages": ((StagedOptimization, "solved", lambda _self, merged, _maps: merged),),
     "torn maps": ((wrong_geometry, "is_torn", lambda *_: False),),

@@ -26,12 +26,17 @@ class ImplausibleMaps:
     def __init__(self) -> None:
         """Nothing is known yet."""
         self._by_itself: dict[MapId, str] = {}
+        self._by_views: dict[MapId, str] = {}
         self.refused = {}
         self.disbelieved = {}
 
     def changed(self, map_id: MapId, hybrid_map: HybridMap) -> None:
         """Look at a map that is new or has changed."""
         self._by_itself[map_id] = implausible(hybrid_map)
+
+    def note_views(self, map_id: MapId, reason: str) -> None:
+        """Note what the views of a map say against its own way; empty for nothing."""
+        self._by_views[map_id] = reason
 
     def note_refusal(self, map_id: MapId, reason: str) -> bool:
         """Note that a change of a map was refused; returns whether it is the first, which is kept."""
@@ -53,6 +58,7 @@ class ImplausibleMaps:
             pruned: maps that had more nodes, which newer ones have superseded.
         """
         odd = contradict_each_other(merged) | contradict_themselves(merged)
-        odd |= {which: reason for which, reason in self._by_itself.items() if reason}
+        for known in (self._by_views, self._by_itself):
+            odd |= {which: reason for which, reason in known.items() if reason}
         odd |= scattered(merged.maps, pruned) | self.disbelieved | self.refused
         return {which: odd[which] for which in sorted(odd.keys() & merged.maps.keys())}

@@ -21,6 +21,7 @@ from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapweave.mapserver.merging.merge_pipeline import MergePipeline
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import Compare, NodeComparisons, compare
+from mapweave.mapserver.merging.own_views_search import OwnViewsSearch
 from mapweave.mapserver.merging.pruning import PrunePlan, Pruning
 from mapweave.mapserver.merging.restart_record import RestartRecord
 from mapweave.mapserver.merging.verification_cache import RecentComparisons, VerificationCache
@@ -99,6 +100,7 @@ class Merger:
         self._isolation = Isolation()
         self._copies, self._copied = Copies(), dict[MapId, str]()
         self._contradictions = WrongGeometrySearch(self.settings.consistency)
+        self._own_views = OwnViewsSearch(self._comparisons)
         self._wrong: dict[MapId, WrongGeometry] = {}
         self._unlinked: dict[MapPair, str] = {}
         self._stale: set[MapPair] = set()
@@ -328,6 +330,8 @@ class Merger:
             self._find_wrong_geometry()
         except Exception:  # a defect with one map must not hold up the merge
             log.exception("the search for maps with wrong geometry failed")
+        for map_id in self._changed:
+            self._hold_against_way(map_id)
         self._leave_unlinked()
         apart = self._set_apart()
         maps = [kept_id for kept_id in self._kept if kept_id not in apart]
@@ -387,6 +391,17 @@ class Merger:
         self._stale = set()
         if before.keys() - self._wrong.keys():
             self.alike.forget()
+
+    def _hold_against_way(self, map_id: MapId) -> None:
+        """Hold the views of a map against its own way."""
+        reason, hybrid_map = "", self._kept[map_id]
+        try:
+            pieces = self._contradictions.pieces(map_id, hybrid_map)
+            compared = self._verdicts.between((map_id, map_id))
+            reason = self._own_views.reason(map_id, hybrid_map, pieces, compared)
+        except Exception:  # a defect with one map must not hold up the merge
+            log.exception("the views of map %s cannot be held against its own way", map_id)
+        self._implausible.note_views(map_id, reason)
 
     def _leave_unlinked(self) -> None:
         """Maps with wrong geometry are joined with no other."""

@@ -168,8 +168,11 @@ class WrongGeometrySearch:
 
     def _main(self, map_id: MapId, hybrid_map: HybridMap) -> Fragment | None:
         """The largest piece of a map."""
-        pieces = self._memory.fragments({map_id: hybrid_map}, self._s)
-        return max(pieces, key=len, default=None)
+        return max(self.pieces(map_id, hybrid_map), key=len, default=None)
+
+    def pieces(self, map_id: MapId, hybrid_map: HybridMap) -> list[Fragment]:
+        """A map by its own edges."""
+        return self._memory.fragments({map_id: hybrid_map}, self._s)
 
     def _tie(self, pair: MapPair, maps: Mapping[MapId, HybridMap], links: Sequence[Link]) -> None:
         """Sort the links between two maps."""

@@ -426,6 +426,8 @@ WAYS: dict[str, Callable[[LieInputs], LyingMessages]] = {
     "copied places": copied_places,
     "altered copied places": altered_places,
     "half copied landmarks": mixed_landmarks,
+    "depths of 1.3": wrong_depths,
+    "lenses in turns": other_lenses,
 }
 UNDECIDABLE: dict[str, Callable[[LieInputs], LyingMessages]] = {
     "another's times": same_times,
@@ -435,9 +437,6 @@ UNDECIDABLE: dict[str, Callable[[LieInputs], LyingMessages]] = {
 server knows tells which of the two robots lies. Answers may become ambiguous."""
 OPEN: dict[str, Callable[[LieInputs], LyingMessages]] = {
     "a way of 1.05": scaled_way,
-    "depths of 1.3": wrong_depths,
-    "lenses in turns": other_lenses,
 }
-"""Maps that contradict themselves or others a little, which no rule finds out yet. Answers may become
-ambiguous, and a scaled one may part the maps of others."""
+"""Maps that contradict others a little, which no rule finds out yet. They may part the maps of others."""
 EVERY: Mapping[str, Callable[[LieInputs], LyingMessages]] = {**WAYS, **UNDECIDABLE, **OPEN}
