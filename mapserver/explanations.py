@@ -34,12 +34,15 @@ def explained(
     """
     merged = router.merged
     if request.ends is None:
-        lengths = length_words(merged, consistency).values()
-        accusations = (*merged.accusations().values(), *lengths)[:MAX_MAPS_LISTED]
+        accusations = (*merged.accusations().values(), *length_words(merged).values())[:MAX_MAPS_LISTED]
         return FleetExplanation(explain_fleet(merged, MAX_MAPS_LISTED), accusations)
     first, second = request.ends
     if isinstance(first, NodeId) and isinstance(second, NodeId):
         if request.route:
             return explain_route(router, first, second, request.blocked, wary)
         return explain_nodes(merged, first, second, None, consistency)
-    return FleetExplanation((explain_maps(merged, MapId(*first[:2]), MapId(*second[:2])),))
+    pair = MapId(*first[:2]), MapId(*second[:2])
+    lengths = length_words(merged)
+    return FleetExplanation(
+        (explain_maps(merged, *pair),), tuple(lengths[which] for which in pair if which in lengths)
+    )

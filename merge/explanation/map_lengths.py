@@ -3,41 +3,35 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 from mapweave.hybridmap.ids import MapId
-from mapweave.merge.outlier_rejection.segmentation import fragments_of
-from mapweave.merge.pose_graph.map_scales import MapScales
-from mapweave.merge.pose_graph.marginalization import is_marginal
+from mapweave.merge.pose_graph.map_scales import undone_in
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.merge.settings import ConsistencySettings
 
 MOST_NAMED = 3
 """Other maps that are named."""
 
 
-def length_words(merged: MergedMap, settings: ConsistencySettings | None = None) -> dict[MapId, str]:
-    """What is said of maps whose lengths are all too long or too short; found again, which takes time.
+def length_words(merged: MergedMap) -> dict[MapId, str]:
+    """What is said of maps whose lengths the merge has corrected.
 
     Args:
         merged: the merged map.
-        settings: as in the merge.
     """
-    links = [link for link in merged.links if len(link.shared) and not is_marginal(link)]
-    links += [r.link for r in merged.refused if r.link is not None and r.edge is None]
-    maps = {which: one for which, one in merged.maps.items() if which not in merged.constraints.retired}
-    links = [link for link in links if all(which in maps for which in link.maps)]
-    pieces = fragments_of(maps, settings or ConsistencySettings())
+    refused = [r.link for r in merged.refused if r.link is not None and r.edge is None]
+    links = [link for link in (*merged.links, *refused) if not link.within]
     out = {}
-    for which, scale in MapScales().of(maps, pieces, links).items():
-        if not scale.undone:
-            continue
-        off = 100.0 * math.expm1(scale.log)
-        some = ", ".join(map(str, scale.others[:MOST_NAMED]))
-        more = f" and {len(scale.others) - MOST_NAMED} more" if len(scale.others) > MOST_NAMED else ""
-        alone = "" if len(scale.others) > 1 else "; which of the two is wrong, nothing shows"
+    for which, log in undone_in(links).items():
+        beside = Counter(one for link in links if which in link.maps for one in link.maps if one != which)
+        others = [one for one, _ in sorted(beside.items(), key=lambda item: (-item[1], item[0]))]
+        some = ", ".join(map(str, sorted(others[:MOST_NAMED])))
+        more = f" and {len(others) - MOST_NAMED} more" if len(others) > MOST_NAMED else ""
+        alone = "" if len(others) > 1 else "; which of the two is wrong, nothing shows"
+        off, way = 100.0 * abs(math.expm1(log)), "long" if log > 0.0 else "short"
         out[which] = (
-            f"all lengths of map {which} are {abs(off):.1f} % too {'long' if off > 0 else 'short'} "
-            f"(sigma {100.0 * scale.sigma:.1f} %) beside {some}{more}{alone}: "
-            f"calibrate the wheels of {which.agent} (mapweave calibrate drive)"
+            f"all lengths of map {which} are about {off:.1f} % too {way} beside "
+            f"those of {some}{more}, and are corrected{alone}: calibrate the wheels of {which.agent} "
+            "(mapweave calibrate drive)"
         )
     return out

@@ -226,6 +226,17 @@ def _same(first: Used, second: Used) -> bool:
     return len(first) == len(second) and all(a is b for a, b in zip(first, second, strict=True))
 
 
+def undone_in(links: Iterable[Link]) -> dict[MapId, float]:
+    """Logarithms of the factors that a merge has undone, as the evidence of its links says."""
+    logs: dict[MapId, float] = {}
+    for link in links:
+        for end, name in zip(link.pair, FACTORS, strict=True):
+            if name in link.evidence:
+                # To the last bit what was undone, whatever a file has rounded.
+                logs[end.map] = STEP * round(math.log(link.evidence[name]) / STEP)
+    return {which: log for which, log in sorted(logs.items()) if log}
+
+
 def corrected_again(
     maps: Mapping[MapId, HybridMap], links: Sequence[Link], about: Iterable[Link] = ()
 ) -> tuple[dict[MapId, HybridMap], list[Link]]:
@@ -236,13 +247,7 @@ def corrected_again(
         links: of the merge, as they were measured.
         about: further links that say what was undone, as refused ones.
     """
-    logs: dict[MapId, float] = {}
-    for link in (*links, *about):
-        for end, name in zip(link.pair, FACTORS, strict=True):
-            if name in link.evidence:
-                # To the last bit what was undone, whatever a file has rounded.
-                logs[end.map] = STEP * round(math.log(link.evidence[name]) / STEP)
-    logs = {which: log for which, log in logs.items() if log and which in maps}
+    logs = {which: log for which, log in undone_in((*links, *about)).items() if which in maps}
     scales = MapScales()
     corrected = [
         scales.corrected_link(link, maps, (logs.get(link.a.map, 0.0), logs.get(link.b.map, 0.0)))
