@@ -1,4 +1,4 @@
-"""The whole mind never drives into what it sees, nor on and on against what it does not see."""
+"""The whole pipeline never drives into what it sees, nor on and on against what it does not see."""
 
 from __future__ import annotations
 

@@ -363,7 +363,6 @@ from pathlib import Path
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.merging.merger import Merger
-from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.server import MapServer
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
