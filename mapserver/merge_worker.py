@@ -257,6 +257,7 @@ class MergeWorker:
         """Stop, and keep what was found. Changes that wait are in the store, for the next start."""
         if self._schedule.close():
             self._save(last=True)
+        self._retry.end()
 
     def _post(self, job: Job) -> None:
         """Post a job after which the merged map is out of date."""
@@ -342,6 +343,8 @@ class MergeWorker:
 
     def _end_reading(self, taken: threading.Event) -> None:
         self._reading, self._read_all, self._begun = False, True, not self._dirty
+        if self._dirty and not self._following:
+            self._retry.begin()
         if self._merger.uncompared:
             self._publish_parts()
         taken.set()
@@ -590,13 +593,14 @@ class MergeWorker:
             return
         except Exception:  # questions are answered from the map before; the next change is the next chance
             log.exception("merging failed")
+            self._retry.end()
             self._problem, self._trouble = f"{FAILED}; {self._lacking}", FAILED
             self._history.failed(FAILED)
             return
         finally:
             self._done, self._begun = self._applied, self._read_all
             self._observe(self._schedule.monotonic() - began)
-        self._retry.succeeded()
+        self._retry.succeeded(self._read_all)
         self._unprepared, self._problem, self._trouble = True, "", ""
         self._unmerged.merged(self._applied)
         self._follow_history(merged)

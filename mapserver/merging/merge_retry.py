@@ -39,13 +39,14 @@ class MergeRetry:
         self._clock = clock
         self._path = None if path is None else path.with_name(path.name + SUFFIX)
         self._ends = self._failures = 0
+        self._first = False
         self._wait_until, self.words = -math.inf, ""
         with suppress(OSError, ValueError):
             if self._path is not None:
                 self._ends = int(self._path.read_text(encoding="ascii"))
         if self._ends:
             times = "" if self._ends == 1 else f" {self._ends} times in a row"
-            words = f"the process ended while it merged{times}, as where the memory does not suffice"
+            words = f"the process ended before it had merged{times}, as where the memory does not suffice"
             self._wait(words, self._ends - 1)
             log.warning("%s", self.words)
 
@@ -54,26 +55,41 @@ class MergeRetry:
         """How long nothing shall be merged yet, s. From any thread."""
         return max(self._wait_until - self._clock(), 0.0)
 
+    def begin(self) -> None:
+        """All is read: take note of an end of the process before it is merged, or `end` is called."""
+        self._first = True
+        self._mark()
+
+    def end(self) -> None:
+        """It is merged, or cannot be, or need not be: an end of the process means nothing now."""
+        self._first = False
+        self._clear()
+
     @contextmanager
     def attempt(self) -> Iterator[None]:
         """Around what may need much memory: takes note of an end of the process meanwhile."""
-        with suppress(OSError):
-            if self._path is not None:
-                self._path.write_text(str(self._ends + 1), encoding="ascii")
+        self._mark()
         try:
             yield
         finally:
-            with suppress(OSError):
-                if self._path is not None:
-                    self._path.unlink(missing_ok=True)
+            if not self._first:
+                self._clear()
 
-    def succeeded(self) -> None:
-        """Something was merged."""
-        self._ends = self._failures = 0
+    def succeeded(self, whole: bool = True) -> None:
+        """Something was merged.
+
+        Args:
+            whole: all that was read; else less, as the constraints before there is a map.
+        """
+        self._failures = 0
+        if whole:
+            self._ends = 0
+            self.end()
 
     def short(self) -> None:
         """There was not enough memory: free what can be, and wait."""
         gc.collect()
+        self.end()
         self._failures += 1
         self._wait(SHORT, self._failures)
         log.error("%s; answers are from the last merged map", self.words)
@@ -83,3 +99,13 @@ class MergeRetry:
         pause = min(FIRST * 2.0 ** (times - 1), LONGEST) if times else 0.0
         self._wait_until = self._clock() + pause
         self.words = f"{words}: merging begins again after {pause:.0f} s" if times else words
+
+    def _mark(self) -> None:
+        with suppress(OSError):
+            if self._path is not None:
+                self._path.write_text(str(self._ends + 1), encoding="ascii")
+
+    def _clear(self) -> None:
+        with suppress(OSError):
+            if self._path is not None:
+                self._path.unlink(missing_ok=True)

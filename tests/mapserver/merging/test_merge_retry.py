@@ -136,7 +136,7 @@ def test_a_process_that_is_killed_while_it_merges_is_noticed(
     killed(path)
     assert not MergeRetry(path).pause, "perhaps by a person"
     (line,) = caplog.messages
-    assert line.startswith("the process ended while it merged, as where")
+    assert line.startswith("the process ended before it had merged, as where")
     for times, least in ((2, FIRST), (3, 2 * FIRST)):
         killed(path)
         retry = MergeRetry(path)
@@ -145,6 +145,12 @@ def test_a_process_that_is_killed_while_it_merges_is_noticed(
         assert (tmp_path / f"s0.sqlite{SUFFIX}").exists()
     retry.succeeded()
     assert not MergeRetry(path).pause, "it merged"
+    retry.begin()
+    with retry.attempt():
+        pass
+    assert (tmp_path / f"s0.sqlite{SUFFIX}").exists(), "a part is done, and nothing is merged yet"
+    retry.end()
+    assert not (tmp_path / f"s0.sqlite{SUFFIX}").exists()
     path.with_name(path.name + SUFFIX).write_text("damaged")
     assert not MergeRetry(path).pause
 
@@ -157,18 +163,37 @@ def test_a_server_that_was_killed_twice_answers_before_it_merges(
     path = tmp_path / "s0.sqlite"
     for _ in range(2):
         killed(path)
-    worker = MergeWorker(LiveSchedule(), 1.0, retry=MergeRetry(path))
+    retry = MergeRetry(path)
+    worker = MergeWorker(LiveSchedule(), 1.0, retry=retry)
     worker.start()
+    retry.succeeded(whole=False)  # as the server, which merges the constraints before there is a map
     logs = looked_around([R0, R1], 3)
     worker.read(change for which in logs for change in numbered(which, logs[which]))
     assert worker.counters().merges == 0
     assert len(worker.answers.merged.poses) == 8, "each map by itself"
     eventually(lambda: "merging begins again after 3 s" in worker.event)
     assert worker.counters().merges == 0 and not worker.begun
+    assert (tmp_path / f"s0.sqlite{SUFFIX}").read_text() == "3"
     eventually(lambda: worker.counters().merges == 1)
     assert len(worker.answers.merged.components) == 1 and not worker.delay
+    assert not (tmp_path / f"s0.sqlite{SUFFIX}").exists()
     worker.close()
     assert not MergeRetry(path).pause
+
+
+def test_a_server_that_ends_in_order_before_it_has_merged_was_not_killed(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    path = tmp_path / "s0.sqlite"
+    killed(path)
+    killed(path)
+    worker = MergeWorker(LiveSchedule(), 1.0, retry=MergeRetry(path))
+    worker.start()
+    logs = looked_around([R0], 3)
+    worker.read(change for which in logs for change in numbered(which, logs[which]))
+    worker.close()
+    caplog.clear()
+    assert not MergeRetry(path).pause and not caplog.records
 
 
 def test_an_intake_that_has_no_memory_ends_the_server_and_loses_nothing(tmp_path: Path) -> None:
