@@ -29,7 +29,7 @@ from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.merge.islands import Islands
 from mapweave.merge.map_maintenance.node_superseding import Superseding
-from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
+from mapweave.merge.outlier_rejection.wrong_geometry import UNSOLVABLE, WrongGeometrySearch
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
 from mapweave.merge.pose_graph.merged_map import MergedMap, WrongGeometry
@@ -399,6 +399,8 @@ class Merger:
             pieces = self._contradictions.pieces(map_id, hybrid_map)
             compared = self._verdicts.between((map_id, map_id))
             reason = self._own_views.reason(map_id, hybrid_map, pieces, compared)
+        except UNSOLVABLE:
+            log.debug("map %s has no way that its views could contradict", map_id)
         except Exception:  # a defect with one map must not hold up the merge
             log.exception("the views of map %s cannot be held against its own way", map_id)
         self._implausible.note_views(map_id, reason)
