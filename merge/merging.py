@@ -227,10 +227,9 @@ def _refused_as_measured(
     if refusal.link is None:
         return refusal
     if refusal.edge is not None:
-        edge = maps[refusal.edge.map].edges[refusal.edge]
-        return (
-            refusal if edge.a_from_b.mean == refusal.link.a_from_b.mean else refuse_edge(edge, refusal.reason)
-        )
+        edge = maps[refusal.edge.map].edges.get(refusal.edge)  # none: a person keeps its nodes apart
+        same = edge is None or edge.a_from_b.mean == refusal.link.a_from_b.mean
+        return refusal if edge is None or same else refuse_edge(edge, refusal.reason)
     link = _as_measured(refusal.link, maps, links)
     return refusal if link is refusal.link else replace(refusal, link=link)
 
