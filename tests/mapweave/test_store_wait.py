@@ -145,7 +145,9 @@ def test_a_server_waits_for_a_database_that_starts_later(tmp_path: Path) -> None
         while messages[-1:] != [b"READY=1"]:
             messages.append(manager.recv(1000))
     assert len(messages) >= LATE, "each second"
-    assert all(re.match(rb"EXTEND_TIMEOUT_USEC=600000000\nSTATUS=postgresql://", one) for one in messages[:-1])
+    assert all(
+        re.match(rb"EXTEND_TIMEOUT_USEC=600000000\nSTATUS=postgresql://", one) for one in messages[:-1]
+    )
     lines = (tmp_path / "log").read_text().splitlines()
     waits = [line for line in lines if "waiting" in line or "store is there" in line]
     assert len(waits) == 2 and "waiting for at most 600 s: postgresql://" in waits[0]
