@@ -244,12 +244,12 @@ def by_scales(
 
     Returns:
         (3, 2) right perturbation of `a_from_b`, m, m, rad, by the natural logarithm of the scale of a, and
-        of b. None without pairs that determine a pose.
+        of b. None without pairs that determine a pose, or where the nodes have not kept their landmarks.
     """
     s = settings or RecognitionSettings()
-    forward = a.landmarks.has_depth[pairs[:, 0]]
-    if len(pairs) < s.least_inliers:
+    if len(pairs) < s.least_inliers or (pairs.max(axis=0) >= (len(a.landmarks), len(b.landmarks))).any():
         return None
+    forward = a.landmarks.has_depth[pairs[:, 0]]
     sightings = [
         _sightings(a.landmarks, a.camera, b.landmarks, b.camera, pairs[forward], s, False, 0.0),
         _sightings(b.landmarks, b.camera, a.landmarks, a.camera, pairs[~forward][:, ::-1], s, True, 0.0),
