@@ -17,16 +17,19 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from enum import StrEnum
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 from msgspec import Meta
 
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.mission_order import AT_START, MissionKind, MissionReport
-from mapweave.mapserver.log.store import Store
-from mapweave.mapserver.mission_relay import MissionRelay
 from mapweave.storage.full_disks import logged
 from mapweave.wire.each_robot import in_parallel
+
+# Settings are read before large libraries are.
+if TYPE_CHECKING:
+    from mapweave.mapserver.log.store import Store
+    from mapweave.mapserver.mission_relay import MissionRelay
 
 log = logging.getLogger(__name__)
 
