@@ -56,7 +56,7 @@ def test_a_server_whose_start_fails_leaves_nothing_running(
 ) -> None:
     """The process aborted behind its message when the interpreter ended within such a library."""
 
-    def fail(*parts: object) -> None:
+    def fail(*parts: object, **named: object) -> None:
         raise InvalidFile("the database system is starting up")
 
     before = set(threading.enumerate())
