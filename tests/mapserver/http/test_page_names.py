@@ -22,9 +22,10 @@ CORRECTIONS = "return [...document.querySelectorAll('#corrections li')].map(one 
 PLACES = "return [...document.querySelectorAll('#places li')].map(one => one.textContent)"
 KEEP_ANNOUNCED = """
 window.announced = "";
-const said = document.getElementById("announcement");
-const keep = new MutationObserver(() => { window.announced += said.textContent + "\\n"; });
-keep.observe(said, { childList: true });
+const keep = new MutationObserver(changes => {
+  for (const { addedNodes } of changes) for (const words of addedNodes) window.announced += words.textContent + "\\n";
+});
+keep.observe(document.getElementById("announcement"), { childList: true });
 """
 
 
