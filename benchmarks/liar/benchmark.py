@@ -12,8 +12,8 @@ compared with what they have without the fourth robot: the links among their map
 and the answers to lost robots; views to which an honest fourth robot changes the answer are left out. A lie
 is contained if links and answers are the same and no node has moved by more than 5 cm: an honest fourth one
 moves them by 2 to 3 cm. It is named if the history that the page shows holds it against the robot. Some ways
-cannot be found out (`UNDECIDABLE`), and some no rule finds out yet (`OPEN`): they are measured, and not
-counted.
+cannot be found out (`UNDECIDABLE`), and some are merged and not named (`OPEN`): they are measured, and
+not counted.
 
 With `--rules` all ways that can be found out are tried with all rules, and without each. With `--margins` the
 ways of `margins.py` are, each without the one rule that contains it. With `--recovery` a person retires what
