@@ -438,6 +438,6 @@ server knows tells which of the two robots lies. Answers may become ambiguous.""
 OPEN: dict[str, Callable[[LieInputs], LyingMessages]] = {
     "a way of 1.05": scaled_way,
 }
-"""Maps that contradict others a little. The merge undoes what is off (mapweave.merge.pose_graph.map_scales); the
-status of robots does not name them."""
+"""Maps that contradict others a little. The merge undoes what is off; the status of robots does not name them
+(see mapweave.merge.pose_graph.map_scales)."""
 EVERY: Mapping[str, Callable[[LieInputs], LyingMessages]] = {**WAYS, **UNDECIDABLE, **OPEN}
