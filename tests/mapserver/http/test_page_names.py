@@ -23,7 +23,8 @@ PLACES = "return [...document.querySelectorAll('#places li')].map(one => one.tex
 KEEP_ANNOUNCED = """
 window.announced = "";
 const keep = new MutationObserver(changes => {
-  for (const { addedNodes } of changes) for (const words of addedNodes) window.announced += words.textContent + "\\n";
+  for (const { addedNodes } of changes)
+    for (const words of addedNodes) window.announced += words.textContent + "\\n";
 });
 keep.observe(document.getElementById("announcement"), { childList: true });
 """
