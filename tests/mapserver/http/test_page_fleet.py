@@ -100,10 +100,11 @@ class Fleet:
         return report
 
     def moved(self, robot: str, seconds: float) -> float:
-        """How far a robot gets in a time, m."""
-        before = self.stands(robot)
-        time.sleep(seconds)
-        return pose_error(self.stands(robot), before)[0]
+        """How far a robot gets in a time of the simulation, which may be slower than the clock, m."""
+        before = self._control.status()
+        end = before.stamp_ns + round(1e9 * seconds)
+        eventually(lambda: self._control.status().stamp_ns >= end, PATIENCE)
+        return pose_error(self.stands(robot), before.robots[robot].world_from_robot)[0]
 
     def stands(self, robot: str) -> Pose2:
         """Where a robot is."""
