@@ -113,6 +113,8 @@ def test_one_of_several_standbys_may_become_the_primary() -> None:
         servers.close()
 
 
+@pytest.mark.slow
+@pytest.mark.waits
 def test_a_pooler_whose_server_is_down_is_waited_for() -> None:
     servers = started()
     server = next(servers)

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import pytest
+
 from mapweave.mapserver.map_files import map_file_of, merged_of
 from mapweave.merge.explanation.map_lengths import length_words
 from mapweave.merge.pose_graph.component import Component
@@ -16,6 +18,7 @@ from tests.merge.pose_graph.test_map_scales import longer
 SEED, FACTOR = 9413, 1.04
 
 
+@pytest.mark.slow
 def test_a_corrected_map_is_adopted_bit_by_bit_and_named(tmp_path: Path) -> None:
     fleet = draw_fleet(SEED, SCENES["room"], OdometryFault.NONE)
     maps = {**fleet.maps, ODD: longer(fleet.maps[ODD], FACTOR, FACTOR)}
