@@ -110,6 +110,7 @@ def server(folder: Path, store: str, *options: str, **environment: str) -> Itera
 
 
 @pytest.mark.slow
+@pytest.mark.waits
 @pytest.mark.timeout(300)
 def test_a_server_waits_for_a_database_that_starts_later(tmp_path: Path) -> None:
     databases = started()
@@ -155,6 +156,7 @@ def test_a_server_waits_for_a_database_that_starts_later(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
+@pytest.mark.waits
 def test_a_server_ends_at_once_where_there_is_no_such_database(
     postgres: PostgresServer, tmp_path: Path
 ) -> None:
@@ -165,6 +167,7 @@ def test_a_server_ends_at_once_where_there_is_no_such_database(
 
 
 @pytest.mark.slow
+@pytest.mark.waits
 def test_a_server_that_waits_can_be_stopped_and_gives_up(tmp_path: Path) -> None:
     pytest.importorskip("psycopg")
     nowhere = f"postgresql://anna@127.0.0.1:{free_port()}/maps"

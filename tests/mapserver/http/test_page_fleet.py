@@ -193,6 +193,7 @@ def test_robots_that_drive_are_watched_and_sent(fleet: Fleet, browser: Browser) 
 
 
 @pytest.mark.slow
+@pytest.mark.waits
 @needs_simulator
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 @pytest.mark.timeout(600)

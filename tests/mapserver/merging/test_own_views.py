@@ -56,7 +56,7 @@ def merged(fleet: FaultyFleet, lie: Lie = honest, left_out: frozenset[MapId] = f
     return merger.merged()
 
 
-@pytest.mark.parametrize("seed", first_quick([33001, 33002], 1))
+@pytest.mark.parametrize("seed", first_quick([33001, 33002], 1, 1))
 @pytest.mark.parametrize("lie", [too_deep, other_lens])
 def test_a_map_whose_views_contradict_its_own_way_is_named(lie: Lie, seed: int) -> None:
     fleet = draw_fleet(seed, SCENES["room"], OdometryFault.NONE, stops=2)
@@ -68,7 +68,7 @@ def test_a_map_whose_views_contradict_its_own_way_is_named(lie: Lie, seed: int) 
     assert {link.pair for link in found.links if ODD not in link.maps} == {link.pair for link in alone.links}
 
 
-@pytest.mark.parametrize("seed", first_quick([33001, 33002], 1))
+@pytest.mark.parametrize("seed", first_quick([33001, 33002], 1, 1))
 @pytest.mark.parametrize("fault", [OdometryFault.NONE, OdometryFault.SLIP, OdometryFault.CARRIED])
 def test_views_do_not_contradict_a_way_that_slipped_once(fault: OdometryFault, seed: int) -> None:
     """Wrong geometry has rules of its own: one slip is no share by which all is too long."""

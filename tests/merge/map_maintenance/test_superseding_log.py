@@ -28,6 +28,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.maps import changes_of
 from synthetic.world import room, take_map
 from tests.examined import examined_once
+from tests.quick import first_quick
 
 HOUR_NS = 3_600_000_000_000
 HONEST = [MapId(f"r{k}", 1) for k in range(4)]
@@ -131,9 +132,7 @@ def test_a_node_that_a_pruned_one_superseded_before_is_judged_again() -> None:
     assert step.without(frozenset()) == step
 
 
-@pytest.mark.parametrize(
-    "seed", [SEEDS[0], *(pytest.param(one, marks=pytest.mark.slow) for one in SEEDS[1:])]
-)
+@pytest.mark.parametrize("seed", first_quick(SEEDS, 1, 2))
 @settings(max_examples=6, deadline=None)
 @given(
     order=st.permutations(HONEST),
