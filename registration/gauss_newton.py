@@ -127,17 +127,11 @@ def refine(stack: Stack, start: Array, scale_sigma: float, shift_sigma: float = 
     Returns:
         The pose, or None if the inliers do not determine one.
     """
-    improved = improve(stack, start, GAUSS_NEWTON_STEPS)
-    if improved is None:
+    solution = _solution(stack, start)
+    if solution is None:
         return None
-    state, moved = improved
-    linear = linearise(stack, state, moved)
-    products = normal_equations(linear, state[3])
+    state, moved, linear, products, covariance = solution
     inliers = linear.inliers
-    if not inliers.any() or not determined(of_pose_alone(products)):
-        return None
-    # (3, 4): of the pose, with itself and with the pitch.
-    covariance = np.linalg.inv(products[1:, 1:])[:3]
     freedom = max(int(np.where(stack.measured, 3, 2)[inliers].sum()) - 3, 1)
     mean_square = float(linear.distance2[inliers].sum()) / freedom
     alone = covariance = covariance * max(1.0, mean_square)
@@ -169,6 +163,21 @@ def by_scales(stack: Stack, start: Array) -> Array | None:
         (3, 2) right perturbation of the pose, m, m, rad; of the forward points' side first. None if the
         inliers do not determine a pose.
     """
+    solution = _solution(stack, start)
+    if solution is None:
+        return None
+    _, moved, linear, _, covariance = solution
+    changes = [covariance @ _gradient(linear, change) for change in _common_scales(stack, linear, moved)]
+    return np.stack(changes, axis=1)
+
+
+def _solution(stack: Stack, start: Array) -> tuple[Array, Array, Linear, Array, Array] | None:
+    """Bring a pose to its best; None if its inliers do not determine one.
+
+    Returns:
+        (4,) state and moved points as of `improve`, linearised there, normal equations, and (3, 4) covariance
+        of the pose, with itself and with the pitch.
+    """
     improved = improve(stack, start, GAUSS_NEWTON_STEPS)
     if improved is None:
         return None
@@ -177,9 +186,8 @@ def by_scales(stack: Stack, start: Array) -> Array | None:
     products = normal_equations(linear, state[3])
     if not linear.inliers.any() or not determined(of_pose_alone(products)):
         return None
-    covariance = np.linalg.inv(products[1:, 1:])[:3]
-    changes = [covariance @ _gradient(linear, change) for change in _common_scales(stack, linear, moved)]
-    return np.stack(changes, axis=1)
+    covariance = np.asarray(np.linalg.inv(products[1:, 1:])[:3], np.float64)
+    return state, moved, linear, products, covariance
 
 
 def _common_scales(stack: Stack, linear: Linear, points: Array) -> list[Array]:
