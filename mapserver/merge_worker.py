@@ -10,16 +10,17 @@ from datetime import UTC, datetime
 from functools import partial
 from itertools import islice
 
-from mapweave.hybridmap.change import Change, NodePut
+from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.counted import counted
-from mapweave.hybridmap.errors import InvalidFile, MapweaveError
-from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
-from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merging.merge_adoption import MergeAdoption
+from mapweave.mapserver.merging.merge_handover import MOST_WORDS, MergeHandover
+from mapweave.mapserver.merging.merge_intake import MergeIntake
 from mapweave.mapserver.merging.merge_retry import SHORT, MergeRetry
 from mapweave.mapserver.merging.merge_sharing import MergeSharing
 from mapweave.mapserver.merging.merger import Merger
@@ -33,7 +34,6 @@ from mapweave.mapserver.schedule import Job, Schedule
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from mapweave.storage.full_disks import logged
-from mapweave.wire.fair_queue import FairQueue
 
 log = logging.getLogger(__name__)
 
@@ -43,19 +43,11 @@ SEARCHES_AT_ONCE = 20
 """Nodes whose similar nodes are searched at once, before new changes are taken in."""
 PREPARED_AT_ONCE = 4
 """Nodes whose aliasing is evaluated at once, likewise."""
-SHARE, QUICK = 0.05, 0.05
-"""Of the time that it may take to hand merges over, where one takes longer than so many seconds."""
 RETRY = 5.0
 """s between two looks whether merging is to be tried again for which there was too little memory."""
 LOOK = 1.0
 """s between two looks for a merge that can be adopted, while there is none."""
-LATE = 2.0
-"""s that something waits for the leader's merge before it is looked whether that one has a trouble ..."""
-SILENT = 60.0
-"""... and so many with no merge before this server says so: a merge of a large map takes half a minute."""
 FAILED = "merging failed: see the server's log"
-MOST_WORDS = 1000
-"""Characters of an event in a status message."""
 
 
 class MergeWorker:
@@ -92,20 +84,18 @@ class MergeWorker:
         """
         self._schedule = schedule
         self._sharing = sharing
+        self._handover = MergeHandover(sharing, schedule.monotonic) if sharing else None
         # Until it is known which server leads this one follows.
         self._adoption = MergeAdoption(sharing, pruning, schedule.monotonic) if sharing else None
         self._following, self._alone = sharing is not None, ""
-        self._own_merges = self._shared_merges = self._term = 0
-        self._share_at = 0.0
+        self._own_merges = 0
         self._waiting_for: list[threading.Event] = []
         self._keeper, self._pruning = keeper, pruning
         self._history = history or MapHistory()
         self._observe = observe
         self._share_of_time = share
         self._merger = Merger(places, merge, compare, schedule.pause)
-        self._fresh: dict[NodeId, Node] = {}
-        self._last: dict[MapId, int] = {}
-        """The last change of each log that was taken in."""
+        self._intake = MergeIntake(self._merger, pruning)
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._unprepared = False
         self._read_all = self._begun = self._waits_for_memory = False
@@ -114,7 +104,6 @@ class MergeWorker:
         self._merger.suspect(self._history.set_apart)
         for map_id, reason in self._history.disbelieved:
             self._merger.note_disbelief(map_id, reason)
-        self._waiting: FairQueue[Change] = FairQueue(0, 0)
         self._counting = threading.Lock()
         self._came = self._applied = self._done = 0
         self._retry = retry or MergeRetry(clock=schedule.monotonic)
@@ -178,11 +167,7 @@ class MergeWorker:
         the change in when its turn comes, and its result for the place database is final.
         """
         self._schedule.observe(change.stamp_ns)
-        if isinstance(change.body, NodePut):
-            self._fresh[change.body.node.id] = change.body.node
-            self._merger.places.announce(change.body.node)
-        with self._counting:
-            self._waiting.put(change.map.agent, change, bounded=False)
+        self._intake.put(change)
         self._post(self._take_next)
 
     def counters(self) -> MergerCounters:
@@ -192,11 +177,11 @@ class MergeWorker:
     def queues(self) -> Mapping[str, int]:
         """Changes that wait to be taken in, or for another server's merge, and nodes to be compared."""
         compare = 0 if self._following else self._merger.uncompared
-        return {"merge": len(self._waiting), "leader": self.behind, "comparisons": compare}
+        return {"merge": len(self._intake), "leader": self.behind, "comparisons": compare}
 
     def unmerged(self, robot: str) -> int:
         """Changes of a robot that wait to be taken in: robots take turns."""
-        return self._waiting.waiting(robot)
+        return self._intake.waiting(robot)
 
     def read(self, changes: Iterable[Change]) -> None:
         """Take in all that is in a store, map by map in the order of its log, once this has started.
@@ -211,7 +196,7 @@ class MergeWorker:
         self._reading = True
         try:
             while some := list(islice(rest, READ_AT_ONCE)):
-                self._post(partial(self._read, some))
+                self._post(partial(self._intake.read, some))
         finally:
             self._schedule.post(lambda: self._end_reading(taken))
         self._schedule.catch_up()
@@ -350,31 +335,18 @@ class MergeWorker:
         taken.set()
 
     def _take_next(self) -> None:
-        with self._counting:
-            _, change = self._waiting.pop()
+        change = self._intake.pop()
         if self._following and self._adoption:
             self._adoption.hold(self._applied + 1, change)
         else:
-            self._take(change)
-
-    def _take_held(self, changes: list[Change]) -> None:
-        """Take in what was held back, without comparing nodes."""
-        if changes:
-            self._read(changes)
-            self._merger.counters.changes += len(changes)
-        for change in changes:
-            if isinstance(change.body, NodePut):
-                self._forget(change.body.node)
-                self._check_pruned(change.body.node.id)
+            self._intake.take(change)
 
     def _look(self) -> None:
         """Lead or follow, as the store says."""
-        if self._adoption is None or self._sharing is None:
+        if self._adoption is None or self._handover is None or self._sharing is None:
             return
         if self._sharing.leads:
-            if self._term != self._sharing.term:
-                self._term, self._shared_merges = self._sharing.term, -1
-                self._sharing.begin()
+            self._handover.lead()
             if self._following:
                 self._adopt()
                 self._go_on()
@@ -395,7 +367,9 @@ class MergeWorker:
             self._done = self._applied
             self._unmerged.merged(self._done)
             self._release()
-        problem = self._adoption.reason or self._leaders_trouble()
+        problem = self._adoption.reason
+        if not problem and (trouble := self._adoption.leaders_trouble(self._unmerged.seconds)):
+            problem = f"{trouble}; {self._lacking}"
         if problem != self._problem and not self._adoption.reason and problem:
             log.warning("%s", problem)
         self._problem = problem
@@ -412,26 +386,13 @@ class MergeWorker:
         since = datetime.fromtimestamp(began, UTC)
         return f"the map lacks what came since {since:%Y-%m-%d %H:%M} UTC"
 
-    def _leaders_trouble(self) -> str:
-        """Why the server that leads, and is there, hands over nothing new though something waits for it."""
-        if self._adoption is None or self._sharing is None or self._unmerged.seconds < LATE:
-            return ""
-        leader = self._sharing.leader or "another server"
-        try:
-            if trouble := self._sharing.trouble:
-                return f"{leader} leads, and says: {trouble}; {self._lacking}"
-        except InvalidFile:  # the store is away, which is said elsewhere
-            return ""
-        if min(self._unmerged.seconds, self._adoption.unchanged) < SILENT:
-            return ""
-        words = f"{leader} leads, and for more than {SILENT:.0f} s has not merged what this server knows"
-        return f"{words}; {self._lacking}"
-
     def _adopt(self) -> None:
         if self._adoption is None:
             return
         try:
-            merged = self._adoption.adopt(self._merger, self._take_held, self._has_merged, self._last)
+            merged = self._adoption.adopt(
+                self._merger, self._intake.take_held, self._has_merged, self._intake.last
+            )
             if merged is None:
                 return
             self._own_merges = self._merger.counters.merges
@@ -457,7 +418,7 @@ class MergeWorker:
                 self._adoption.hand_over(self._merger, self._has_merged)
             except Exception:  # it can all be found out again
                 log.exception("what the server that led has found cannot be used: nodes are compared again")
-            self._take_held(self._adoption.release())
+            self._intake.take_held(self._adoption.release())
         self._following, self._dirty = False, True
         waiting, self._waiting_for = self._waiting_for, []
         for merged in waiting:
@@ -469,80 +430,14 @@ class MergeWorker:
             merged.set()
 
     def _share(self) -> float | None:
-        """Hand the newest merge over to the servers that follow, if that takes little of the time."""
-        merges = self._merger.counters.merges
-        if self._sharing is None or not self._sharing.followed:
+        """Hand the newest merge over to the servers that follow; see `MergeHandover.write`."""
+        if self._handover is None:
             return None
-        self._sharing.tell(self._trouble)
-        if merges == self._shared_merges:
-            return None
-        began = self._schedule.monotonic()
-        if began < self._share_at:
-            return self._share_at - began
-        if not self._dirty:
-            try:
-                self._sharing.write(self._merger, self._last, self._pruning.mark if self._pruning else None)
-                self._trouble = ""
-            except Exception as error:  # the next merge is the next chance
-                log.exception("a merge is not handed over")
-                words = f"a merge cannot be handed over ({type(error).__name__}: {error})"
-                self._trouble = words[:MOST_WORDS]
-            self._sharing.tell(self._trouble)
-            self._shared_merges = merges
-            took = self._schedule.monotonic() - began
-            if took > QUICK:
-                self._share_at = self._schedule.monotonic() + took / SHARE
-        return None
-
-    def _take(self, change: Change) -> None:
-        if isinstance(change.body, NodePut):
-            newest = self._fresh.get(change.body.node.id)
-            if newest is not None and newest is not change.body.node:
-                return  # The same node is put again by a change that waits: the last one counts.
-            self._apply(change)
-            self._forget(change.body.node)
-            self._check_pruned(change.body.node.id)
-        else:
-            self._apply(change)
-
-    def _check_pruned(self, node: NodeId) -> None:
-        if self._pruning:
-            try:
-                self._pruning.came(node, self._merger)
-            except InvalidFile as error:  # it stays until the next start
-                log.warning("%s", error)
-            except Exception:  # likewise; a defect with one node must not end the taking in of others
-                log.exception("%s may be pruned, and stays", node)
-
-    def _forget(self, node: Node) -> None:
-        if self._fresh.get(node.id) is node:
-            del self._fresh[node.id]
-
-    def _read(self, changes: list[Change]) -> None:
-        self._last |= {change.map: change.sequence for change in changes}
-        try:
-            self._merger.read((change.map, change.body) for change in changes)
-        except Exception:  # a log may be replayed: a defect in one change must not stop the others
-            log.exception("the changes in the store are taken in one by one")
-            for change in changes:
-                self._apply(change)
-
-    def _apply(self, change: Change) -> None:
-        # A change that was damaged comes again behind later ones.
-        self._last[change.map] = max(change.sequence, self._last.get(change.map, 0))
-        try:
-            self._merger.on_change(change)
-        except MapweaveError as error:
-            log.warning("change %s of %s is not merged: %s", change.sequence, change.map, error)
-        except Exception:  # a defect with one change must not end all merging
-            log.exception("change %s of %s is not merged", change.sequence, change.map)
+        mark = self._pruning.mark if self._pruning else None
+        return self._handover.write(self._merger, self._intake.last, mark, self._dirty, self._trouble)
 
     def _answers_from(self, merged: MergedMap) -> Answers:
-        return Answers.of(self._merger, merged, self._node)
-
-    def _node(self, node_id: NodeId) -> Node | None:
-        """A node, also one that is not with the merger yet."""
-        return self._fresh.get(node_id) or self._merger.node(node_id)
+        return Answers.of(self._merger, merged, self._intake.node)
 
     def _search_pairs(self) -> None:
         """A part of the work before the first merge, which must not hold up new changes."""
@@ -606,7 +501,7 @@ class MergeWorker:
         self._follow_history(merged)
         try:
             now_ns = self._schedule.time_ns()
-            if self._pruning and self._pruning.prune(self._merger, now_ns, self._last):
+            if self._pruning and self._pruning.prune(self._merger, now_ns, self._intake.last):
                 self._dirty = True
         except InvalidFile as error:  # it is tried again the next day
             if not logged(error):

@@ -39,6 +39,10 @@ RETRY = 1.0
 """s between two attempts to read a merge that cannot be read: it may just be written."""
 AGAIN = 60.0
 """s after which a server that merges itself for that reason, or after a failure, tries to follow again."""
+LATE = 2.0
+"""s that something waits for the leader's merge before it is looked whether that one has a trouble ..."""
+SILENT = 60.0
+"""... and so many with no merge before this server says so: a merge of a large map takes half a minute."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,14 +94,27 @@ class MergeAdoption:
         return self._held[0][0] if self._held else None
 
     @property
-    def unchanged(self) -> float:
-        """For how long no merge has been handed over, s, as far as this server has looked."""
-        return self._clock() - self._read_at
-
-    @property
     def overdue(self) -> bool:
         """Whether it is time to merge without a leader."""
         return bool(self.reason) and self._clock() >= self._since + self._wait
+
+    def leaders_trouble(self, waited: float) -> str:
+        """Why the server that leads, and is there, hands over nothing new though something waits for it.
+
+        Args:
+            waited: for how long something has, s.
+        """
+        if waited < LATE:
+            return ""
+        leader = self._sharing.leader or "another server"
+        try:
+            if trouble := self._sharing.trouble:
+                return f"{leader} leads, and says: {trouble}"
+        except InvalidFile:  # the store is away, which is said elsewhere
+            return ""
+        if min(waited, self._clock() - self._read_at) < SILENT:
+            return ""
+        return f"{leader} leads, and for more than {SILENT:.0f} s has not merged what this server knows"
 
     def begin(self) -> None:
         """This server follows from now on."""

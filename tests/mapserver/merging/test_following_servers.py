@@ -26,7 +26,6 @@ from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RelocalizeAnswer, View
-from mapweave.mapserver import merge_worker
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.explainer import ConstraintRecord
 from mapweave.mapserver.log.entry import ReceivedChange
@@ -335,7 +334,7 @@ def test_a_follower_says_that_its_leader_cannot_merge_and_how_old_its_map_is(
 def test_a_follower_says_that_its_leader_stands_still(
     servers: Servers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(merge_worker, "SILENT", 3.0)
+    monkeypatch.setattr(merge_adoption, "SILENT", 3.0)
     changes = numbered(drives(1))
     servers.start("s0", "s1")
     servers.send(changes[:24])
