@@ -226,3 +226,11 @@ class Missions:
             turns[robot] += 1
         kept = (report for _, report in sorted(ranked, key=lambda one: one[0])[:MAX_KEPT])
         return Missions(tuple(sorted(kept, key=lambda report: report.order.rank)))
+
+    def awaited(self) -> set[str]:
+        """The robots that get a mission once they are back, other than a stop."""
+        return {
+            report.order.robot
+            for report in self.reports
+            if report.state is MissionState.SENT and report.order.kind is not MissionKind.STOP
+        }

@@ -183,14 +183,21 @@ class MissionRelay:
         via: tuple[str, ...] = (),
         because: str = "",
     ) -> MissionRequest:
-        """A mission that is given now, and is newer than the one that holds the robot.
+        """A mission that is given now, and is newer than the one that holds the robot or waits for it.
 
         Raises:
             InvalidValue: the goal is missing or too long, or there is one too many; a name is none.
         """
         status = None if self.roster is None else self.roster.status(robot)
         report = None if status is None else status.mission
-        stamp_ns = later_stamp(self._time_ns(), 0 if report is None else report.order.stamp_ns)
+        with self._turn:
+            given = [
+                one.order.stamp_ns
+                for one in self._reports.values()
+                if one.order.robot == robot and one.state is MissionState.SENT
+            ]
+        holding = 0 if report is None else report.order.stamp_ns
+        stamp_ns = later_stamp(self._time_ns(), max([holding, *given]))
         mission_id = check_name(mission_id) if mission_id else new_id()
         if len(via) > MAX_VIA:
             raise InvalidValue(f"a mission passes at most {MAX_VIA} places, not {len(via)}")

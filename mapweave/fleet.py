@@ -20,7 +20,7 @@ from mapweave.connection import ANSWERED, reach
 from mapweave.fleet_constraints import FleetConstraints
 from mapweave.fleet_map import FleetMap
 from mapweave.hybridmap.agent_status import SILENT, AgentStatus, FleetStatus, RobotEntry
-from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
+from mapweave.hybridmap.errors import InvalidValue, MapweaveError, NotConnected, Refused
 from mapweave.hybridmap.ids import NodeId, check_name
 from mapweave.hybridmap.mission_order import (
     MAX_KEPT,
@@ -55,6 +55,10 @@ TRIES = 3
 """A mission given by a clock that is behind is given again, later than the robot's present one."""
 
 
+class Silent(NotConnected):
+    """A robot does not answer."""
+
+
 def connect(
     endpoint: str | Sequence[str] = "tcp/127.0.0.1:7447",
     fleet: str = "demo",
@@ -82,11 +86,12 @@ def send_order(
         sender: holder of the key with which the bus is connected; empty without one.
 
     Raises:
-        NotConnected: the robot does not answer, or does not take it.
+        Silent: the robot does not answer.
+        NotConnected: it does not take it.
     """
     replies = bus.ask(sent_by(keys.mission(order.robot), sender), encode(order), timeout)
     if not replies:
-        raise NotConnected(
+        raise Silent(
             f"robot {order.robot} does not answer: is its agent running? `mapweave status` lists the robots"
         )
     if replies[0].error:
@@ -283,18 +288,20 @@ class Fleet(FleetMap, FleetConstraints):
     def stop(self, robot: str = "", because: str = "") -> tuple[MissionReport, ...]:
         """Stop a robot, or all of them; the orders go to the robots directly, and at once.
 
+        Where a robot does not answer, the map server gets the order (state SENT): it gives the robot no
+        mission of before any more, and the stop once it is back.
+
         Args:
-            robot: which; all without a name.
+            robot: which; without a name all that are there, and all that wait for a mission.
             because: why, for the history.
 
         Raises:
-            NotConnected: one does not answer, or not as it should; the others are stopped.
+            NotConnected: one does not answer and no map server knows it, or it does not answer as it should;
+                the others are stopped.
         """
         self._check_role()
-        names = [check_name(robot)] if robot else [e.robot for e in self.status().robots if e.alive]
-        return tuple(
-            each_robot(names, lambda name: self._direct(name, MissionKind.STOP, None, "", (), because))
-        )
+        names = [check_name(robot)] if robot else self._stoppable()
+        return tuple(each_robot(names, lambda name: self._stop(name, because)))
 
     def portal_done(self, robot: str) -> str:
         """Tell a robot that it was taken through the portal at which it waits; it looks where it is then.
@@ -382,11 +389,12 @@ class Fleet(FleetMap, FleetConstraints):
         wait: float,
         via: tuple[str, ...] = (),
         because: str = "",
+        after_ns: int = 0,
     ) -> MissionReport:
-        """Give a mission by way of the map server; without one directly."""
+        """Give a mission by way of the map server, later than the stamp; without one directly."""
         check_name(robot)
         self._check_role()
-        report, after_ns = None, 0
+        report = None
         for _ in range(TRIES):
             stamp_ns = later_stamp(time.time_ns(), after_ns)
             request = MissionRequest(new_id(), robot, kind, stamp_ns, self._by, goal, via, because)
@@ -424,6 +432,26 @@ class Fleet(FleetMap, FleetConstraints):
                 break
             after_ns = self._newest(robot)
         return report
+
+    def _stoppable(self) -> list[str]:
+        """The robots that are there, and those that a map server would give a mission once they are back."""
+        names = {entry.robot for entry in self.status().robots if entry.alive}
+        # Without a server none waits for a mission.
+        for reply in self._bus.ask(self._keys.any_missions(), b"", ANSWERED):
+            if not reply.error:
+                names |= decode(reply.payload, Missions).awaited()
+        return sorted(names)
+
+    def _stop(self, robot: str, because: str) -> MissionReport:
+        """Stop a robot, directly; one that does not answer by way of the map server."""
+        try:
+            return self._direct(robot, MissionKind.STOP, None, "", (), because)
+        except Silent as silent:
+            try:
+                after_ns = max((report.order.stamp_ns for report in self.missions(robot)), default=0)
+            except MapweaveError:
+                raise silent from None
+            return self._give(robot, MissionKind.STOP, "", 0.0, because=because, after_ns=after_ns)
 
     def _newest(self, robot: str) -> int:
         """Stamp of the mission that holds a robot."""

@@ -354,12 +354,13 @@ class Questions:
         by, because = _author(request), _because(request)
 
         def stop() -> Mapping[str, Any]:
-            names = [entry.robot for entry in self._server.robots().robots if entry.alive]
+            names = {entry.robot for entry in self._server.robots().robots if entry.alive}
+            names |= self._server.missions().awaited()
 
             def one(name: str) -> MissionReport:
                 return self._server.give(name, MissionKind.STOP, "", by, "", (), because)
 
-            return json_values(Missions(tuple(each_robot(names, one))))
+            return json_values(Missions(tuple(each_robot(sorted(names), one))))
 
         return await run_in_threadpool(stop)
 

@@ -77,8 +77,8 @@ def add_to(commands: Any) -> None:
         "stop",
         help="stop a robot, or all",
         description="Stop a robot, `mapweave stop r0`, or all, `mapweave stop --all`. The order goes to the "
-        "robots directly, and works without a map server. Exit status: 0 if every robot took it, "
-        f"{NOT_TAKEN}",
+        "robots directly, and works without a map server; a robot that is away gets it once it is back, "
+        f"and no mission of before. Exit status: 0 if every robot took it, {NOT_TAKEN}",
     )
     which = stop.add_mutually_exclusive_group(required=True)
     which.add_argument("robot", nargs="?", type=values.name, help="the robot's name, for example r0")
@@ -148,7 +148,7 @@ def run_stop(arguments: argparse.Namespace) -> int:
     if not reports and not arguments.json:
         print("no robot is there")
     _print(reports, arguments.json)
-    return _exit_status(reports, False)
+    return _exit_status(reports, False, sent_is_good=False)
 
 
 def run_missions(arguments: argparse.Namespace) -> int:
@@ -210,8 +210,11 @@ def _print(reports: list[MissionReport], as_json: bool) -> None:
     print(json.dumps({"missions": [json_values(report) for report in reports]}))
 
 
-def _exit_status(reports: list[MissionReport], waited: bool) -> int:
+def _exit_status(reports: list[MissionReport], waited: bool, sent_is_good: bool = True) -> int:
+    """A stop that has not reached its robot is not good: the robot may drive."""
     from mapweave.hybridmap.mission_order import MissionState
 
-    good = {MissionState.DONE} if waited else {MissionState.DONE, MissionState.RUNNING, MissionState.SENT}
+    good = {MissionState.DONE} if waited else {MissionState.DONE, MissionState.RUNNING}
+    if sent_is_good and not waited:
+        good.add(MissionState.SENT)
     return DONE if all(report.state in good for report in reports) else NO

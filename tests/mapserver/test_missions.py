@@ -150,6 +150,26 @@ def test_a_robot_that_is_away_gets_its_newest_mission_when_it_is_back(house: Hou
     link.close()
 
 
+@pytest.mark.parametrize("by", ["name", "all", "http"])
+def test_a_robot_that_is_away_gets_no_mission_from_before_it_was_stopped(house: House, by: str) -> None:
+    """The stop failed, and the robot drove off once it was back."""
+    link, _ = house.robot()
+    link.close()
+    eventually(lambda: not house.entry("r0").alive)
+    assert house.person.go("r0", str(THERE)).state is MissionState.SENT
+    if by == "http":
+        with Web(("127.0.0.1", 0), house.server) as web:
+            states = [report["state"] for report in ask(web, "POST", "/stop")[1]["reports"]]
+    else:
+        states = [report.state for report in house.person.stop("r0" if by == "name" else "")]
+    assert states == ["sent"], "who stops it must hear that it does not answer"
+    assert [one.state for one in house.person.missions()] == [MissionState.REPLACED, MissionState.SENT]
+    link, control = house.robot()
+    eventually(lambda: control.report is not None)
+    assert control.report is not None and control.report.order.kind is MissionKind.STOP
+    link.close()
+
+
 def test_a_goal_is_of_the_map_that_a_robot_makes_now(house: House) -> None:
     """Right after a start of the server its status has not come, and after its own its last one is older."""
     bus, first = house.bus(), min(house.mapped.truth)

@@ -134,6 +134,17 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
         bus.close()
 
 
+def test_a_stop_that_has_not_reached_its_robot_is_no_success(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order = MissionOrder.new("r0", MissionKind.STOP, "anna")
+    states = iter((MissionState.SENT, MissionState.DONE))
+    person = SimpleNamespace(stop=lambda robot, because: (MissionReport(order, next(states)),))
+    monkeypatch.setattr("mapweave.commands.missions.fleet_of", lambda arguments: nullcontext(person))
+    assert [main(["stop", "r0"]), main(["stop", "--all"])] == [NO, 0]
+    assert f"r0: stop, mission {order.id}, sent" in capsys.readouterr().out
+
+
 ASKING = {
     "status": [], "go": ["r0", "home"], "explore": ["r0"], "stop": ["r0"], "map fetch": ["out.mapweave"],
     "map explain": ["r0.1", "r1.1"], "map route": ["r0.1.1", "r0.1.2"], "map history": [],
