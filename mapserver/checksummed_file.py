@@ -8,9 +8,10 @@ from __future__ import annotations
 import hashlib
 import io
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,22 +25,61 @@ DIGEST = 32
 """Bytes of SHA-256."""
 
 
-def seal(path: Path, magic: bytes, parts: Iterable[NDArray[Any]]) -> None:
-    """Write the file, or replace it at once when all is on the disk.
+@dataclass(frozen=True)
+class FileKind(Generic[Value]):
+    """Values of one kind as such files.
 
-    Args:
-        path: of the file; its folder must be there.
+    Attributes:
         magic: the first line.
-        parts: arrays of plain numbers.
-
-    Raises:
-        InvalidFile: the disk does not take it.
+        header: the format, and what else must be the same when it is read.
+        parts: arrays of plain numbers, of a value.
+        read: the value of the same arrays.
+        lack: what a file is that has none, for example "is no map".
     """
-    write_whole(path, sealed(magic, parts))
+
+    magic: bytes
+    header: Mapping[str, Any]
+    parts: Callable[[Value], Iterable[NDArray[Any]]]
+    read: Callable[[Iterator[NDArray[Any]]], Value]
+    lack: str
+
+    def save(self, path: Path, value: Value, made_by: str) -> None:
+        """Write a file, or replace it at once when all is on the disk.
+
+        Args:
+            path: of the file; its folder must be there.
+            value: to be kept.
+            made_by: settings and version of what made it, in words.
+
+        Raises:
+            InvalidFile: the disk does not take it.
+        """
+        write_whole(path, self.packed(value, made_by))
+
+    def packed(self, value: Value, made_by: str) -> memoryview:
+        """The bytes of the file; see `save`."""
+        return sealed(self.magic, (json_part({**self.header, "made_by": made_by}), *self.parts(value)))
+
+    def load(self, source: Path | bytes, made_by: str) -> Value:
+        """Read a file.
+
+        Args:
+            source: the file, or its bytes.
+            made_by: as it was saved; what other versions have made is not used.
+
+        Raises:
+            InvalidFile: there is none, it is damaged, or it was made otherwise; with the reason.
+        """
+        return read_sealed(source, self.magic, {**self.header, "made_by": made_by}, self.read, self.lack)
 
 
 def sealed(magic: bytes, parts: Iterable[NDArray[Any]]) -> memoryview:
-    """The bytes of such a file; see `seal`."""
+    """The bytes of such a file.
+
+    Args:
+        magic: the first line.
+        parts: arrays of plain numbers.
+    """
     out = io.BytesIO()
     out.write(magic)
     for part in parts:

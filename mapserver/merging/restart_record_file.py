@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,7 +19,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.hybridmap.limits import MAX_LANDMARKS, MAX_NUMBER, MAX_POSITION
 from mapweave.hybridmap.superseded import Superseded
-from mapweave.mapserver.checksummed_file import json_part, read_json, read_sealed, seal, sealed
+from mapweave.mapserver.checksummed_file import FileKind, json_part, read_json
 from mapweave.mapserver.merging.restart_record import RestartRecord
 from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, RecentComparisons
 from mapweave.merge.map_maintenance.superseding_log import MOST, Changes, SupersedingLog
@@ -32,43 +31,7 @@ JUDGED, COMPARED = 1, 2
 """What is known of a node: bits."""
 
 
-def save(path: Path, record: RestartRecord, made_by: str) -> None:
-    """Write the file, or replace it at once.
-
-    Args:
-        path: of the file.
-        record: to be kept.
-        made_by: settings and version of what made it, in words.
-
-    Raises:
-        InvalidFile: the disk does not take it.
-    """
-    seal(path, MAGIC, _parts(record, made_by))
-
-
-def packed(record: RestartRecord, made_by: str) -> memoryview:
-    """The bytes of the file; see `save`."""
-    return sealed(MAGIC, _parts(record, made_by))
-
-
-def load(source: Path | bytes, made_by: str) -> RestartRecord:
-    """Read the file.
-
-    Args:
-        source: the file, or its bytes.
-        made_by: as it was saved; what other versions had superseded is not used.
-
-    Raises:
-        InvalidFile: there is none, it is damaged, or it was made otherwise; with the reason.
-    """
-    return read_sealed(source, MAGIC, _header(made_by), _read, "is no record of this version")
-
-
-def _header(made_by: str) -> dict[str, Any]:
-    return {"format": FORMAT, "made_by": made_by}
-
-
-def _parts(record: RestartRecord, made_by: str) -> Iterator[NDArray[Any]]:
+def _parts(record: RestartRecord) -> Iterator[NDArray[Any]]:
     recent = record.recent
     nodes = sorted(recent.prints)
     row = {node: k for k, node in enumerate(nodes)}
@@ -77,7 +40,6 @@ def _parts(record: RestartRecord, made_by: str) -> Iterator[NDArray[Any]]:
     joined = {map_id for part in (*record.log.joined, *parted) for map_id in part}
     agents = sorted({n.agent for n in (*nodes, *logged)} | {m.agent for m in (*record.unsure, *joined)})
     number = {agent: k for k, agent in enumerate(agents)}
-    yield json_part(_header(made_by))
     yield json_part(agents)
     yield _ids(nodes, number)
     yield np.frombuffer(b"".join(recent.prints[n] for n in nodes), np.uint8).reshape(-1, PRINT_BYTES)
@@ -266,3 +228,7 @@ def _of(part: NDArray[Any], kind: type[np.generic], columns: int | None = None) 
 def _in_range(rows: NDArray[Any], ends: Sequence[int], least: Sequence[int] | int = 0) -> None:
     if not ((rows >= least) & (rows < ends)).all():
         raise InvalidValue("a number is out of range")
+
+
+FILE = FileKind(MAGIC, {"format": FORMAT}, _parts, _read, "is no record of this version")
+save, packed, load = FILE.save, FILE.packed, FILE.load

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -17,7 +16,7 @@ from numpy.typing import NDArray
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.landmark_tables import VERSION as TABLES
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.mapserver.checksummed_file import json_part, read_json, read_sealed, seal, sealed
+from mapweave.mapserver.checksummed_file import FileKind, json_part, read_json
 from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, VerificationCache
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.links import Link, RefusedLink
@@ -27,48 +26,11 @@ MAGIC = b"mapweave verdicts\n"
 FORMAT = 1
 
 
-def save(path: Path, findings: VerificationCache, made_by: str) -> None:
-    """Write the file, or replace it at once.
-
-    Args:
-        path: of the file.
-        findings: to be kept.
-        made_by: settings and version of what found them, in words.
-
-    Raises:
-        InvalidFile: the disk does not take it.
-    """
-    seal(path, MAGIC, _parts(findings, made_by))
-
-
-def packed(findings: VerificationCache, made_by: str) -> memoryview:
-    """The bytes of the file; see `save`."""
-    return sealed(MAGIC, _parts(findings, made_by))
-
-
-def load(source: Path | bytes, made_by: str) -> VerificationCache:
-    """Read the file.
-
-    Args:
-        source: the file, or its bytes.
-        made_by: as it was saved; results of other versions are not used.
-
-    Raises:
-        InvalidFile: there is none, it is damaged, or it was made otherwise; with the reason.
-    """
-    return read_sealed(source, MAGIC, _header(made_by), _read, "are no verdicts of this version")
-
-
-def _header(made_by: str) -> dict[str, Any]:
-    return {"format": FORMAT, "tables": TABLES, "made_by": made_by}
-
-
-def _parts(findings: VerificationCache, made_by: str) -> Iterator[NDArray[Any]]:
+def _parts(findings: VerificationCache) -> Iterator[NDArray[Any]]:
     nodes = sorted(findings.prints)
     row = {node: k for k, node in enumerate(nodes)}
     agents = sorted({node.agent for node in nodes})
     number = {agent: k for k, agent in enumerate(agents)}
-    yield json_part(_header(made_by))
     yield json_part(agents)
     yield np.array([(number[n.agent], n.epoch, n.number) for n in nodes], np.int64).reshape(-1, 3)
     yield np.frombuffer(b"".join(findings.prints[n] for n in nodes), np.uint8).reshape(-1, PRINT_BYTES)
@@ -141,3 +103,7 @@ def _rows(pairs: Sequence[Pair], row: dict[NodeId, int]) -> NDArray[np.int64]:
 
 def _pairs(rows: NDArray[np.int64], nodes: Sequence[NodeId]) -> list[Pair]:
     return [(nodes[a], nodes[b]) for a, b in rows.tolist()]
+
+
+FILE = FileKind(MAGIC, {"format": FORMAT, "tables": TABLES}, _parts, _read, "are no verdicts of this version")
+save, packed, load = FILE.save, FILE.packed, FILE.load
