@@ -21,7 +21,7 @@ from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
-from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId, read_number
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.mapserver.log import sqlite_store
 from mapweave.mapserver.log.opening import is_postgres
@@ -180,6 +180,19 @@ def open_map(path: Path | str) -> OpenedMap:
     return _of_journal(path) if source is MapSource.JOURNAL else _of_store(path)
 
 
+def _not_yet(path: Path) -> str:
+    """Where the map of an agent is whose file, for example `r0.1.mapweave`, is not written yet."""
+    name = path.name.removesuffix(".mapweave")
+    robot, _, number = name.partition(".")
+    kept = path.with_name(f"{robot}.sqlite")
+    if name == path.name or read_number(number) is None or not kept.exists():
+        return ""
+    return (
+        f" yet: the agent of {robot} writes it when it ends; while it runs ask the server, `mapweave map fetch "
+        f"FILE`, and after it was killed take it from the journal, `mapweave map extract {kept}`"
+    )
+
+
 def source_of(path: Path, live: bool = False) -> MapSource:
     """What a file is, by its content.
 
@@ -193,7 +206,7 @@ def source_of(path: Path, live: bool = False) -> MapSource:
     if path.is_dir():
         raise InvalidFile(f"{path}: is a folder; give a map file, or a server's or agent's .sqlite in it")
     if not path.exists():
-        raise InvalidFile(f"{path}: no such file")
+        raise InvalidFile(f"{path}: no such file{_not_yet(path)}")
     if not path.is_file():
         raise InvalidFile(f"{path}: cannot be read (not a regular file)")
     try:

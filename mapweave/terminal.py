@@ -124,13 +124,13 @@ class Bar:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Show the last state. What was quick, or has failed, ends without a plain line."""
+        """Show the last state. What was quick, has failed or has no steps ends without a plain line."""
         if self._bar is not None:
             self._bar[0].stop()
             return
         self._over.set()
         self._waiting.join()
-        if self._said and error is None:
+        if self._said and error is None and (self._done or self._total is not None):
             self._say()
 
     def advance(self, steps: float = 1, detail: str = "") -> None:

@@ -29,6 +29,7 @@ from mapweave.cli import main
 from mapweave.hybridmap.annotation import Annotation, Place
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart, RetiredNodes
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
@@ -386,3 +387,18 @@ def test_the_same_map_has_the_same_hash_however_it_is_written(shuffle: random.Ra
 )
 def test_another_map_has_another_hash(other: MapFile) -> None:
     assert content_hash(other) != content_hash(WHOLE)
+
+
+def test_the_map_of_an_agent_that_runs_is_said_to_be_in_its_journal(tmp_path: Path) -> None:
+    """`no such file`, said `map show` of the map that the agent was making."""
+    (tmp_path / "r0.sqlite").touch()
+    for name, words in {
+        "r0.1": f"{tmp_path / 'r0.1.mapweave'}: no such file yet: the agent of r0 writes it when it ends; "
+        "while it runs ask the server, `mapweave map fetch FILE`, and after it was killed take it from the "
+        f"journal, `mapweave map extract {tmp_path / 'r0.sqlite'}`",
+        "r1.1": f"{tmp_path / 'r1.1.mapweave'}: no such file",
+        "r0": f"{tmp_path / 'r0.mapweave'}: no such file",
+    }.items():
+        with pytest.raises(InvalidFile) as error:
+            open_map(tmp_path / f"{name}.mapweave")
+        assert str(error.value) == words
