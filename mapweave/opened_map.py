@@ -188,8 +188,8 @@ def _not_yet(path: Path) -> str:
     if name == path.name or read_number(number) is None or not kept.exists():
         return ""
     return (
-        f" yet: the agent of {robot} writes it when it ends; while it runs ask the server, `mapweave map fetch "
-        f"FILE`, and after it was killed take it from the journal, `mapweave map extract {kept}`"
+        f" yet: the agent of {robot} writes it when it ends; while it runs ask the server, `mapweave map "
+        f"fetch FILE`, and after it was killed take it from the journal, `mapweave map extract {kept}`"
     )
 
 

@@ -86,6 +86,14 @@ def test_every_panel_of_the_board_asks_for_what_is_there(labels: dict[str, set[s
     assert len({panel["id"] for panel in board["panels"]}) == len(board["panels"])
 
 
+def test_whatever_an_alert_watches_is_on_the_board() -> None:
+    """`MapweaveMapOld` came, and no panel showed for how long changes had waited."""
+    board, alerts = ((FOLDER / name).read_text() for name in ("grafana.json", "alerts.yml"))
+    watched = {*re.findall(r"\bmapweave_\w+", "\n".join(re.findall("expr:.*", alerts)))}
+    assert len(watched) > 8
+    assert watched <= {*re.findall(r"\bmapweave_\w+", board)}
+
+
 def test_every_alert_asks_for_what_is_there(labels: dict[str, set[str]]) -> None:
     (group,) = YAML(typ="safe").load(FOLDER / "alerts.yml")["groups"]
     assert {"MapweaveRobotLagging", "MapweaveGap", "MapweaveStoreFailing"} <= {
