@@ -5,6 +5,7 @@ from __future__ import annotations
 import signal
 import subprocess
 from collections.abc import Iterator
+from contextlib import ExitStack, closing
 
 import psycopg
 import pytest
@@ -103,6 +104,28 @@ def test_no_database_user_or_password_comes_by_waiting(server: PostgresServer) -
         rules.write_text(before)
         server.process.send_signal(signal.SIGHUP)
         eventually(lambda: not refused(server.address()))
+
+
+def test_a_server_with_too_many_sessions_takes_another_one_later() -> None:
+    servers = started("-c", "max_connections=8", "-c", "superuser_reserved_connections=3")
+    server = next(servers)
+    address = server.address().replace("mapweave@", "anna@")
+    try:
+        with psycopg.connect(server.address(), autocommit=True) as owner:
+            owner.execute("CREATE ROLE anna LOGIN")
+        with ExitStack() as others:
+            for user in (address, server.address()):
+                # The slots of all, then those of superusers: refused after and before it is known who asks.
+                while not refused(user):
+                    others.enter_context(closing(psycopg.connect(user)))
+                assert away(address), refused(address)
+        eventually(lambda: not refused(address))
+        assert not away(server.address("none").replace("mapweave@", "anna@"))
+        with psycopg.connect(server.address(), autocommit=True) as owner:
+            owner.execute("ALTER ROLE anna CONNECTION LIMIT 0")
+        assert "too many connections for role" in refused(address) and away(address)
+    finally:
+        servers.close()
 
 
 def test_one_of_several_standbys_may_become_the_primary() -> None:
