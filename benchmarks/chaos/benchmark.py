@@ -135,8 +135,15 @@ def relocalize_gaps(fleet: FleetProcesses, seed: int, progress: Progress) -> lis
     views = [ScriptedRobot(k, seed).view for k in range(len(fleet.agents))]
     gaps: list[float] = []
     with LostRobot(fleet.endpoints, views) as robot:
+
+        def recognised() -> bool:
+            fleet.check()
+            return robot.recognised(SERVERS)
+
         for kind, victim, lasts in ATTACKS:
-            wait_until(lambda: robot.recognised(SERVERS), START, "not both servers recognise a place")
+            if not comes_true(recognised, START):
+                said = "; ".join(robot.missing)
+                raise ChildFailed(f"not both servers recognise a place after {START:g} s: {said}")
             if not gaps:
                 robot.start()
             progress.update(bar, description=f"a lost robot asks: {victim} {kind}")

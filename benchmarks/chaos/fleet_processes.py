@@ -134,6 +134,7 @@ class FleetProcesses:
             status, now = process.poll(), time.monotonic()
             if status == 1 and name in SERVERS and NO_DATABASE in self._last_line(name):
                 if now > self._ended_at.setdefault(name, now) + RESTART:
+                    process.communicate()
                     self.start(name)
             elif status is not None and not (done and status == 0 and name in self.agents):
                 raise ChildFailed(f"{name} ended with status {status}: {self._last_line(name)}")

@@ -19,13 +19,22 @@ from mapweave.wire.messages import decode, encode_view
 from mapweave.wire.senders import sent_by
 from mapweave.wire.zenoh_bus import ZenohBus
 
-NAME = "lost"
+NAME, LOOKER = "lost", "looks"
+"""Of the robot, and of who looks whether the servers know the place: a server takes one question of a robot
+at a time, and the robot's next one is under way all the time."""
+TIMEOUT = 3.0
+"""Of a look, s."""
 PAUSE = 0.15
 """Between an answer and the next question, s. A server answers a robot ten times a second in the long run."""
 
 
 class LostRobot:
-    """A robot's link that asks where it is, again and again. A context manager."""
+    """A robot's link that asks where it is, again and again. A context manager.
+
+    Attributes:
+        found: when an answer had a place, s of the system's monotonic clock.
+        missing: what servers answered instead when it was looked last whether all recognise a place.
+    """
 
     def __init__(self, endpoints: Sequence[str], views: Sequence[View]) -> None:
         """Connect.
@@ -39,6 +48,7 @@ class LostRobot:
         self._views, self._stop = list(views), threading.Event()
         self._thread = threading.Thread(target=self._run, name="lost robot")
         self.found: list[float] = []
+        self.missing: list[str] = []
 
     def __enter__(self) -> LostRobot:
         """Connected; see `start`."""
@@ -58,7 +68,9 @@ class LostRobot:
         One view in five shows too little to be sure of.
         """
         for view in self._views:
-            if all(self._found(view, server) for server in servers):
+            said = {server: self._asked(view, server) for server in servers}
+            self.missing = [f"{server}: {words}" for server, words in said.items() if words]
+            if not self.missing:
                 self._views = [view]
                 return True
         return False
@@ -72,10 +84,15 @@ class LostRobot:
         times = [begin, *(t for t in self.found if begin < t < end), end]
         return max(b - a for a, b in pairwise(times))
 
-    def _found(self, view: View, server: str) -> bool:
-        key = sent_by(Keys(FLEET).relocalize(server), NAME)
-        replies = [one for one in self._bus.ask(key, encode_view(view), 3.0) if not one.error]
-        return any(decode(one.payload, RelocalizeAnswer).certainty is Certainty.FOUND for one in replies)
+    def _asked(self, view: View, server: str) -> str:
+        """Ask one server; why the place is not found, or nothing."""
+        key = sent_by(Keys(FLEET).relocalize(server), LOOKER)
+        replies = self._bus.ask(key, encode_view(view), TIMEOUT)
+        answers = [decode(one.payload, RelocalizeAnswer) for one in replies if not one.error]
+        if any(one.certainty is Certainty.FOUND for one in answers):
+            return ""
+        refused = [f"refused, {one.error}" for one in replies if one.error]
+        return "; ".join([f"{one.certainty}, {one.reason}" for one in answers] + refused) or "no answer"
 
     def _run(self) -> None:
         number = 0

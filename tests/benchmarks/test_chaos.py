@@ -13,14 +13,16 @@ from contextlib import closing
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
+from typing import ClassVar
 
 import pytest
+from rich.progress import Progress
 
 from benchmarks.chaos.account import Account, BrokenLog, account, sent_changes
 from benchmarks.chaos.agent_process import STAMP, digest
-from benchmarks.chaos.benchmark import comes_true, good, percentile, together
+from benchmarks.chaos.benchmark import comes_true, good, percentile, relocalize_gaps, together
 from benchmarks.chaos.disorder import ChangeListener, DisorderedBus, flag
-from benchmarks.chaos.fleet_processes import FleetProcesses
+from benchmarks.chaos.fleet_processes import NO_DATABASE, FleetProcesses
 from benchmarks.chaos.recovery import NEVER, RobotTimes, recoveries
 from benchmarks.chaos.schedule import KILLS, LEAST_KILLS, Kind, draw_schedule
 from benchmarks.chaos.scripted_robot import ScriptedRobot
@@ -29,6 +31,7 @@ from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.scenarios.children import ChildFailed
 from mapweave.wire.codec import element_of, encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Mark
@@ -287,6 +290,56 @@ def test_a_server_that_has_ended_by_itself_is_neither_frozen_nor_thawed(tmp_path
         fleet.end_disturbance(Kind.STOP, "s0")
         eventually(lambda: fleet._running["s0"].poll() == 0)
         fleet.end_disturbance(Kind.STOP, "s0")
+
+
+class PatientRobot:
+    """Recognised by both servers once a file is there; it asks nothing itself."""
+
+    there: ClassVar[Path]
+    missing: ClassVar = ["s0: there", "s1: no answer"]
+
+    def __init__(self, *_: object) -> None:
+        pass
+
+    def __enter__(self) -> PatientRobot:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        pass
+
+    def recognised(self, servers: tuple[str, ...]) -> bool:
+        return servers == ("s0", "s1") and self.there.exists()
+
+    def start(self) -> None:
+        pass
+
+    def longest_gap(self, begin: float, end: float) -> float:
+        return max(begin - end, 0.0)
+
+
+def test_a_server_that_found_no_database_is_started_again_before_robots_ask(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also when it ends behind the last disturbance; and who is missing is named."""
+    monkeypatch.setattr("benchmarks.chaos.benchmark.LostRobot", PatientRobot)
+    monkeypatch.setattr("benchmarks.chaos.benchmark.ATTACKS", ((Kind.STOP, "s1", 0.0),))
+    monkeypatch.setattr("benchmarks.chaos.fleet_processes.RESTART", 0.1)
+    script = (
+        "import pathlib, sys; first, there = map(pathlib.Path, sys.argv[1:])\n"
+        "if first.exists(): there.touch(); input()\n"
+        f"first.touch(); sys.exit('{NO_DATABASE}')"
+    )
+    PatientRobot.there = tmp_path / "there"
+    with FleetProcesses(tmp_path, 1, 1, "sqlite") as fleet, Progress(disable=True) as progress:
+        fleet._commands["s0"] = [
+            sys.executable, "-c", script, str(tmp_path / "first"), str(PatientRobot.there),
+        ]  # fmt: skip
+        fleet.start("s0")
+        assert relocalize_gaps(fleet, 1, progress) == [0.0]
+        PatientRobot.there = tmp_path / "never"
+        monkeypatch.setattr("benchmarks.chaos.benchmark.START", 0.1)
+        with pytest.raises(ChildFailed, match=r"not both servers recognise a place .*; s1: no answer"):
+            relocalize_gaps(fleet, 1, progress)
 
 
 @pytest.mark.slow
