@@ -10,6 +10,11 @@ export const placeNames = () => annotations.filter(one => one.body.kind === "pla
 export const placeNamed = name => annotations.find(one => one.body.kind === "place" && one.name === name);
 // The node at a place, or the one that its area, edge or plan hangs on.
 export const nodeOf = ({ body }) => body.node || body.area?.anchor || body.edge?.[0] || body.pairs?.[0].node || body.a;
+// The corners of all areas, on the plane.
+export const areaCorners = model => annotations.flatMap(({ body: { area } }) => {
+  const anchor = model.rowOf(area?.anchor);
+  return anchor === undefined ? [] : area.corners.map(([x, y]) => model.inNode(anchor, x, y));
+});
 
 // What it is, in a word or two; in the list with its figures.
 const kindOf = ({ body }) => body.kind === "floor" ? `floor ${body.label}`

@@ -1,7 +1,7 @@
 // The page: what comes over the WebSocket goes to the map and the panels, what is chosen on one shows on all.
 import { add, button, byId, counted, draw, listed, made, say } from "./dom.js";
 import { colours, edgeColour, followTheme, hue } from "./colours.js";
-import { drawAnnotations, loadAnnotations } from "./annotations.js";
+import { areaCorners, drawAnnotations, loadAnnotations } from "./annotations.js";
 import { permit } from "./changes.js";
 import { listCorrections } from "./corrections.js";
 import { Drawing } from "./drawing.js";
@@ -27,7 +27,7 @@ import { watch } from "./live.js";
 
 const PICK = 14;              // px about what is pressed
 const EDGE = 30;              // px from the edge of the map, at which the selected robot is moved to its middle
-const NEAR = 0.25;            // of the extent of the map, within which robots beside it are shown too
+const NEAR = 0.25;            // of the extent of the map, within which robots and areas beside it are shown too
 const MOST_NAMES = 500;       // in the list that helps searching
 const SAID_EVERY = 10000;       // ms, between two looks at annotations and plans
 
@@ -37,7 +37,7 @@ const selection = new Selection(model), drawing = new Drawing(viewport, corners 
 const planEditor = new PlanEditor(model, viewport, moved);
 const panel = new EditPanel(model, selection, drawing, { moved, planning: openPlan });
 const page = { robots: [], goals: [], commands: false, whyNot: "", node: "", robot: "", photo: [], places: [],
-  readOnly: false, loading: true };
+  readOnly: false, loading: true, areas: "" };
 // For tests and measurements.
 window.mapweave = { model, viewport, painter, page, selection, drawing, planEditor };
 
@@ -145,11 +145,11 @@ function find(text) {
   byId("query").setCustomValidity(byId("query").title);
   byId("query").reportValidity();
 }
-// Of all nodes, and of the robots that are not far from them.
+// Of all nodes, and of the robots and the corners of areas that are not far from them.
 function extent() {
   const box = model.bounds(), reach = box && NEAR * Math.max(box[2] - box[0], box[3] - box[1], 4);
   const grown = box?.slice();
-  for (const { x, y } of painter.robots) {
+  for (const [x, y] of [...painter.robots.map(robot => [robot.x, robot.y]), ...areaCorners(model)]) {
     if (!box || x < box[0] - reach || y < box[1] - reach || x > box[2] + reach || y > box[3] + reach) continue;
     grown[0] = Math.min(grown[0], x); grown[1] = Math.min(grown[1], y);
     grown[2] = Math.max(grown[2], x); grown[3] = Math.max(grown[3], y);
@@ -289,6 +289,10 @@ async function loadSaid() {
   if (!places) return;
   page.places = places;
   listNames();
+  // Robots alone let the view stay as it is.
+  const areas = String(areaCorners(model));
+  if (!viewport.touched && areas !== page.areas) viewport.fit(extent());
+  page.areas = areas;
   painter.ask();
 }
 setInterval(loadSaid, SAID_EVERY);

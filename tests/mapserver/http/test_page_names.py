@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import pytest
 
 from mapweave.hybridmap.annotation import Annotation, Place
+from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.constraint_subject import RetiredWindow
 from mapweave.mapserver.http.web import Web
 from mapweave.mapserver.server import MapServer
@@ -116,6 +117,37 @@ def test_what_another_person_says_is_shown_at_once(browser: Browser, server: Map
                 eventually(lambda name=name: f"{name} place" in page.run(PLACES))
     finally:
         browser.devtools("Page.removeScriptToEvaluateOnNewDocument", identifier=script["identifier"])
+
+
+AROUND = """
+const m = mapweave.model, row = m.rowOf('%s'), [left, bottom, right, top] = m.bounds();
+const corners = [[left - %s, bottom], [right, bottom - %s], [right + %s, top], [left, top + %s]];
+return corners.map(([x, y]) => m.toNode(row, x, y));
+"""
+HALL_IN_VIEW = """
+const m = mapweave.model, row = m.rowOf('%s');
+return %s.every(([x, y]) => mapweave.viewport.holds(...m.inNode(row, x, y), 0));
+"""
+
+
+def test_the_whole_map_is_shown_with_the_areas_that_people_have_named(
+    person: Person, server: MapServer
+) -> None:
+    """Of a hall that is wider than its nodes the edge was beyond the window."""
+    page = person.page
+    page.look(320, 600)
+    wide, far = (page.run(AROUND % (FIRST, m, m, m, m)) for m in (0.9, 50.0))
+    person.press("fit")
+    scale = page.run("return mapweave.viewport.scale")
+    # One that reaches very far makes nothing small.
+    server.annotate(Annotation("town", Place(area=Area(FIRST, tuple(map(tuple, far)))), False, "bob", 1))
+    eventually(lambda: any("town place" in one for one in page.run(PLACES)))
+    person.press("fit")
+    assert page.run("return mapweave.viewport.scale") == scale
+    server.annotate(Annotation("hall", Place(area=Area(FIRST, tuple(map(tuple, wide)))), False, "bob", 1))
+    eventually(lambda: page.run(HALL_IN_VIEW % (FIRST, wide)))
+    person.press("fit")
+    assert page.run(HALL_IN_VIEW % (FIRST, wide))
 
 
 def test_a_place_that_was_replaced_is_restored(person: Person, server: MapServer) -> None:
