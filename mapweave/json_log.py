@@ -28,14 +28,26 @@ class JsonFormatter(logging.Formatter):
             "time": when.isoformat(timespec="milliseconds").replace("+00:00", "Z"),
             "level": record.levelname.lower(),
             "logger": record.name,
-            "message": " ".join(record.getMessage().split()),
+            "message": one_line(record.getMessage()),
             **self._fields,
             **_named(record.args),
             **{name: value for name, value in vars(record).items() if name not in USUAL},
         }
         if record.exc_info:
             line["exception"] = self.formatException(record.exc_info)
-        return json.dumps(line, ensure_ascii=False, default=str)
+        return escaped(json.dumps(line, ensure_ascii=False, default=str))
+
+
+def one_line(text: str) -> str:
+    """Text as a log or a terminal shows it, whoever wrote it: nothing in it controls the terminal."""
+    return escaped(" ".join(text.split()))
+
+
+def escaped(text: str) -> str:
+    """The text with all that is not printable as in JSON: escape sequences, marks that turn the direction."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() else json.dumps(c)[1:-1] for c in text)
 
 
 def _named(arguments: object) -> dict[str, str]:

@@ -12,9 +12,9 @@ import time
 from collections.abc import Callable, Iterable, Iterator, Sized
 from datetime import datetime
 from types import TracebackType
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
-from mapweave.json_log import JsonFormatter, json_line
+from mapweave.json_log import JsonFormatter, escaped, json_line, one_line
 
 if TYPE_CHECKING:
     # A server prints lines alone.
@@ -46,19 +46,33 @@ def log_with_time(log_format: str = "text", **fields: str) -> None:
         log_format: `text`, or `json` for one object a line, see `mapweave.json_log`.
         fields: that every object has.
     """
-    if log_format == "text":
-        logging.basicConfig(format="%(asctime)s %(message)s", datefmt=STAMP)
-    else:
-        handler = logging.StreamHandler()
-        handler.setFormatter(JsonFormatter(**fields))
-        logging.basicConfig(handlers=[handler])
+    handler = logging.StreamHandler()
+    handler.setFormatter(TextFormatter() if log_format == "text" else JsonFormatter(**fields))
+    logging.basicConfig(handlers=[handler])
+
+
+class TextFormatter(logging.Formatter):
+    """Time and message in one line, whatever is in it; then the exception, if there is one."""
+
+    def __init__(self) -> None:
+        """Nothing to set."""
+        super().__init__("%(asctime)s %(message)s", STAMP)
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        """The line."""
+        record.message = one_line(record.message)
+        return super().formatMessage(record)
+
+    def formatException(self, ei: Any) -> str:
+        """The lines of an exception, which may have words of others."""
+        return "\n".join(map(escaped, super().formatException(ei).split("\n")))
 
 
 def stamped(line: str) -> str:
     """An event as a line of a log, with the time."""
     if (as_json := json_line(line)) is not None:
         return as_json
-    return f"{datetime.now().strftime(STAMP)} {' '.join(line.split())}"
+    return f"{datetime.now().strftime(STAMP)} {one_line(line)}"
 
 
 class EventLog:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import time
 from collections.abc import Callable
 
 from mapweave.hybridmap.errors import Busy, MapweaveError
@@ -24,6 +25,10 @@ DEFAULT_LIMIT = 16384
 """Tasks that may wait: half a minute of a hundred robots at five messages a second."""
 MOST_BYTES = 2**26
 """Of messages and questions that may wait: as many changes of 4 kB."""
+EVERY = 60.0
+"""s within which one failed message of a robot is logged: a flood must not become a flood of log lines."""
+MOST_ROBOTS = 4096
+"""Whose failures are counted; one more forgets that of the longest ago."""
 FULL_PAUSE = 1.0
 """After what time a question that found the queue full may be asked again, s."""
 
@@ -80,7 +85,8 @@ class Dispatcher:
             except MapweaveError as error:
                 request.refuse(str(error))
             except Exception as error:
-                log.exception("a handler of %s failed", request.key)
+                if (also := failures.count(request.key)) is not None:
+                    log.exception("a handler of %s failed%s", request.key, also)
                 request.refuse(f"internal error: {type(error).__name__}")
 
         if not self._put(task, request.key, len(request.payload)):
@@ -136,6 +142,42 @@ def guarded(call: Callable[[], None], key: str) -> None:
     try:
         call()
     except MapweaveError as error:
-        log.warning("%s: %s", key, error)
+        if (also := failures.count(key)) is not None:
+            log.warning("%s: %s%s", key, error, also)
     except Exception:
-        log.exception("a handler of %s failed", key)
+        if (also := failures.count(key)) is not None:
+            log.exception("a handler of %s failed%s", key, also)
+
+
+class Failures:
+    """Messages with which a handler failed: one a minute of each robot is logged. Thread-safe."""
+
+    def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
+        """Take a clock that only grows, s."""
+        self._clock, self._lock = clock, threading.Lock()
+        self._since: dict[str, tuple[float, int]] = {}
+
+    def count(self, key: str) -> str | None:
+        """Count one.
+
+        Args:
+            key: of the message or question. What is in no robot's name is logged each time.
+
+        Returns:
+            How many were not logged since the last one that was, in words; None if this one is not to be.
+        """
+        robot, now = robot_of(key), self._clock()
+        if not robot:
+            return ""
+        with self._lock:
+            since, more = self._since.pop(robot, (now - EVERY, 0))
+            due = now - since >= EVERY
+            self._since[robot] = (now, 0) if due else (since, more + 1)
+            if len(self._since) > MOST_ROBOTS:
+                del self._since[next(iter(self._since))]
+        if not due:
+            return None
+        return f" ({more} more of {robot} within {now - since:.0f} s)" if more else ""
+
+
+failures = Failures()

@@ -19,6 +19,7 @@ import pytest
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.json_log import JsonFormatter
+from mapweave.terminal import TextFormatter, stamped
 from mapweave.wire.log_messages import Mark
 from mapweave.wire.memory import MemoryHub
 from tests.mapserver.played import KEYS, MAP, HandAgent, Server
@@ -52,6 +53,33 @@ def test_a_refused_change_names_its_map_and_robot(lines: io.StringIO, tmp_path: 
     assert (line["level"], line["logger"]) == ("warning", "mapweave.mapserver.log.ingest")
     assert (line["map"], line["robot"]) == ("r0.3", "r0")
     assert abs(datetime.fromisoformat(line["time"]) - datetime.now(UTC)) < timedelta(minutes=10)
+
+
+HOSTILE = "agent/r0/alive/\x1b[31mRED\x07\x9b2J\u202eabc\n2026-11-30 01:00:00 all is well"
+"""A key that a robot chose: escape sequences, a mark that turns the direction, and a line of its own."""
+
+
+@pytest.mark.parametrize("log_format", [TextFormatter(), JsonFormatter()])
+def test_what_others_have_written_controls_no_terminal_and_makes_no_line(
+    log_format: logging.Formatter,
+) -> None:
+    handler = logging.StreamHandler(stream := io.StringIO())
+    handler.setFormatter(log_format)
+    logger = logging.getLogger("mapweave.mapserver.test")
+    logger.addHandler(handler)
+    try:
+        logger.warning("%s: no epoch", HOSTILE, extra={"reason": HOSTILE})
+        try:
+            raise ValueError(HOSTILE)
+        except ValueError:
+            logger.exception("it failed")
+    finally:
+        logger.removeHandler(handler)
+    first, *rest = stream.getvalue().splitlines()
+    assert "all is well: no epoch" in first
+    assert all(line.isprintable() for line in (first, *rest))
+    assert "RED" in rest[-1] or "RED" in rest[-2], "the exception is there"
+    assert stamped(HOSTILE).isprintable()
 
 
 def test_fields_are_those_of_the_message_and_those_that_are_given(lines: io.StringIO) -> None:

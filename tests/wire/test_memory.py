@@ -8,10 +8,12 @@ import threading
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.errors import SettingsError
+from mapweave.hybridmap.errors import InvalidMessage, SettingsError
+from mapweave.hybridmap.ids import MapId
 from mapweave.wire.bus import Reply, Request, Sample
 from mapweave.wire.bus_settings import BusSettings
-from mapweave.wire.dispatch import Dispatcher
+from mapweave.wire.dispatch import EVERY, Dispatcher, Failures
+from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub, MessageFaults
 from tests.waiting import eventually
 
@@ -174,3 +176,35 @@ def test_a_full_queue_counts_messages_refuses_questions_and_keeps_presence(
 def test_settings_that_cannot_work(settings: dict[str, object], reason: str) -> None:
     with pytest.raises(SettingsError, match=reason):
         BusSettings(**settings)  # type: ignore[arg-type]
+
+
+def test_what_a_robot_sends_wrong_fills_no_log() -> None:
+    now = [1000.0]
+    counted = Failures(lambda: now[0])
+    keys = Keys("demo")
+    assert counted.count(keys.agent_status("r0")) == ""
+    assert [counted.count(keys.agent_alive(MapId("r0", k))) for k in range(500)] == [None] * 500
+    assert counted.count(keys.agent_status("r1")) == "", "each robot is counted apart"
+    now[0] += EVERY
+    assert counted.count(keys.agent_status("r0")) == " (500 more of r0 within 60 s)"
+    assert counted.count(keys.agent_status("r1")) == ""
+    assert [counted.count(keys.server_status("s0")) for _ in range(3)] == [""] * 3, "a defect of its own"
+
+
+def test_a_flood_of_wrong_messages_is_one_line(caplog: pytest.LogCaptureFixture) -> None:
+    hub, keys = MemoryHub(), Keys("demo")
+    robot, server = MemoryBus(hub), MemoryBus(hub)
+    heard: list[int] = []
+
+    def handler(sample: Sample) -> None:
+        heard.append(len(sample.payload))
+        raise InvalidMessage("agent status: no map of fields")
+
+    server.subscribe(keys.agent_statuses(), handler)
+    with caplog.at_level(logging.WARNING):
+        for _ in range(1000):
+            robot.publish(keys.agent_status("r17"), b"x")
+        eventually(lambda: len(heard) == 1000)
+    assert len([record for record in caplog.records if "no map of fields" in record.getMessage()]) == 1
+    robot.close()
+    server.close()
