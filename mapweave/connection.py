@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
@@ -11,8 +12,11 @@ from mapweave.identities.validity import out_of_date
 from mapweave.wire.credentials import Role
 
 if TYPE_CHECKING:
+    from mapweave.wire.bus import Bus
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.credentials import Credentials
+    from mapweave.wire.keys import Keys
+    from mapweave.wire.log_messages import Scalar
     from mapweave.wire.zenoh_bus import ZenohBus
 
 SOON = 1.0
@@ -97,18 +101,34 @@ def _try(endpoint: str) -> None:
         pass
 
 
-def no_server(fleet: str, holder: Credentials | None = None) -> NotConnected:
-    """The error that no map server answers.
+def no_server(bus: Bus, keys: Keys, holder: Credentials | None = None) -> NotConnected:
+    """The error that no map server answers: none is there, or one waits for its store.
 
     Args:
-        fleet: its name.
+        bus: the connection.
+        keys: of the fleet.
         holder: of the key with which one is connected, if there is one.
     """
+    if waits := [waits_for(one) for one in server_statuses(bus, keys, ANSWERED) if waits_for(one)]:
+        return NotConnected("; ".join(waits))
     return NotConnected(
-        f"a router is up, but no map server of fleet {fleet} answers: start `mapweave server` or give "
+        f"a router is up, but no map server of fleet {keys.fleet} answers: start `mapweave server` or give "
         "another fleet (--fleet)"
         f"{_key_hint(holder)}"
     )
+
+
+def server_statuses(bus: Bus, keys: Keys, timeout: float) -> list[dict[str, Scalar]]:
+    """What the map servers say of themselves, those that answer, also those that wait for their store."""
+    from mapweave.wire.log_messages import decode_record
+
+    replies = bus.ask(keys.server_statuses(), b"", timeout)
+    return [decode_record(reply.payload) for reply in replies if not reply.error]
+
+
+def waits_for(status: Mapping[str, Scalar]) -> str:
+    """What a map server waits for before it serves, in words, by its status; empty if it serves."""
+    return f"map server {status['name']} is {status['summary']}" if status.get("loading") else ""
 
 
 def router_gone() -> NotConnected:

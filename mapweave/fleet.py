@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
-from mapweave.connection import ANSWERED, reach
+from mapweave.connection import ANSWERED, reach, server_statuses
 from mapweave.fleet_constraints import FleetConstraints
 from mapweave.fleet_map import FleetMap
 from mapweave.hybridmap.agent_status import SILENT, AgentStatus, FleetStatus, RobotEntry
@@ -225,8 +225,7 @@ class Fleet(FleetMap, FleetConstraints):
 
     def servers(self) -> list[dict[str, Scalar]]:
         """What the map servers say of themselves, those that answer."""
-        replies = self._ask(self._keys.server_statuses(), b"", ANSWERED)
-        return [decode_record(reply.payload) for reply in replies if not reply.error]
+        return server_statuses(self._bus, self._keys, ANSWERED)
 
     def missions(self, robot: str = "") -> tuple[MissionReport, ...]:
         """The missions that the map server knows of, or those of one robot, oldest first; none is in an older

@@ -38,7 +38,7 @@ class FleetQuestions:
         """The error that nothing answers."""
         if not self._bus.connected():
             return router_gone()
-        return no_server(self._keys.fleet, self._key_holder)
+        return no_server(self._bus, self._keys, self._key_holder)
 
     @property
     def _sender(self) -> str:

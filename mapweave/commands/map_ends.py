@@ -170,7 +170,7 @@ def answers(bus: Bus, network: NetworkSettings, key: str, payload: bytes, timeou
 
     replies = ask_patiently(bus, key, payload, timeout)
     if not replies:
-        raise no_server(network.fleet, key_holder(network))
+        raise no_server(bus, Keys(network.fleet), key_holder(network))
     good = [reply for reply in replies if not reply.error]
     if not good:
         if any(reply.retry_after for reply in replies):

@@ -114,15 +114,15 @@ def _by_server(
 ) -> tuple[RelocalizeAnswer, Node | None]:
     """The answer of a running server, and the best candidate's node if it is to be drawn."""
     from mapweave.commands.map_ends import answers
-    from mapweave.connection import no_server
+    from mapweave.connection import no_server, server_statuses, waits_for
     from mapweave.hybridmap.query import RelocalizeAnswer
     from mapweave.wire.messages import decode, encode_view
 
     network = network_of(arguments, settings_of(arguments))
     bus, keys = reach(network)
     try:
-        if not bus.ask(keys.server_statuses(), b"", arguments.timeout):
-            raise no_server(network.fleet, key_holder(network))  # said before the work
+        if all(map(waits_for, server_statuses(bus, keys, arguments.timeout))):
+            raise no_server(bus, keys, key_holder(network))  # said before the work
         (reply, *_) = answers(bus, network, keys.any_relocalize(), encode_view(view()), arguments.timeout)
         answer = decode(reply.payload, RelocalizeAnswer)
         if arguments.draw is None or not answer.candidates:

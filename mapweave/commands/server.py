@@ -179,7 +179,7 @@ def run(arguments: argparse.Namespace) -> int:
         from mapweave.mapserver.server import MapServer, ServerSettings
         from mapweave.processes.separate_stores import SeparateStores
         from mapweave.processes.service_manager import ServiceManager
-        from mapweave.processes.store_wait import Waiting, made_with_store
+        from mapweave.processes.store_wait import Waiting, WaitingServer, made_with_store
 
         gc.freeze()
         gc.enable()
@@ -220,7 +220,15 @@ def run(arguments: argparse.Namespace) -> int:
 
             return waiting_may_help(PostgresAddress.read(arguments.store))
 
-        waiting = Waiting(tell, loading.wait if web is not None else lambda words: None)
+        waits = WaitingServer(bus, keys, name)
+        stack.callback(waits.close)
+
+        def show(words: str) -> None:
+            waits.show(words)
+            if web is not None:
+                loading.wait(words)
+
+        waiting = Waiting(tell, show)
         server = made_with_store(make, may_help, waiting, stop, arguments.store_wait)
         if server is None:
             tell(STOPPED)

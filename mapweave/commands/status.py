@@ -127,7 +127,7 @@ def _shown(
     from rich.text import Text
 
     if not status.robots:
-        return "no robot is there"
+        return "\n".join(("no robot is there", *leading(servers)))
     return Group(
         table(status, width, plan),
         *map(Text, (*troubles(status, width, plan), *apart(status), *leading(servers))),
@@ -135,8 +135,13 @@ def _shown(
 
 
 def leading(servers: Sequence[Mapping[str, Scalar]]) -> list[str]:
-    """Lines that say which of the servers that share a store merges, and how far the others are behind it."""
-    lines = []
+    """Lines that say which of the servers that share a store merges, how far the others are behind it, and
+    which ones wait for their store.
+    """
+    from mapweave.connection import waits_for
+
+    lines = sorted(filter(None, map(waits_for, servers)))
+    servers = [one for one in servers if not waits_for(one)]
     stores = sum("leads" not in one for one in servers) + any("leads" in one for one in servers)
     if stores > 1:
         counts = sorted(int(one.get("constraints", 0)) for one in servers)

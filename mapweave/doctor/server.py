@@ -69,6 +69,7 @@ def _refusal(endpoint: str) -> str:
 
 def _answer(bus: ZenohBus, network: NetworkSettings) -> Finding:
     """What the fleet's server says of itself."""
+    from mapweave.connection import waits_for
     from mapweave.wire.keys import Keys
     from mapweave.wire.log_messages import decode_record
 
@@ -78,6 +79,8 @@ def _answer(bus: ZenohBus, network: NetworkSettings) -> Finding:
             return wrong(SUBJECT, f"{network.server} refuses: {reply.error}", "see the server's log")
         record, own = decode_record(reply.payload), version("mapweave")
         theirs = str(record.get("version", "unknown"))
+        if waits := waits_for(record):
+            return wrong(SUBJECT, waits, "it serves once its store is there; see its log")
         words = f"{network.server} of fleet {network.fleet}, version {theirs}: {record.get('summary', '')}"
         if theirs != own:
             return warning(SUBJECT, words, f"this robot has version {own}; install the same on both")

@@ -6,12 +6,18 @@ import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import version
 from typing import TypeVar
 
 from mapweave.hybridmap.errors import StoreAway
 from mapweave.processes.service_manager import ServiceManager
+from mapweave.wire.bus import Bus, Closing, Request
+from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import encode_record
 
 Made = TypeVar("Made")
+
+VERSION = version("mapweave")
 
 EVERY = 1.0
 """s between two attempts."""
@@ -28,6 +34,44 @@ class Waiting:
 
     log: Callable[[str], None]
     show: Callable[[str], None]
+
+
+class WaitingServer:
+    """Answers for a server that waits, to who asks for the status of servers, and to no other question.
+
+    It is not announced: robots count on those that are.
+    """
+
+    def __init__(self, bus: Bus, keys: Keys, name: str) -> None:
+        """Nothing is waited for yet.
+
+        Args:
+            bus: the connection.
+            keys: of the fleet.
+            name: of the server.
+        """
+        self._bus, self._keys, self._name = bus, keys, name
+        self._words, self._serving = "", list[Closing]()
+
+    def show(self, words: str) -> None:
+        """What is waited for at present; nothing once it has come."""
+        self._words = words
+        if words and not self._serving:
+            self._serving.append(self._bus.serve(self._keys.server_status(self._name), self._answer))
+        if not words:
+            self.close()
+
+    def close(self) -> None:
+        """Answer no more. Idempotent."""
+        while self._serving:
+            self._serving.pop().close()
+
+    def _answer(self, request: Request) -> None:
+        words = self._words
+        request.reply(encode_record({
+            "name": self._name, "summary": words, "event": words, "loading": True, "settled": False,
+            "version": VERSION,
+        }))  # fmt: skip
 
 
 def made_with_store(

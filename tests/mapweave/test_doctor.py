@@ -32,7 +32,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.children import free_port
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import encode_record
+from mapweave.wire.log_messages import Scalar, encode_record
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.agent.drivers.emulators import ArduinoSketch
@@ -345,7 +345,7 @@ def test_servers(router: tuple[ZenohBus, str], tmp_path, capfd) -> None:
     other = bus.announce(theirs.server_alive("s7"))
     assert "s7 of fleet theirs" in doctor(capfd, *asked)[1]["server"].detail
     other.close()
-    record = {"version": "0.0.1", "summary": "3 maps"}
+    record: dict[str, Scalar] = {"version": "0.0.1", "summary": "3 maps"}
     serving = bus.serve(ours.server_status("s0"), lambda request: request.reply(encode_record(record)))
     status, findings, _ = doctor(capfd, *asked)
     assert (
@@ -355,6 +355,10 @@ def test_servers(router: tuple[ZenohBus, str], tmp_path, capfd) -> None:
     )
     record["version"] = version("mapweave")
     assert doctor(capfd, *asked)[1]["server"].verdict is FindingLevel.GOOD
+    record |= {"name": "s0", "summary": "waiting: refused", "loading": True}
+    status, findings, first = doctor(capfd, *asked)
+    assert (status, first) == (NO, "server")
+    assert findings["server"].detail == "map server s0 is waiting: refused"
     serving.close()
 
 

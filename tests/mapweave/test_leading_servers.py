@@ -24,6 +24,12 @@ def test_it_says_for_how_long_a_server_is_behind_and_what_delays_it() -> None:
     assert leading([LEADS, FOLLOWS | {"unmerged_s": 0.4, "delay": ""}])[1].endswith(", 3 changes behind")
 
 
+def test_it_says_which_server_waits_for_its_store() -> None:
+    waits = {"name": "s1", "summary": "waiting: refused", "event": "waiting: refused", "loading": True}
+    assert leading([LEADS, waits]) == ["map server s1 is waiting: refused"]
+    assert leading([waits]) == ["map server s1 is waiting: refused"]
+
+
 def test_of_a_server_without_others_it_says_nothing() -> None:
     assert leading([LEADS]) == leading([{"summary": "no nodes"}]) == leading([]) == []
 

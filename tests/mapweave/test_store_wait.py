@@ -18,10 +18,14 @@ from urllib.request import urlopen
 
 import pytest
 
+from mapweave.connection import no_server, server_statuses, waits_for
 from mapweave.exit_status import FAILED
 from mapweave.hybridmap.errors import InvalidFile, StoreAway
-from mapweave.processes.store_wait import Waiting, made_with_store
+from mapweave.processes.store_wait import Waiting, WaitingServer, made_with_store
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
 from synthetic.postgres_server import PostgresServer
+from tests.mapweave.command_line import complaint
 from tests.postgres import started
 from tests.waiting import eventually, free_port
 
@@ -91,6 +95,25 @@ def test_a_wait_ends_after_its_time_and_when_it_is_stopped() -> None:
     stop = threading.Event()
     threading.Timer(0.1, stop.set).start()
     assert store.wait(60.0, stop) is None
+
+
+def test_who_asks_for_a_servers_status_hears_that_it_waits() -> None:
+    hub, keys = MemoryHub(), Keys("fleet")
+    bus, asker = MemoryBus(hub), MemoryBus(hub)
+    waits = WaitingServer(bus, keys, "s0")
+    assert server_statuses(asker, keys, 1.0) == []
+    for words in ("waiting: refused", "waiting: it starts"):
+        waits.show(words)
+        (status,) = server_statuses(asker, keys, 1.0)
+        assert (status["loading"], status["settled"], status["event"]) == (True, False, words)
+        assert waits_for(status) == f"map server s0 is {words}"
+        assert str(no_server(asker, keys)) == f"map server s0 is {words}"
+    alive = list[str]()
+    asker.watch(keys.servers_alive(), lambda key, there: alive.append(key))
+    waits.show("")
+    assert server_statuses(asker, keys, 1.0) == [] and not alive
+    assert "no map server of fleet fleet answers" in str(no_server(asker, keys))
+    waits.close()
 
 
 @contextmanager
@@ -168,11 +191,16 @@ def test_a_server_ends_at_once_where_there_is_no_such_database(
 
 @pytest.mark.slow
 @pytest.mark.waits
-def test_a_server_that_waits_can_be_stopped_and_gives_up(tmp_path: Path) -> None:
+def test_a_server_that_waits_can_be_stopped_and_gives_up(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
     pytest.importorskip("psycopg")
-    nowhere = f"postgresql://anna@127.0.0.1:{free_port()}/maps"
-    with server(tmp_path, nowhere) as process:
+    nowhere, router = f"postgresql://anna@127.0.0.1:{free_port()}/maps", f"tcp/127.0.0.1:{free_port()}"
+    with server(tmp_path, nowhere, "--listen", router) as process:
         eventually(lambda: "waiting for at most 600 s" in (tmp_path / "log").read_text(), PATIENCE)
+        for command in (["status"], ["map", "history"], ["status", "--json"]):
+            said = complaint(capfd, *command, "--connect", router)
+            assert re.match(r"mapweave: map server s0 is waiting: postgresql://127.*refused", said)
         process.send_signal(signal.SIGTERM)
         assert process.wait(PATIENCE) == 0
     assert (tmp_path / "log").read_text().splitlines()[-1].endswith("stopped while it was starting")

@@ -25,6 +25,8 @@ from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.identities.logins import Logins
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Role
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
 from tests.mapweave.command_line import complaint
 
 
@@ -118,9 +120,11 @@ def test_a_token_is_shown_once_and_its_hash_alone_is_kept(
 
 def test_a_question_with_a_robots_key_is_said_to_need_anothers(keys: Path) -> None:
     """The router drops it without a word: it looks like a server that is not there."""
-    robot = read_key_file(keys / "r0.key.toml").credentials
-    assert "its key is a robot's, use a viewer's or an operator's" in str(no_server("f1", robot))
-    assert "a robot's" not in str(no_server("f1", replace(robot, role=Role.VIEWER)))
+    robot, nowhere = read_key_file(keys / "r0.key.toml").credentials, MemoryBus(MemoryHub())
+    assert "its key is a robot's, use a viewer's or an operator's" in str(
+        no_server(nowhere, Keys("f1"), robot)
+    )
+    assert "a robot's" not in str(no_server(nowhere, Keys("f1"), replace(robot, role=Role.VIEWER)))
 
 
 def test_a_robot_that_is_not_let_in_hears_that_its_key_may_be_no_longer_good(keys: Path) -> None:
