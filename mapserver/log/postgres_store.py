@@ -62,6 +62,12 @@ TABLES_THERE = (
     "FROM pg_class WHERE relkind = 'r' AND relnamespace = to_regnamespace('mapweave')"
 )
 """Each with whether it has a primary key."""
+NOT_CHANGED = (
+    "SELECT relname FROM pg_class WHERE relkind = 'r' AND relnamespace = to_regnamespace('mapweave') "
+    "AND relname = ANY(%s) AND NOT (SELECT bool_and(has_table_privilege(pg_class.oid, needed)) "
+    "FROM unnest(ARRAY['SELECT', 'INSERT', 'UPDATE', 'DELETE']) AS needed) ORDER BY relname"
+)
+"""Tables that this session's user may not change."""
 PREPARED_AFTER = 5
 """Uses of a statement, by a session that writes."""
 VERSIONS = "schema_version"
@@ -185,6 +191,15 @@ class PostgresStore(Store):
                 self._put("result", (ID, fresh_id().to_bytes(8, "big")))
             else:
                 self._check_version(self._writer.connection)
+                self._check_rights(self._writer.connection)
+
+    def _check_rights(self, connection: psycopg.Connection) -> None:
+        """A server that may only read would serve, and acknowledge nothing."""
+        if tables := [name for (name,) in connection.execute(NOT_CHANGED, ([*KEYS],))]:
+            raise InvalidFile(
+                f"{self.address.words}: the user may not change {', '.join(tables)}: connect as their owner, "
+                "or GRANT it SELECT, INSERT, UPDATE and DELETE on them"
+            )
 
     def _check_version(self, connection: psycopg.Connection) -> None:
         version, there = _version(connection), _tables(connection)

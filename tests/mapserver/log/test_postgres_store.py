@@ -27,7 +27,7 @@ from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.store import LogChanges, Store
 from mapweave.wire.codec import encode_body, encode_change
-from synthetic.postgres_server import PostgresServer, binaries
+from synthetic.postgres_server import ROLE, PostgresServer, binaries
 from tests.mapserver.log.test_store import MAP, OTHER, broken, edge_put, entry, node_put
 from tests.postgres import started
 from tests.waiting import eventually
@@ -288,6 +288,32 @@ def test_a_store_of_another_format_is_refused(postgres: PostgresServer) -> None:
         connection.execute("UPDATE mapweave.schema_version SET version = 99")
     with pytest.raises(InvalidFile, match=r"format 99, this program uses format 1"):
         PostgresStore(address)
+
+
+def test_a_server_whose_role_may_only_read_is_refused_at_its_start(postgres: PostgresServer) -> None:
+    """It would serve, and acknowledge nothing; a command that only reads needs no more."""
+    address = postgres.database()
+    reader = address.replace(f"{ROLE}@", "reader@")
+    store = PostgresStore(address, "s0")
+    with psycopg.connect(address, autocommit=True) as owner:
+        owner.execute("CREATE ROLE reader LOGIN")
+        owner.execute("GRANT USAGE ON SCHEMA mapweave TO reader")
+        owner.execute("GRANT SELECT ON ALL TABLES IN SCHEMA mapweave TO reader")
+        try:
+            PostgresStore(reader, read_only=True).close()
+            with pytest.raises(InvalidFile, match=r"may not change annotation, change, .*: ") as refused:
+                PostgresStore(reader, "s1")
+            assert "\n" not in str(refused.value)
+            owner.execute("GRANT INSERT, UPDATE, DELETE ON ALL TABLES IN SCHEMA mapweave TO reader")
+            owner.execute("REVOKE UPDATE ON mapweave.log FROM reader")
+            with pytest.raises(InvalidFile, match=r"user may not change log: "):
+                PostgresStore(reader, "s1")
+            owner.execute("GRANT UPDATE ON mapweave.log TO reader")
+            PostgresStore(reader, "s1").close()
+        finally:
+            store.close()
+            owner.execute("DROP OWNED BY reader")
+            owner.execute("DROP ROLE reader")
 
 
 @pytest.mark.parametrize("part", ["tables", "rows", "cut-off", "no-version"])
