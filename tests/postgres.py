@@ -44,6 +44,12 @@ def postgres(postgres_server: PostgresServer) -> Iterator[PostgresServer]:
     postgres_server.take_back()
 
 
+@pytest.fixture
+def address(postgres: PostgresServer) -> str:
+    """Of a new database."""
+    return postgres.database()
+
+
 def pytest_unconfigure() -> None:
     """Remove the cluster that the others are copies of."""
     if _template.cache_info().currsize:

@@ -13,23 +13,14 @@ from mapweave.mapserver import admission_control
 from mapweave.mapserver.admission_control import LONGEST_PAUSE, AdmissionControl, AdmissionSettings
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.storage.settings_file import build
-
-
-class Clock:
-    """Time that passes when the test says so."""
-
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
+from tests.clock import Clock
 
 
 class Counter:
     """An admission control whose workers are all held up until released."""
 
     def __init__(self, settings: AdmissionSettings, seconds: float) -> None:
-        self.clock = Clock()
+        self.clock = Clock(100.0)
         self.services = AdmissionControl(settings, self.clock, first_guess=seconds)
         self.go = threading.Event()
         self.taken = self.asked = 0
@@ -52,7 +43,7 @@ class Counter:
 @pytest.mark.parametrize("workers", [1, 2])
 def test_unusual_jobs_do_not_change_the_estimated_duration(workers: int) -> None:
     """A person's question takes seconds; no robot is turned away for it afterwards."""
-    clock = Clock()
+    clock = Clock(100.0)
     admission = AdmissionControl(AdmissionSettings(workers), clock, first_guess=0.1)
 
     def work() -> None:
@@ -110,7 +101,7 @@ class Simulated:
     """
 
     def __init__(self, robots: int, seconds: float, keep: bool, rng: np.random.Generator) -> None:
-        self.clock = Clock()
+        self.clock = Clock(100.0)
         self.services = AdmissionControl(AdmissionSettings(1), self.clock, first_guess=seconds)
         self.pool = self.services._pool
         queue: list[tuple[float, int]] = []  # when it came, and whose it is
@@ -184,7 +175,7 @@ def test_an_appointment_has_precedence_and_expires() -> None:
 
 
 def test_the_time_that_a_question_takes_is_learned(monkeypatch: pytest.MonkeyPatch) -> None:
-    clock = Clock()
+    clock = Clock(100.0)
     monkeypatch.setattr(admission_control, "SMOOTHING", 0.5)
     admission = AdmissionControl(AdmissionSettings(1), clock, first_guess=0.01)
 
@@ -217,7 +208,7 @@ def test_results_and_errors_come_back_and_a_failure_costs_no_worker() -> None:
 
 def test_questions_that_waited_too_long_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     """Each question takes four times as long as was thought."""
-    clock = Clock()
+    clock = Clock(100.0)
     monkeypatch.setattr(admission_control, "TOO_LATE", 1.5)
     admission = AdmissionControl(AdmissionSettings(1, in_time=0.6), clock, first_guess=0.1)
     go, waited = threading.Event(), list[float]()

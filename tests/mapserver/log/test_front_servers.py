@@ -62,11 +62,6 @@ class FrontServer:
 
 
 @pytest.fixture
-def address(postgres: PostgresServer) -> str:
-    return postgres.database()
-
-
-@pytest.fixture
 def journals(tmp_path: Path) -> Iterator[list[Journal]]:
     journals = [Journal(tmp_path / name, name) for name in ROBOTS]
     yield journals

@@ -26,20 +26,12 @@ from mapweave.wire.bus import Request
 from mapweave.wire.codec import encode_body
 from mapweave.wire.log_messages import Refusal
 from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.clock import Clock
 from tests.mapserver.log.acknowledged_fleet import AGENT, edge, node
 from tests.mapserver.played import KEYS, LOG_ID, MAP, HandAgent, Server
 from tests.waiting import eventually
 
 OTHER = MapId("r1", 1)
-
-
-class Clock:
-    """Time that passes when the test says so."""
-
-    now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 @pytest.fixture

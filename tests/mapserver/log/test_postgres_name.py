@@ -39,11 +39,6 @@ time.sleep(600)
 """
 
 
-@pytest.fixture
-def address(postgres: PostgresServer) -> str:
-    return postgres.database()
-
-
 def refusal(address: str, name: str = "s0") -> str:
     with pytest.MonkeyPatch.context() as patch, pytest.raises(InvalidFile) as refused:
         # The other server does not end meanwhile.

@@ -44,7 +44,6 @@ from mapweave.wire.log_messages import Mark
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import encode
 from synthetic.maps import LOG_ID
-from synthetic.postgres_server import PostgresServer
 from tests.mapserver.merging.test_restart_record import decided, drives
 from tests.mapserver.merging.test_shared_merge import numbered
 from tests.quick import first_quick
@@ -52,11 +51,6 @@ from tests.waiting import eventually
 
 KEYS = Keys("fleet")
 PATIENCE = 120.0
-
-
-@pytest.fixture
-def address(postgres: PostgresServer) -> str:
-    return postgres.database()
 
 
 @pytest.fixture(autouse=True)

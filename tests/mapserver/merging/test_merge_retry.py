@@ -23,6 +23,7 @@ from mapweave.mapserver.server import MapServer
 from mapweave.wire.codec import encode_change
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from synthetic.maps import looked_around, numbered
+from tests.clock import Clock
 from tests.mapserver.log.acknowledged_fleet import AGENT, KEYS
 from tests.mapserver.log.test_front_servers import logs_of
 from tests.waiting import eventually
@@ -38,6 +39,7 @@ from mapweave.mapserver.merging import merge_retry
 from mapweave.mapserver.merging.merge_pipeline import MergePipeline
 from mapweave.mapserver.schedule import LiveSchedule
 from synthetic.maps import looked_around, numbered
+from tests.clock import Clock
 from tests.waiting import eventually
 
 logging.basicConfig(format="%(message)s")
@@ -100,14 +102,6 @@ def test_the_last_map_stays_and_no_map_is_blamed_where_memory_is_short() -> None
     lines = [line for line in done.stderr.splitlines() if "memory" in line]
     assert lines and "Traceback" not in done.stderr
     assert all(line.startswith(f"{merge_retry.SHORT}: merging begins again after") for line in lines)
-
-
-class Clock:
-    def __init__(self) -> None:
-        self.now = 100.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 def test_it_is_tried_less_and_less_often() -> None:

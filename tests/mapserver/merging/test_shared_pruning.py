@@ -31,7 +31,6 @@ from mapweave.opened_map import open_map
 from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from synthetic.postgres_server import PostgresServer
 from tests.mapserver.merging.test_pruning import BEGIN, DAYS, MAPS, Logs, Server, poses_apart, serving
 from tests.waiting import eventually
 
@@ -42,11 +41,6 @@ PATIENCE = 120.0
 @pytest.fixture(scope="module")
 def logs() -> Logs:
     return Logs()
-
-
-@pytest.fixture
-def address(postgres: PostgresServer) -> str:
-    return postgres.database()
 
 
 @pytest.fixture

@@ -3,16 +3,7 @@
 import random
 
 from mapweave.mapserver.merging.unmerged import MOST, STEP, Unmerged
-
-
-class Clock:
-    """A clock that is set by hand, s."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
+from tests.clock import Clock
 
 
 def test_the_oldest_that_is_not_merged_counts_to_a_second() -> None:
