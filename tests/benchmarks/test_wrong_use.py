@@ -39,10 +39,6 @@ WRONG = [
     ("servo", "--trials 0", "--trials"),
     ("servo", "--jobs 0", "--jobs"),
     ("relocalize", "--nodes 300", "at least 1000 nodes and 4 queries"),
-    ("sim", "--robots 0", "--robots"),
-    ("sim", "--robots 3 17", "--robots"),
-    ("sim", "--seconds 0", "--seconds"),
-    ("sim", "--seconds nan", "--seconds"),
     ("trust", "--lying 0", "trust: a seed of 0 or more"),
 ]
 
@@ -79,4 +75,4 @@ def test_python_starts_it_by_the_name_of_its_folder(name: str) -> None:
 
 
 def test_the_benchmarks_are_found() -> None:
-    assert {"parking", "navigate", "servo", "ekf", "relocalize", "merge", "sim"} <= set(SEEDED)
+    assert {"parking", "navigate", "servo", "ekf", "relocalize", "merge"} <= set(SEEDED)
