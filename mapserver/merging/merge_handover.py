@@ -16,7 +16,7 @@ SHARE, QUICK = 0.05, 0.05
 """Of the time that it may take to hand merges over, where one takes longer than so many seconds."""
 
 MOST_WORDS = 1000
-"""Characters of an event in a status message, and of a trouble that other servers are told."""
+"""Characters of an event in a status message, and of a trouble that other servers hear of."""
 
 
 class MergeHandover:
@@ -50,7 +50,7 @@ class MergeHandover:
             last: the last change of each log that it has.
             pruning: mark of what was pruned.
             outdated: something has changed since it merged: the next merge is handed over.
-            trouble: why it cannot merge, which the others are told; empty: it can.
+            trouble: why it cannot merge, for the others to say; empty: it can.
 
         Returns:
             How long to wait until it is time, s; None: nothing is left to do.
