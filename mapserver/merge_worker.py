@@ -66,6 +66,7 @@ class MergeWorker:
         pruning: PruningRecord | None = None,
         sharing: MergeSharing | None = None,
         retry: MergeRetry | None = None,
+        choice_key: bytes = b"",
     ) -> None:
         """Start with no map.
 
@@ -81,6 +82,7 @@ class MergeWorker:
             pruning: prunes what has been superseded for long; None: nothing is.
             sharing: hands merges over to other servers, or from them; None: this one merges for itself.
             retry: says when merging is tried again for which there was too little memory.
+            choice_key: see `Merger`.
         """
         self._schedule = schedule
         self._sharing = sharing
@@ -94,7 +96,7 @@ class MergeWorker:
         self._history = history or MapHistory()
         self._observe = observe
         self._share_of_time = share
-        self._merger = Merger(places, merge, compare, schedule.pause)
+        self._merger = Merger(places, merge, compare, schedule.pause, choice_key)
         self._intake = MergeIntake(self._merger, pruning)
         self._answers = self._answers_from(MergedMap.empty())
         self._dirty = self._reading = self._unprepared = False

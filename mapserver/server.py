@@ -36,7 +36,15 @@ from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.libraries import library_jobs
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.opening import open_store
-from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, HISTORY, MERGE_MARK, PRUNING_MARK, News
+from mapweave.mapserver.log.store import (
+    ANNOTATIONS,
+    CHOICE_KEY,
+    CONSTRAINTS,
+    HISTORY,
+    MERGE_MARK,
+    PRUNING_MARK,
+    News,
+)
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
 from mapweave.mapserver.merging.merge_retry import MergeRetry
@@ -155,6 +163,7 @@ class MapServer:
             observe=self._metrics.merged, pruning=pruning,
             sharing=MergeSharing(self._store, name) if shares else None,
             retry=MergeRetry(None if isinstance(clock, LockstepSchedule) else path, clock.monotonic),
+            choice_key=b"" if isinstance(clock, LockstepSchedule) else self._store.secret(CHOICE_KEY),
         )  # fmt: skip
         self._constraints = ConstraintRecord(self._store, self._base)
         self._annotations = AnnotationRecord(self._store, self._base.annotations)

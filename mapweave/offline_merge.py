@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from os import PathLike
@@ -20,6 +21,7 @@ from mapweave.hybridmap.pin import Pin
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.pruning import Pruning
+from mapweave.mapserver.merging.verification_cache import fingerprint_of
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.own_maps import maps_of, marginal_links
 from mapweave.merge.pose_graph.candidates import Pair
@@ -126,6 +128,15 @@ def _bytes(hybrid_map: HybridMap) -> list[bytes]:
     return sorted(encode_body(change) for change in hybrid_map.contents())
 
 
+def _digest(maps: Mapping[MapId, HybridMap]) -> bytes:
+    """Of all nodes: the same whenever these maps are merged, and unknown to who has made but one of them."""
+    digest = hashlib.blake2b(digest_size=16)
+    for _, hybrid_map in sorted(maps.items()):
+        for _, node in sorted(hybrid_map.nodes.items()):
+            digest.update(fingerprint_of(node))
+    return digest.digest()
+
+
 def merge_parts(
     maps: Mapping[MapId, HybridMap],
     constraints: ManualConstraints,
@@ -153,7 +164,7 @@ def merge_parts(
     Raises:
         InvalidValue: a map cannot be merged; writing the others would lose it.
     """
-    merger = Merger(settings=settings)
+    merger = Merger(settings=settings, choice_key=_digest(maps))
     merger.constrain(constraints)
     merger.pin(pins)
     for map_id, reason in (refused_changes or {}).items():

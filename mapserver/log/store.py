@@ -21,6 +21,7 @@ from mapweave.hybridmap.limits import MAX_NUMBER
 from mapweave.mapserver.log.entry import Applied, Position, ReceivedChange
 from mapweave.mapserver.log.integrity import Gap
 from mapweave.mapserver.log.sql_sizes import SqlSizes
+from mapweave.storage.full_disks import logged
 from mapweave.wire.codec import decode_body, element_of, unwrap_body
 from mapweave.wire.log_messages import Refusal
 
@@ -37,8 +38,11 @@ PRUNING_MARK = "pruning_mark"
 MERGE, MERGE_MARK = "merge", "merge_mark"
 """The newest merge, for servers that do not merge themselves, and a digest of it; see
 mapweave.mapserver.merging.merge_sharing."""
+CHOICE_KEY = "choice key"
+"""Likewise: decides which of many things are looked at, so that robots cannot. It is sent to nobody."""
 MERGE_TROUBLE = "merge_trouble"
 """Why the server that leads cannot merge, or hand its merges over, in words (UTF-8); empty if it can."""
+SECRET_BYTES = 16
 MOST_REFUSED_KEPT = 100
 """Refused changes of a map of which the bytes are kept; of further ones only the reason."""
 MOST_REFUSALS = 1000
@@ -452,6 +456,25 @@ class Store(SqlSizes):
         """The result of this name."""
         rows = self._read("SELECT value FROM result WHERE name = ?", (name,))
         return bytes(rows[0][0]) if rows else None
+
+    def secret(self, name: str) -> bytes:
+        """Random bytes of this name: drawn when they are asked for first, and the same ever after.
+
+        Where several servers share the store they are the same for all. A disk that does not take them, which
+        is logged, is no error: they are others then after the next start.
+        """
+        known = self.result(name)
+        if known is None:
+            known = secrets.token_bytes(SECRET_BYTES)
+            try:
+                with self._transaction():
+                    self._lock_table("result")
+                    known = self.result(name) or known
+                    self._put("result", (name, known))
+            except InvalidFile as error:
+                if not logged(error):
+                    log.warning("%s", error)
+        return known
 
     def _apply(self, run: LogChanges, logs: dict[MapId, Position]) -> Applied | MapweaveError:
         stored_id, watermark = logs.get(run.map_id, (run.log_id, 0))

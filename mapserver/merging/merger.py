@@ -62,6 +62,7 @@ class Merger:
         settings: MergeSettings | None = None,
         compare: Compare = compare,
         pause: Callable[[], None] = lambda: None,
+        choice_key: bytes = b"",
     ) -> None:
         """Start with no maps.
 
@@ -70,6 +71,7 @@ class Merger:
             settings: how.
             compare: compares nodes.
             pause: called between the pieces of a merge.
+            choice_key: decides which pairs of views are held against their map's way; see `OwnViewsSearch`.
         """
         # A database in which there is nothing yet is one.
         self.places = PlaceDatabase() if places is None else places
@@ -78,7 +80,7 @@ class Merger:
         self.counters = MergerCounters()
         self.reaches = ReachabilityCache()
         self.settings = settings or MergeSettings()
-        self._compare, self._pause = compare, pause
+        self._compare, self._pause, self._choice_key = compare, pause, choice_key
         self.pruning = Pruning()
         self._suspects: frozenset[MapId] = frozenset()
         self._implausible = ImplausibleMaps()
@@ -100,7 +102,7 @@ class Merger:
         self._isolation = Isolation()
         self._copies, self._copied = Copies(), dict[MapId, str]()
         self._contradictions = WrongGeometrySearch(self.settings.consistency)
-        self._own_views = OwnViewsSearch(self._comparisons)
+        self._own_views = OwnViewsSearch(self._comparisons, self._choice_key)
         self._wrong: dict[MapId, WrongGeometry] = {}
         self._unlinked: dict[MapPair, str] = {}
         self._stale: set[MapPair] = set()

@@ -1,9 +1,13 @@
-"""Which pairs of views of one map are held against its own way."""
+"""Which pairs of views of one map are held against its own way.
+
+A robot chooses the ids of its nodes. Which pairs are looked at depends on a key as well that no robot knows:
+else ids could be chosen so that the pairs that contradict are never among them.
+"""
 
 from __future__ import annotations
 
+import hashlib
 import math
-import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import numpy as np
@@ -31,9 +35,14 @@ NEAR_XY, NEAR_HEADING = 3.0, math.radians(60.0)
 class OwnViewsSearch:
     """Compares what is near each other on a robot's drive, besides the pairs that the merge compares."""
 
-    def __init__(self, comparisons: NodeComparisons) -> None:
-        """Take what compares nodes and keeps the verdicts."""
-        self._comparisons = comparisons
+    def __init__(self, comparisons: NodeComparisons, choice_key: bytes = b"") -> None:
+        """Begin with no maps.
+
+        Args:
+            comparisons: compares nodes and keeps the verdicts.
+            choice_key: at most 64 bytes; with the same one the same pairs are chosen.
+        """
+        self._comparisons, self._key = comparisons, choice_key
         self._lost: dict[MapId, dict[Pair, tuple[Verdict, bool]]] = {}
 
     def reason(
@@ -49,10 +58,10 @@ class OwnViewsSearch:
         """
         edges = (edge for edge in hybrid_map.edges.values() if edge.kind is not EdgeKind.DRIVEN)
         ends = ((min(edge.a, edge.b), max(edge.a, edge.b)) for edge in edges)
-        pairs = _some((pair for pair in ends if hybrid_map.nodes.keys() >= {*pair}), MOST_NEIGHBOURS)
-        pairs += _some((pair for piece in pieces for pair in _near(piece)), MOST_NEAR)
+        pairs = self._some((pair for pair in ends if hybrid_map.nodes.keys() >= {*pair}), MOST_NEIGHBOURS)
+        pairs += self._some((pair for piece in pieces for pair in self._near(piece)), MOST_NEAR)
         self._comparisons.verify(pairs)
-        pairs += _some(compared, MOST_COMPARED)
+        pairs += self._some(compared, MOST_COMPARED)
         pairs = [pair for pair in dict.fromkeys(pairs) if pair in self._comparisons]
         known, self._lost[map_id] = self._lost.get(map_id, {}), {}
         return contradiction(self._views(map_id, hybrid_map, pieces, pairs, known))
@@ -84,18 +93,19 @@ class OwnViewsSearch:
                 self._lost[map_id][pair] = verdict, lost
                 yield PairOfViews(a, b, way, None, lost)
 
+    def _near(self, piece: Fragment) -> list[Pair]:
+        """Pairs of nodes that are likely to show the same by the way."""
+        nodes = sorted(sorted(piece.nodes, key=lambda node: (self._drawn(f"{node}"), node))[:MOST_NODES])
+        x, y, heading = piece.graph.means[piece.graph.index(nodes)].T
+        away = np.hypot(x[:, None] - x, y[:, None] - y)
+        turn = np.abs(np.remainder(heading[:, None] - heading + np.pi, math.tau) - np.pi)
+        first, second = np.nonzero(np.triu((away < NEAR_XY) & (turn < NEAR_HEADING), 1))
+        return [(nodes[a], nodes[b]) for a, b in zip(first.tolist(), second.tolist(), strict=True)]
 
-def _near(piece: Fragment) -> list[Pair]:
-    """Pairs of nodes that are likely to show the same by the way."""
-    nodes = sorted(piece.nodes, key=lambda node: (zlib.crc32(f"{node}".encode()), node))[:MOST_NODES]
-    nodes.sort()
-    x, y, heading = piece.graph.means[piece.graph.index(nodes)].T
-    away = np.hypot(x[:, None] - x, y[:, None] - y)
-    turn = np.abs(np.remainder(heading[:, None] - heading + np.pi, math.tau) - np.pi)
-    first, second = np.nonzero(np.triu((away < NEAR_XY) & (turn < NEAR_HEADING), 1))
-    return [(nodes[a], nodes[b]) for a, b in zip(first.tolist(), second.tolist(), strict=True)]
+    def _some(self, pairs: Iterable[Pair], most: int) -> list[Pair]:
+        """As many pairs at most: nearly the same ones when others come, and from all of the map."""
+        return sorted(set(pairs), key=lambda pair: (self._drawn(f"{pair[0]} {pair[1]}"), pair))[:most]
 
-
-def _some(pairs: Iterable[Pair], most: int) -> list[Pair]:
-    """As many pairs at most: nearly the same ones when others come, and from all of the map."""
-    return sorted(set(pairs), key=lambda pair: (zlib.crc32(f"{pair[0]} {pair[1]}".encode()), pair))[:most]
+    def _drawn(self, words: str) -> bytes:
+        """What an id, or a pair of them, is ordered by."""
+        return hashlib.blake2b(words.encode(), digest_size=8, key=self._key).digest()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -365,6 +366,32 @@ def test_results_are_kept_by_name(store: Store) -> None:
     store.put_result("poses", b"1")
     store.put_result("poses", b"2")
     assert store.result("poses") == b"2"
+
+
+def test_a_secret_is_drawn_once_for_all_servers_of_a_store(place: Path | str) -> None:
+    first = open_store(place)
+    drawn = first.secret("choice")
+    assert len(drawn) == 16
+    assert drawn not in (first.secret("another"), first.id.to_bytes(8, "big") * 2)
+    if isinstance(first, PostgresStore):
+        with closing(open_store(place, "s1")) as second:
+            assert second.secret("choice") == drawn
+    first.close()
+    with closing(open_store(place)) as again:
+        assert again.secret("choice") == drawn
+
+
+def test_a_secret_that_the_disk_does_not_take_is_used_all_the_same(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with closing(SqliteStore(tmp_path / "s0.sqlite")) as store:
+
+        def full(*_: object) -> None:
+            raise InvalidFile("the disk is full")
+
+        monkeypatch.setattr(SqliteStore, "_put", full)
+        assert len(store.secret("choice")) == 16
+        assert store.result("choice") is None
 
 
 def test_a_journal_is_no_store(tmp_path: Path) -> None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -19,9 +20,13 @@ from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import NodeComparisons
 from mapweave.mapserver.merging.own_views_search import OwnViewsSearch
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
+from mapweave.mapserver.schedule import LockstepSchedule
+from mapweave.mapserver.server import MapServer
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import ConsistencySettings
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
 from synthetic.world import room, take_map
 from synthetic.wrong_geometry import ODD, SCENES, FaultyFleet, OdometryFault, draw_fleet
 from tests.quick import first_quick
@@ -111,3 +116,68 @@ def _by_neighbours(map_id: MapId, nodes: list[Node], edges: list[Edge]) -> str:
     comparisons = NodeComparisons(PlaceDatabase(), one.nodes.get, MergerCounters())
     pieces = DecisionCache().fragments({map_id: one}, ConsistencySettings())
     return OwnViewsSearch(comparisons).reason(map_id, one, pieces, ())
+
+
+LYING, TRUE = 48, 24
+"""Nodes of a robot that chooses its ids: those whose depths are wrong, and others."""
+
+
+def test_a_robot_that_chooses_its_ids_does_not_choose_what_is_looked_at() -> None:
+    """It knows the code, and numbers its nodes so that by an unkeyed choice its true nodes are looked at."""
+    one = _with_chosen_ids()
+    assert not _reason(one, b""), "else the ids are not chosen well enough to show anything"
+    for key in (b"a", b"b", b"c"):
+        assert "times as long" in _reason(one, key)
+
+
+def test_each_store_has_a_choice_of_its_own_which_servers_keep(tmp_path: Path) -> None:
+    keys = list[bytes]()
+    for name, schedule in (("a", None), ("a", None), ("b", None), ("c", LockstepSchedule())):
+        hub = MemoryHub()
+        server = MapServer(MemoryBus(hub), Keys("demo"), tmp_path / f"{name}.sqlite", "s0", schedule=schedule)
+        with server:
+            keys.append(server._worker._merger._own_views._key)
+    first, again, other, simulated = keys
+    assert first == again != other
+    assert simulated == b"", "a simulation is repeatable"
+
+
+def _with_chosen_ids() -> HybridMap:
+    """A drive around a room, of which the depths are too long behind the first third."""
+    rng = np.random.default_rng(7)
+    tour = [Pose2(2.0 + 0.25 * (k % 18), 0.8 + 1.2 * (k // 18), 0.03 * (k % 18)) for k in range(TRUE + LYING)]
+    drawn, search = MapId("r0", 1), OwnViewsSearch(_comparisons(HybridMap()))
+    nodes, edges = take_map(room(0, 0, 9, 7, 1800, rng), drawn, tour, rng, sigma_xy=0.01, sigma_heading=0.005)
+    ids: dict[NodeId, NodeId] = {}
+    numbers = iter(range(1000, 10**9))
+    for place, node in enumerate(nodes):
+        # Of each pair of a node that lies, what the choice orders by is to be high.
+        near = [other.id for other in nodes[:place] if _apart(other, node) < 3.0 and place >= TRUE]
+        ids[node.id] = next(
+            chosen
+            for chosen in (NodeId(*drawn, number) for number in numbers)
+            if all(search._drawn(f"{ids[other]} {chosen}")[0] >= 40 for other in near)
+        )
+    one = HybridMap()
+    for place, node in enumerate(nodes):
+        said = too_deep(node, place) if place >= TRUE else node
+        one.apply(NodePut(replace(said, id=ids[node.id])))
+    for edge in edges:
+        number = NodeId(*drawn, 1 + edge.id.number)
+        one.apply(EdgePut(replace(edge, id=number, a=ids[edge.a], b=ids[edge.b])))
+    return one
+
+
+def _apart(a: Node, b: Node) -> float:
+    between = a.map_from_robot.mean.inverse() @ b.map_from_robot.mean
+    return float(np.hypot(between.x, between.y))
+
+
+def _comparisons(one: HybridMap) -> NodeComparisons:
+    return NodeComparisons(PlaceDatabase(), one.nodes.get, MergerCounters())
+
+
+def _reason(one: HybridMap, key: bytes) -> str:
+    (map_id,) = {node.map for node in one.nodes}
+    pieces = DecisionCache().fragments({map_id: one}, ConsistencySettings())
+    return OwnViewsSearch(_comparisons(one), key).reason(map_id, one, pieces, ())
