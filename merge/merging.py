@@ -17,7 +17,7 @@ Links by hand join pieces before all others, and never fall. What contradicts th
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence, Set
+from collections.abc import Container, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field, replace
 
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -102,70 +102,47 @@ def decide(
     Returns:
         The merged map, and the standing decisions.
     """
-    s = settings
+    s, exact, standing = settings, before is None, before or StandingDecisions()
     links, certain = list(links), list(certain)
-    as_measured = maps, {link.pair: link for link in (*links, *certain)}
-    maps, fragments, links, certain = _corrected(maps, links, certain, s, cache, exact=before is None)
+    measured = _Measured(maps, {link.pair: link for link in (*links, *certain)})
+    maps, fragments, links, certain = _corrected(maps, links, certain, s, cache, exact)
     solver = ComponentSolver(fragments)
-    by_node = solver.by_node
-    by_hand = {link.pair: link for link in certain if link.a in by_node and link.b in by_node}
-    given = {link.pair: link for link in links if link.a in by_node and link.b in by_node} | by_hand
-    standing = before or StandingDecisions()
-    unchanged = {pair for pair, link in given.items() if standing.given.get(pair) is link}
-    news = (given.keys() - unchanged) | (standing.given.keys() - unchanged)
-    fresh = {(given.get(pair) or standing.given[pair]).maps for pair in news}
-    others = {pair: link for pair, link in given.items() if pair not in by_hand}
-    weighed = _weighed(others, standing, unchanged, fresh, by_node, maps, cache.decisions, s) | by_hand
-    held = [link for pair, link in weighed.items() if pair in standing.believed and pair in unchanged]
-    refuted = standing.refuted & unchanged
+    now = _Links.of(links, certain, solver.by_node, standing)
+    weighed = _weighed(now, standing, solver.by_node, maps, cache.decisions, s) | now.by_hand
+
+    # What has been decided and still holds.
+    held = [weighed[pair] for pair in weighed if pair in standing.believed and pair in now.unchanged]
+    refuted = standing.refuted & now.unchanged
     closed = {
         pair
-        for pair in standing.refused.keys() & unchanged
-        if weighed[pair].maps not in fresh and standing.together(*pair)
+        for pair in standing.refused.keys() & now.unchanged
+        if weighed[pair].maps not in now.fresh and standing.together(*pair)
     }
-    if before is not None:
-        removed = [standing.weighed[pair] for pair in standing.believed - unchanged]
+    contradicted = {pair: words for pair, words in standing.contradicted.items() if pair in now.unchanged}
+    if not exact:
+        removed = [standing.weighed[pair] for pair in standing.believed - now.unchanged]
         solver.resume(standing.graphs, standing.fragments, held, removed)
-    held += [link for pair, link in by_hand.items() if pair not in unchanged]
+    held += [link for pair, link in now.by_hand.items() if pair not in now.unchanged]
+
+    # Sorted by consistency, joined, optimised, and tested for robots that cannot have been in one place.
     refutation = Refutation(maps, fragments, s.exclusion, cache.trajectories)
-    open_ = [weighed[pair] for pair in others if pair not in refuted]
-    contradicted = {pair: words for pair, words in standing.contradicted.items() if pair in unchanged}
-    groups = cache.decisions.groups(open_, by_node, s.consistency, refutation.verdict, exact=before is None)
-    # Each round refutes a link at least, so there is a last one.
-    while True:
-        solved, kept, unjoined = _joined(solver, groups, held, closed, s, whole=before is None)
-        changed = None if before is None else solver.changed
-        impossible, against_hand = refutation.impossible(solved, kept, changed, by_hand)
-        contradicted |= against_hand
-        if not impossible:
-            break
-        for key, reason in impossible.items():
-            contradicting = [link for link in kept if refutation.key_of(link) == key]
-            groups[key] = groups[key].without(contradicting, reason, s.consistency, refutation.verdict)
-        fallen = {r.pair for group in groups.values() for r in group.refuted}
-        held = [link for link in held if link.pair not in fallen]
+    open_ = [weighed[pair] for pair in now.given if pair not in now.by_hand and pair not in refuted]
+    groups = cache.decisions.groups(open_, solver.by_node, s.consistency, refutation.verdict, exact)
+    joined = _joined(solver, groups, held, closed, refutation, now.by_hand, s, exact)
+    contradicted |= joined.against_hand
+
     refutations = {r.pair: r for group in groups.values() for r in group.refuted}
     because = {pair: standing.refused[pair] for pair in closed | refuted}
-    because |= {r.pair: r for r in unjoined} | refutations
-    refusals = [r for r in refused if r.a in by_node and r.b in by_node and r.pair not in by_hand]
-    refusals += because.values()
-    refusals += [r for fragment in fragments for r in fragment.refused]
-    refusals += refuse_drives(maps, solved, s.consistency)
-    merged = MergedMap(
-        dict(sorted(as_measured[0].items())),
-        tuple(
-            sorted(
-                (_as_measured(link, *as_measured).canonical() for link in kept), key=lambda link: link.pair
-            )
-        ),
-        tuple(sorted((_refused_as_measured(r, *as_measured) for r in refusals), key=lambda r: r.pair)),
-        tuple(frozenset(graph.nodes) for graph in solved),
-        NodePoses(solved),
-        tuple(solved),
-        contradicted=contradicted,
-    )
+    because |= {r.pair: r for r in joined.unjoined} | refutations
+    refusals = [
+        *(r for r in refused if {r.a, r.b} <= solver.by_node.keys() and r.pair not in now.by_hand),
+        *because.values(),
+        *(r for fragment in fragments for r in fragment.refused),
+        *refuse_drives(maps, joined.solved, s.consistency),
+    ]
+    merged = measured.merged_map(joined.solved, joined.kept, refusals, contradicted)
     return merged, StandingDecisions(
-        given,
+        now.given,
         weighed,
         frozenset(link.pair for link in merged.links),
         because,
@@ -173,9 +150,80 @@ def decide(
         merged.graphs,
         tuple(fragments),
         contradicted,
-        len(given) if before is None else standing.size,
-        0 if before is None else standing.changed + len(news),
+        len(now.given) if exact else standing.size,
+        0 if exact else standing.changed + now.news,
     )
+
+
+@dataclass(frozen=True, eq=False)
+class _Links:
+    """The links of a merge by their pairs, and what is new of them.
+
+    Attributes:
+        given: all at nodes that are there.
+        by_hand: those of them that a person has made.
+        unchanged: pairs of which the last merge had the same link.
+        fresh: maps between which links have come or gone.
+        news: how many have.
+    """
+
+    given: Mapping[Pair, Link]
+    by_hand: dict[Pair, Link]
+    unchanged: Set[Pair]
+    fresh: Set[tuple[MapId, MapId]]
+    news: int
+
+    @staticmethod
+    def of(
+        links: Iterable[Link], certain: Iterable[Link], nodes: Container[NodeId], standing: StandingDecisions
+    ) -> _Links:
+        by_hand = {link.pair: link for link in certain if link.a in nodes and link.b in nodes}
+        given = {link.pair: link for link in links if link.a in nodes and link.b in nodes} | by_hand
+        unchanged = {pair for pair, link in given.items() if standing.given.get(pair) is link}
+        news = (given.keys() - unchanged) | (standing.given.keys() - unchanged)
+        fresh = {(given.get(pair) or standing.given[pair]).maps for pair in news}
+        return _Links(given, by_hand, unchanged, fresh, len(news))
+
+
+@dataclass(frozen=True, eq=False)
+class _Joined:
+    """Components, the links that are kept, those that are not, and what contradicts links by hand."""
+
+    solved: list[PoseGraph]
+    kept: list[Link]
+    unjoined: list[RefusedLink]
+    against_hand: Mapping[Pair, str]
+
+
+def _joined(
+    solver: ComponentSolver,
+    groups: dict[Pair, LinkGroup],
+    held: Sequence[Link],
+    closed: Set[Pair],
+    refutation: Refutation,
+    by_hand: Mapping[Pair, Link],
+    s: MergeSettings,
+    exact: bool,
+) -> _Joined:
+    """Join and optimise until no two robots were at the same place at the same time.
+
+    Groups with refuted links are replaced in `groups`.
+    """
+    against_hand: dict[Pair, str] = {}
+    # Each round refutes a link at least, so there is a last one.
+    while True:
+        kept, unjoined = agglomerate(solver, groups, s.consistency, held, closed)
+        solved = solver.solve(kept, whole=exact)
+        changed = None if exact else solver.changed
+        impossible, contradictions = refutation.impossible(solved, kept, changed, by_hand)
+        against_hand |= contradictions
+        if not impossible:
+            return _Joined(solved, kept, unjoined, against_hand)
+        for key, reason in impossible.items():
+            contradicting = [link for link in kept if refutation.key_of(link) == key]
+            groups[key] = groups[key].without(contradicting, reason, s.consistency, refutation.verdict)
+        fallen = {r.pair for group in groups.values() for r in group.refuted}
+        held = [link for link in held if link.pair not in fallen]
 
 
 def _corrected(
@@ -212,55 +260,62 @@ def _corrected(
     )
 
 
-def _as_measured(link: Link, maps: Mapping[MapId, HybridMap], links: Mapping[Pair, Link]) -> Link:
-    """A link as it was verified, weighed as it is."""
-    verified = links.get(link.pair)
-    if verified is None or verified.a_from_b is link.a_from_b:
-        return link
-    return verified if verified.evidence == link.evidence else replace(verified, evidence=link.evidence)
+@dataclass(frozen=True, eq=False)
+class _Measured:
+    """Maps and links as they were measured: a merge says of these what it has decided of corrected ones."""
 
+    maps: Mapping[MapId, HybridMap]
+    links: Mapping[Pair, Link]
 
-def _refused_as_measured(
-    refusal: RefusedLink, maps: Mapping[MapId, HybridMap], links: Mapping[Pair, Link]
-) -> RefusedLink:
-    """A refusal of the link, or of the edge, as it was measured."""
-    if refusal.link is None:
-        return refusal
-    if refusal.edge is not None:
-        edge = maps[refusal.edge.map].edges.get(refusal.edge)  # none: a person keeps its nodes apart
-        same = edge is None or edge.a_from_b.mean == refusal.link.a_from_b.mean
-        return refusal if edge is None or same else refuse_edge(edge, refusal.reason)
-    link = _as_measured(refusal.link, maps, links)
-    return refusal if link is refusal.link else replace(refusal, link=link)
+    def merged_map(
+        self,
+        solved: Sequence[PoseGraph],
+        kept: Iterable[Link],
+        refusals: Iterable[RefusedLink],
+        contradicted: Mapping[Pair, str],
+    ) -> MergedMap:
+        return MergedMap(
+            dict(sorted(self.maps.items())),
+            tuple(sorted((self._link(link).canonical() for link in kept), key=lambda link: link.pair)),
+            tuple(sorted(map(self._refusal, refusals), key=lambda refusal: refusal.pair)),
+            tuple(frozenset(graph.nodes) for graph in solved),
+            NodePoses(solved),
+            tuple(solved),
+            contradicted=contradicted,
+        )
 
+    def _link(self, link: Link) -> Link:
+        """A link as it was verified, weighed as it is."""
+        verified = self.links.get(link.pair)
+        if verified is None or verified.a_from_b is link.a_from_b:
+            return link
+        return verified if verified.evidence == link.evidence else replace(verified, evidence=link.evidence)
 
-def _joined(
-    solver: ComponentSolver,
-    groups: Mapping[Pair, LinkGroup],
-    held: Sequence[Link],
-    closed: Set[Pair],
-    s: MergeSettings,
-    whole: bool,
-) -> tuple[list[PoseGraph], list[Link], list[RefusedLink]]:
-    """Join and optimise: the components, the links that are kept, and those that are not."""
-    kept, unjoined = agglomerate(solver, groups, s.consistency, held, closed)
-    return solver.solve(kept, whole=whole), kept, unjoined
+    def _refusal(self, refusal: RefusedLink) -> RefusedLink:
+        """A refusal of the link, or of the edge, as it was measured."""
+        if refusal.link is None:
+            return refusal
+        if refusal.edge is not None:
+            edge = self.maps[refusal.edge.map].edges.get(refusal.edge)  # none: a person keeps its nodes apart
+            same = edge is None or edge.a_from_b.mean == refusal.link.a_from_b.mean
+            return refusal if edge is None or same else refuse_edge(edge, refusal.reason)
+        link = self._link(refusal.link)
+        return refusal if link is refusal.link else replace(refusal, link=link)
 
 
 def _weighed(
-    given: Mapping[Pair, Link],
+    now: _Links,
     standing: StandingDecisions,
-    unchanged: Set[Pair],
-    fresh: Set[tuple[MapId, MapId]],
     by_node: Mapping[NodeId, Fragment],
     maps: Mapping[MapId, HybridMap],
     cache: DecisionCache,
     s: MergeSettings,
 ) -> dict[Pair, Link]:
     """Links with their aliased landmarks, searched among links between maps with new links."""
-    out = {pair: standing.weighed[pair] for pair in given if pair in unchanged}
-    some = [link for link in given.values() if link.maps in fresh]
-    involved = {map_id: maps[map_id] for pair in fresh for map_id in pair if map_id in maps}
+    given = {pair: link for pair, link in now.given.items() if pair not in now.by_hand}
+    out = {pair: standing.weighed[pair] for pair in given if pair in now.unchanged}
+    some = [link for link in given.values() if link.maps in now.fresh]
+    involved = {map_id: maps[map_id] for pair in now.fresh for map_id in pair if map_id in maps}
     for link, weighed_link in zip(
         some, cache.weighed(some, weigh(some, by_node, involved, s.consistency)), strict=True
     ):
