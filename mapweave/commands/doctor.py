@@ -21,6 +21,8 @@ if TYPE_CHECKING:
     from mapweave.settings import Settings
     from mapweave.wire.bus import Bus
 
+NARROW = 72
+"""Characters of a line below which a table would break words."""
 STYLES = {"good": "green", "warning": "yellow", "wrong": "bold red", "skipped": "dim"}
 
 
@@ -58,7 +60,7 @@ def add_to(commands: Any) -> None:
 
 
 def run(arguments: argparse.Namespace) -> int:
-    """Examine, print, and return 1 if something is wrong."""
+    """Examine, print, and return 4 if something is wrong."""
     from mapweave.doctor.examination import ExaminationOptions, examine
     from mapweave.doctor.finding import first_wrong, report
 
@@ -134,9 +136,10 @@ def _ask(words: str) -> bool:
 
 
 def _print(findings: Sequence[Finding]) -> None:
-    """A table; lines where rich is not installed."""
+    """A table; paragraphs on a narrow terminal, and lines where rich is not installed."""
     try:
         from rich.box import SIMPLE
+        from rich.padding import Padding
         from rich.table import Table
         from rich.text import Text
 
@@ -145,9 +148,16 @@ def _print(findings: Sequence[Finding]) -> None:
         for one in findings:
             print(f"{one.verdict:<8} {one.subject:<18} {one.detail}{'; ' if one.advice else ''}{one.advice}")
         return
+    console = plain_or_terminal(stderr=False)
+    if console.width < NARROW:
+        for one in findings:
+            console.print(Text.assemble((one.verdict, STYLES[one.verdict]), f" {one.subject}: {one.detail}"))
+            if one.advice:
+                console.print(Padding(Text(f"do: {one.advice}"), (0, 0, 0, 2)))
+        return
     table = Table("", "subject", box=SIMPLE)
     table.add_column("finding", overflow="fold", ratio=3)
     table.add_column("what to do", overflow="fold", ratio=2)
     for one in findings:
         table.add_row(Text(one.verdict, STYLES[one.verdict]), one.subject, Text(one.detail), Text(one.advice))
-    plain_or_terminal(stderr=False).print(table)
+    console.print(table)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import shlex
 import socket
@@ -17,6 +18,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from rich.console import Console
 
 from mapweave.agent.drivers import wheeled
 from mapweave.agent.drivers.serial_port import SerialPort
@@ -396,3 +398,24 @@ def test_a_table_names_the_first_thing_wrong(tmp_path, capfd) -> None:
     assert "python" in out and f"first: server: {endpoint}" in out and "do: start `mapweave server`" in out
     assert main(["doctor", "--offline", "--data", str(tmp_path)]) == 0
     assert capfd.readouterr().out.rstrip().endswith("nothing is wrong")
+
+
+@pytest.mark.parametrize("width", [40, 60])
+def test_a_narrow_terminal_cuts_no_word(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """On 40 columns the table had `observa` and `tions` on two lines, and `encode…`."""
+    said = "22 observations, 10 a second, 3 proximity sensors of which one is distance-limited"
+    findings = [
+        Finding("encoders", FindingLevel.SKIPPED, said, "mapweave doctor --drive"),
+        Finding("extra postgres", FindingLevel.WRONG, "not [installed]", "pip install mapweave[postgres]"),
+    ]
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=True, width=width, color_system=None)
+    monkeypatch.setattr("mapweave.terminal.plain_or_terminal", lambda stderr: console)
+    doctor_command._print(findings)
+    lines = file.getvalue().splitlines()
+    assert max(map(len, lines)) <= width
+    wanted = (
+        f"skipped encoders: {said} do: mapweave doctor --drive "
+        "wrong extra postgres: not [installed] do: pip install mapweave[postgres]"
+    )
+    assert " ".join(" ".join(lines).split()) == wanted
