@@ -36,19 +36,10 @@ from mapweave.mapserver.explainer import ConstraintRecord, Explainer
 from mapweave.mapserver.libraries import library_jobs
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.opening import open_store
-from mapweave.mapserver.log.store import (
-    ANNOTATIONS,
-    CHOICE_KEY,
-    CONSTRAINTS,
-    HISTORY,
-    MERGE_MARK,
-    PRUNING_MARK,
-    News,
-)
+from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, HISTORY, MERGE_MARK, PRUNING_MARK, News
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
-from mapweave.mapserver.merging.merge_retry import MergeRetry
-from mapweave.mapserver.merging.merge_sharing import MergeSharing
+from mapweave.mapserver.merging.merge_surroundings import MergeSurroundings, Surround
 from mapweave.mapserver.merging.pruning_record import PruningRecord
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.metrics import Metrics, Sources
@@ -63,7 +54,7 @@ from mapweave.mapserver.prompt_reading import PromptReading
 from mapweave.mapserver.quotas import Quotas, QuotaSettings
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.roster import Roster
-from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule, Schedule
+from mapweave.mapserver.schedule import LiveSchedule, Schedule
 from mapweave.mapserver.services import Services
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
@@ -116,6 +107,7 @@ class MapServer:
         schedule: Schedule | None = None,
         base: BaseMap | None = None,
         cache: Path | None = None,
+        surroundings: Surround = MergeSurroundings.live,
     ) -> None:
         """Open the store and take up where it was left.
 
@@ -129,6 +121,7 @@ class MapServer:
                 starts and ends with the server.
             base: a map that is there from the start, beside the store.
             cache: folder for what is kept beside a store in PostgreSQL; made if it is not there.
+            surroundings: what merging depends on besides; the other one is for repeatable runs.
 
         Raises:
             InvalidFile: the store is damaged or is none, is another server's, or has another map of a name
@@ -155,15 +148,12 @@ class MapServer:
         pruning = PruningRecord(
             self._store, s.merge.keep_superseded_days, self._said, base.maps if base else (), clock.monotonic
         )
-        # In lock-step nothing may depend on when another process has merged.
-        shares = self._store.shared and not isinstance(clock, LockstepSchedule)
+        around = surroundings(self._store, name, path, clock.monotonic)
         self._worker = MergeWorker(
             clock, MERGE_SHARE, places, s.merge,
             keeper=findings, history=self._history, compare=self._cluster.compare,
             observe=self._metrics.merged, pruning=pruning,
-            sharing=MergeSharing(self._store, name) if shares else None,
-            retry=MergeRetry(None if isinstance(clock, LockstepSchedule) else path, clock.monotonic),
-            choice_key=b"" if isinstance(clock, LockstepSchedule) else self._store.secret(CHOICE_KEY),
+            sharing=around.sharing, retry=around.retry, choice_key=around.choice_key,
         )  # fmt: skip
         self._constraints = ConstraintRecord(self._store, self._base)
         self._annotations = AnnotationRecord(self._store, self._base.annotations)

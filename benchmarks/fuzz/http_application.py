@@ -17,6 +17,7 @@ from mapweave.mapserver.http.same_site import SameSite
 from mapweave.mapserver.http.serving import MAX_VIEWER_BYTES
 from mapweave.mapserver.http.web import Questions
 from mapweave.mapserver.http.websocket import WebSocketConnection
+from mapweave.mapserver.merging.merge_surroundings import MergeSurroundings
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer
 from mapweave.wire.keys import Keys
@@ -33,7 +34,10 @@ class HttpApplication:
         """Start it."""
         folder = Path(tempfile.mkdtemp(prefix="fuzz-http-"))
         bus = MemoryBus(MemoryHub())
-        server = MapServer(bus, Keys("demo"), folder / "s0.sqlite", "s0", schedule=LockstepSchedule())
+        server = MapServer(
+            bus, Keys("demo"), folder / "s0.sqlite", "s0", schedule=LockstepSchedule(),
+            surroundings=MergeSurroundings.repeatable,
+        )  # fmt: skip
         self._server = server.__enter__()
         self._app = SameSite(Questions(server, 2.0, rates=Rates(1e9)).app, "127.0.0.1")
         self._failed: Exception | None = None

@@ -175,7 +175,8 @@ def run(arguments: argparse.Namespace) -> int:
 
         looking = stack.enter_context(ThreadPoolExecutor(1, "server name")).submit(look_for_another)
         from mapweave.mapserver.base_map import BaseMap
-        from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
+        from mapweave.mapserver.merging.merge_surroundings import MergeSurroundings
+        from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule, Schedule
         from mapweave.mapserver.server import MapServer, ServerSettings
         from mapweave.processes.separate_stores import SeparateStores
         from mapweave.processes.service_manager import ServiceManager
@@ -187,7 +188,10 @@ def run(arguments: argparse.Namespace) -> int:
         how = ServerSettings(
             settings.admission_control, settings.merge, settings.quotas, cluster, settings.attendance
         )
-        schedule = LockstepSchedule() if arguments.lockstep else LiveSchedule()
+        schedule: Schedule = LiveSchedule()
+        surroundings = MergeSurroundings.live
+        if arguments.lockstep:
+            schedule, surroundings = LockstepSchedule(), MergeSurroundings.repeatable
         if arguments.demo:
             from mapweave.recorded_fleet.fleet import RecordedFleet, prepare
 
@@ -209,7 +213,9 @@ def run(arguments: argparse.Namespace) -> int:
             base = BaseMap.of(str(given.path), given.content)
 
         def make() -> MapServer:
-            return MapServer(bus, keys, arguments.store or path, name, how, schedule, base, data)
+            return MapServer(
+                bus, keys, arguments.store or path, name, how, schedule, base, data, surroundings
+            )
 
         def tell(words: str) -> None:
             print(stamped(words), flush=True)

@@ -13,6 +13,7 @@ from mapweave.agent.observation import Command, Observation
 from mapweave.agent.pipeline import TickResult
 from mapweave.agent.synchronization import LockstepWaiting
 from mapweave.hybridmap.errors import MapweaveError
+from mapweave.mapserver.merging.merge_surroundings import MergeSurroundings
 from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer, ServerSettings
 from mapweave.processes.agent import Agent, AgentOptions
@@ -146,8 +147,10 @@ class LocalFleet:
         self._stage.store.parent.mkdir(parents=True, exist_ok=True)
         self._server_bus, file = MemoryBus(self._hub), self._stage.settings_file
         settings = ServerSettings(merge=load_settings(file).merge)
-        schedule = LockstepSchedule()
-        self._server = MapServer(self._server_bus, self.keys, self._stage.store, SERVER, settings, schedule)
+        self._server = MapServer(
+            self._server_bus, self.keys, self._stage.store, SERVER, settings, LockstepSchedule(),
+            surroundings=MergeSurroundings.repeatable,
+        )  # fmt: skip
         self._server.__enter__()
 
     def cut(self, robot: str) -> None:

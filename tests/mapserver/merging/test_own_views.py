@@ -15,12 +15,12 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.active_nodes import doubted
+from mapweave.mapserver.merging.merge_surroundings import MergeSurroundings
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import NodeComparisons
 from mapweave.mapserver.merging.own_views_search import OwnViewsSearch
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
-from mapweave.mapserver.schedule import LockstepSchedule
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.outlier_rejection.decision_cache import DecisionCache
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -132,10 +132,10 @@ def test_a_robot_that_chooses_its_ids_does_not_choose_what_is_looked_at() -> Non
 
 def test_each_store_has_a_choice_of_its_own_which_servers_keep(tmp_path: Path) -> None:
     keys = list[bytes]()
-    for name, schedule in (("a", None), ("a", None), ("b", None), ("c", LockstepSchedule())):
-        hub = MemoryHub()
-        server = MapServer(MemoryBus(hub), Keys("demo"), tmp_path / f"{name}.sqlite", "s0", schedule=schedule)
-        with server:
+    live, repeatable = MergeSurroundings.live, MergeSurroundings.repeatable
+    for name, surroundings in (("a", live), ("a", live), ("b", live), ("c", repeatable)):
+        bus, path = MemoryBus(MemoryHub()), tmp_path / f"{name}.sqlite"
+        with MapServer(bus, Keys("demo"), path, "s0", surroundings=surroundings) as server:
             keys.append(server._worker._merger._own_views._key)
     first, again, other, simulated = keys
     assert first == again != other
