@@ -85,6 +85,7 @@ class FleetClient(BusClient):
         self._status = Status("starting", "nothing sensed yet", 0, 0, Pose2(), False)
         self._stamp_ns = self._skipped = 0
         self._battery: float | None = None
+        self._silent = ""
         self._troubles = Troubles()
         self._missions = missions
         self._unsent, self._placed, self._failure = unsent, placed, failure
@@ -121,6 +122,7 @@ class FleetClient(BusClient):
         battery: float | None = None,
         publish: bool = True,
         skipped: int = 0,
+        silent: str = "",
     ) -> None:
         """Publish the robot's status: on request and, best effort, to subscribers.
 
@@ -130,8 +132,9 @@ class FleetClient(BusClient):
             battery: charge, as a share, if it is known.
             publish: send it now; else only answer questions with it.
             skipped: images that were skipped so far.
+            silent: why the robot's base does not answer; empty while it does.
         """
-        self._status = status
+        self._status, self._silent = status, silent
         self._stamp_ns, self._battery, self._skipped = stamp_ns, battery, skipped
         mission = self._missions.report
         self._troubles.mission(None if mission is None else (mission.order.id, mission.state))
@@ -171,8 +174,8 @@ class FleetClient(BusClient):
     def status(self) -> AgentStatus:
         """The status as others receive it; from any thread."""
         traffic = self._bus.traffic if isinstance(self._bus, TrafficMeter) else 0
-        # What fails now comes before a question that once had no answer.
-        failure = one_line(self._failure())
+        # What fails now comes before a question that once had no answer, and first what the robot drives by.
+        failure = one_line(self._silent or self._failure())
         trouble, age = (failure, 0.0) if failure else self._troubles.newest()
         status = self._status
         return AgentStatus(

@@ -77,6 +77,7 @@ class Observation:
             moved; once this ends, it is at an unknown place.
         left_out: (K, 4) px in the ideal image, regions of it in which other robots may stand, so that
             nothing there is a landmark: left, top, right, bottom. No driver gives it.
+        silent: why the robot's base does not answer, so that the robot stands; empty while it does.
     """
 
     stamp_ns: int
@@ -87,6 +88,7 @@ class Observation:
     battery: float | None = None
     kidnapped: bool = False
     left_out: NDArray[np.float64] = field(default_factory=lambda: np.zeros((0, 4)))
+    silent: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -115,7 +115,9 @@ class Runner:
         self._reported = self._clock() if now else self._reported
         step = replace(step, status=self._missions.explained(step.status))
         status = self._monitor.explained(step.status)
-        self._fleet.report(status, observation.stamp_ns, observation.battery, now, self.skipped)
+        self._fleet.report(
+            status, observation.stamp_ns, observation.battery, now, self.skipped, observation.silent
+        )
         self._ticks += 1
         self._on_step(observation, step)
 

@@ -147,7 +147,7 @@ class WheeledRobot:
                 stamp_ns = max(self._stamp_ns + tick_ns // 10, now_ns() - self._age_ns - tick_ns)
             way = self._way(stamp_ns)
             read_ns, reading = self._readings[-1]
-            bumped, kidnapped = self._bumped, self._kidnapped
+            bumped, kidnapped, silent = self._bumped, self._kidnapped, self._failure
             self._bumped, self._kidnapped = reading.bumped, reading.kidnapped
         before, self._odometry_at = self._odometry_at, way
         self._stamp_ns = stamp_ns
@@ -163,6 +163,7 @@ class WheeledRobot:
             bumped and fresh,
             reading.battery,
             kidnapped and fresh,
+            silent=silent,
         )
 
     def act(self, command: Command) -> Command:

@@ -157,6 +157,11 @@ def test_the_status_is_current(hub: MemoryHub, other: MemoryBus) -> None:
     second = asked()
     assert (second.status, second.stamp_ns, second.unsent) == (status, 5, 0)
     assert second.traffic > first.traffic > 0 and second.last_error == ""
+    failure[0] = "r0.sqlite: the disk is full"
+    link.report(status, 6, publish=False, silent="/dev/ttyUSB0: the port is gone")
+    assert asked().last_error == "/dev/ttyUSB0: the port is gone", "without it the robot does nothing else"
+    link.report(status, 7, publish=False)
+    assert asked().last_error == failure[0]
     token.close()
     eventually(lambda: not asked().linked)
     assert not received

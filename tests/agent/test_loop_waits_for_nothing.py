@@ -209,8 +209,11 @@ class Fleet:
     def answers(self) -> tuple[object, ...]:
         return ()
 
-    def report(self, status: Status, stamp_ns: int, battery: float | None, now: bool, skipped: int) -> None:
+    def report(
+        self, status: Status, stamp_ns: int, battery: float | None, now: bool, skipped: int, silent: str
+    ) -> None:
         self.skipped.append(skipped)
+        self.silent = silent
         self.published += [round(stamp_ns * 1e-8)] * now
 
 
@@ -226,6 +229,15 @@ def test_statuses_go_out_as_rarely_as_the_servers_want(
     for tick in range(30):
         runner.tick(Observation(tick * 100_000_000, Odometry(0.0, 0.0)))
     assert fleet.published == published
+
+
+def test_a_base_that_does_not_answer_is_reported(description: RobotDescription) -> None:
+    """`the wheels do not obey: check motor power` was all that a person heard of a port that was gone."""
+    slow, fleet = Slow([0.02] * 2), Fleet()
+    runner = Runner(slow, fleet, fleet, MissionControl("r0"), MappingMonitor(description), clock=slow.clock)
+    for tick, words in enumerate(("/dev/ttyUSB0: the port is gone", "")):
+        runner.tick(Observation(tick * 100_000_000, Odometry(0.0, 0.0), silent=words))
+        assert fleet.silent == words
 
 
 def test_images_that_come_during_a_long_tick_are_skipped_and_counted(description, caplog) -> None:

@@ -199,6 +199,9 @@ def test_a_base_that_waits_on_for_an_answer_is_called_silent(
         base.answers.set()
         eventually(lambda: "the robot answers again" in caplog.text)
     assert seen is not None and seen.odometry.forward == 0.0
+    assert seen.silent == "the robot's base has not answered for 0.3 s", "who is far away reads no log"
+    after = robot.sense()
+    assert after is not None and after.silent == ""
     assert [record.message for record in caplog.records] == [
         "the robot's base has not answered for 0.3 s; the robot stands until it answers again",
         "the robot answers again",
