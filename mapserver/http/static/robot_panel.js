@@ -4,7 +4,7 @@ import { goalOf, wordsOf } from "./names.js";
 import { onPlans } from "./plans.js";
 
 const QUIET = 5; // s without a status
-const KINDS = { sent: "good", running: "good", done: "good", failed: "bad", refused: "bad", replaced: "warn" }; // of missions
+const KINDS = { sent: "warn", running: "good", done: "good", failed: "bad", refused: "bad", replaced: "warn" }; // of missions
 let panel = null;
 
 const known = new Map(); // robot: its last pose, and the anchor of the component in which that is

@@ -31,10 +31,12 @@ SENT = "return document.querySelector('#selected p[role=status]').{}"
 
 
 class DrivenServices(StubServices):
-    """A robot that takes each mission."""
+    """A robot that takes each mission, or does not answer."""
+
+    answers_with = MissionState.RUNNING
 
     def give(self, robot: str, *_: Any) -> MissionReport:
-        return report(MissionState.RUNNING)
+        return report(self.answers_with)
 
 
 def report(state: MissionState, progress: float = 0.0, reason: str = "") -> MissionReport:
@@ -84,6 +86,19 @@ def test_what_became_of_a_mission_replaces_what_was_said_when_it_was_given(
     failed = "go to hall, failed: a door is shut (by page)"
     eventually(lambda: person.page.run(SENT.format("textContent")) == failed)
     assert person.page.run(SENT.format("className")) == "bad"
+
+
+def test_what_has_not_reached_its_robot_is_not_shown_as_good(
+    person: Person, services: DrivenServices
+) -> None:
+    """Also a stop, after which it may be driving, was written in green."""
+    services.answers_with = MissionState.SENT
+    select(person)
+    person.page.run(
+        "[...document.querySelectorAll('#selected button')].find(b => b.textContent === 'Stop').click()"
+    )
+    eventually(lambda: "sent" in str(person.page.run(SENT.format("textContent"))))
+    assert person.page.run(SENT.format("className")) == "warn"
 
 
 def test_a_robot_at_the_beginning_of_its_map_is_at_zero(person: Person, services: DrivenServices) -> None:
