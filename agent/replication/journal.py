@@ -372,6 +372,23 @@ class Journal:
         query = "SELECT server, watermark FROM ack WHERE epoch = ? ORDER BY server"
         return dict(self._read(query, self._epoch(map_id)))
 
+    def note_put_back(self, map_id: MapId) -> None:
+        """Remember that servers have other changes of a log by the numbers of those that are here.
+
+        Raises:
+            InvalidFile: the disk does not take it.
+        """
+        with self._lock, self._database.transaction() as rows:
+            # No journal but those few has this table, so that all others stay as older versions know them.
+            rows.execute("CREATE TABLE IF NOT EXISTS put_back (epoch INTEGER PRIMARY KEY)")
+            rows.execute("INSERT OR IGNORE INTO put_back VALUES (?)", self._epoch(map_id))
+
+    def was_put_back(self, map_id: MapId) -> bool:
+        """Whether that was noted of a log."""
+        if not self._read("SELECT 1 FROM sqlite_master WHERE name = 'put_back'"):
+            return False
+        return bool(self._read("SELECT 1 FROM put_back WHERE epoch = ?", self._epoch(map_id)))
+
     def prune(self, map_id: MapId, servers: Iterable[str]) -> int:
         """Drop changes that every one of the servers has and that a later change of the same log undoes.
 

@@ -15,6 +15,37 @@ LATE = 30.0
 the longest lease is over, which ends the connection with all that waits in it."""
 
 
+PUT_BACK = "{} has changes of {} that this disk has lost: begin a fresh map (--fresh)"
+"""Of a disk that was put back to an older state, as by a backup."""
+
+
+class Ranges:
+    """Changes of a log, as ranges of their numbers."""
+
+    def __init__(self, last: int) -> None:
+        """All up to the last."""
+        self._ranges = [(0, last)]
+
+    @property
+    def whole(self) -> int:
+        """All up to here are among them."""
+        return self._ranges[0][1]
+
+    def add(self, first: int, last: int) -> None:
+        """These, too; those that were added before are mostly behind them."""
+        newest_first, newest_last = self._ranges[-1]
+        if newest_first <= first <= newest_last + 1:
+            self._ranges[-1] = newest_first, max(newest_last, last)
+            return
+        joined: list[tuple[int, int]] = []
+        for begin, end in sorted([*self._ranges, (first, last)]):
+            if joined and begin <= joined[-1][1] + 1:
+                joined[-1] = joined[-1][0], max(joined[-1][1], end)
+            else:
+                joined.append((begin, end))
+        self._ranges = joined
+
+
 @dataclass
 class LogState:
     """One log.
@@ -28,6 +59,9 @@ class LogState:
         failure: why servers do not take this log at all; empty if they do.
         stores: by which id each server's store was known last, see mapweave.wire.log_messages.Ack.
         status_periods: that each server wants, s, likewise.
+        sent: changes that others may have: those that were there when this began, and what left since.
+        put_back: whether a server has changes that have not left: the disk was put back to an older state,
+            and what is there instead has the same numbers.
         left: when which server was first heard of with another store than this one, in the last `LATE`; s of
             the monotonic clock.
     """
@@ -41,11 +75,20 @@ class LogState:
     stores: dict[str, int] = field(default_factory=dict)
     status_periods: dict[str, float] = field(default_factory=dict)
     left: dict[tuple[str, int], float] = field(default_factory=dict)
+    sent: Ranges = field(init=False)
+    put_back: bool = False
+
+    def __post_init__(self) -> None:
+        """What is on the disk may have left before."""
+        self.sent = Ranges(self.newest)
 
     @staticmethod
     def of(journal: Journal, map_id: MapId) -> LogState:
         """The state as the journal has it; raises InvalidValue if the map was never opened."""
-        return LogState(map_id, journal.log_id(map_id), journal.head(map_id), journal.acknowledged(map_id))
+        state = LogState(map_id, journal.log_id(map_id), journal.head(map_id), journal.acknowledged(map_id))
+        if journal.was_put_back(map_id):
+            state.put_back, state.failure = True, PUT_BACK.format("a server", map_id)
+        return state
 
     def settled(self, servers: Sequence[str]) -> int:
         """Up to which change all of these servers have the log; without any, the server that has most."""
@@ -97,9 +140,9 @@ class LogState:
         if self.failure.startswith(f"{server}: ") and all(refusal.sequence for refusal in ack.refusals):
             # It takes the log again, for example since it has room for it.
             self.failure = ""
-        if ack.watermark > self.newest and not self.failure:
-            # This disk was put back to an older state. New changes would take numbers that the server has
-            # seen, and it would drop them as doubles.
-            self.failure = f"{server} has more of {self.map} than this disk: begin a fresh map"
+        if ack.watermark > self.sent.whole and not self.put_back:
+            # New changes have numbers that the server has seen, and it drops them as doubles.
+            self.put_back = True
+            self.failure = PUT_BACK.format(server, self.map)
             news.append(self.failure)
         return news

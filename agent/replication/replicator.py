@@ -253,7 +253,9 @@ class Replicator:
         self._thread.join()
 
     def _unacknowledged(self) -> int:
-        return sum(state.unsettled(self._servers) for state in self._logs.values())
+        # One that no server takes any more is not waited for, once it was left.
+        waits = [one for one in self._logs.values() if one is self._current or not one.put_back]
+        return sum(state.unsettled(self._servers) for state in waits)
 
     def _wanted_period(self, unknown: float) -> float:
         """The longest status period that a server wants; `unknown` as long as none has said it."""
@@ -347,9 +349,14 @@ class Replicator:
         self._beacon_after(self._ack_timer.timeout)
 
     def _publish(self, state: LogState, first: int, drafts: Sequence[Draft]) -> None:
+        if state.put_back:
+            return
+        leaves = self._bus.connected()
         for sequence, draft in enumerate(drafts, start=first):
             change = wrap_body(sequence, draft.stamp_ns, draft.encoded)
             self._bus.publish(self._keys.change(state.map), change, Mark(sequence, state.log_id).encode())
+        if leaves or self._bus.connected():
+            state.sent.add(first, first + len(drafts) - 1)
 
     def _send_beacons(self, now: float) -> None:
         everyone = now >= self._everyone_at
@@ -359,9 +366,9 @@ class Replicator:
             )
         unsettled = False
         for state in self._logs.values():
-            lacking = state.unsettled(self._servers) > 0
+            lacking = state.unsettled(self._servers) > 0 and not state.put_back
             unsettled |= lacking
-            if everyone or lacking:
+            if (everyone or lacking) and not state.put_back:
                 self._bus.publish(self._keys.head(state.map), state.head().encode())
         self._next_beacon = self._everyone_at
         if unsettled:
@@ -378,11 +385,16 @@ class Replicator:
         state = self._logs.get(ack.map)
         if state is None or ack.log_id != state.log_id or state.outdated(server, ack):
             return
+        was_put_back = state.put_back
         with self._changed:
             news = state.take(server, ack)
             lost = state.lost(server, ack)
         for line in news:
             log.warning("%s", line)
+        if state.put_back:
+            if not was_put_back:
+                self._note_put_back(state)
+            return
         if lost:
             # It is to know how much it had: what was retired meanwhile may have been dropped here.
             self._bus.publish(self._keys.head(state.map), state.head().encode())
@@ -425,6 +437,14 @@ class Replicator:
             self._next_beacon = self._everyone_at
             self._beacon_after(self._ack_timer.timeout)
 
+    def _note_put_back(self, state: LogState) -> None:
+        """After the next start all that is on the disk may have left."""
+        try:
+            self._journal.note_put_back(state.map)
+        except InvalidFile as error:
+            if not logged(error):
+                log.error("%s", error)
+
     def _compact(self, state: LogState) -> None:
         """Drop from the disk what later changes of a log undo."""
         if state is self._current:
@@ -455,6 +475,9 @@ class Replicator:
             state = self._logs.get(self._keys.parse_log(question.key))
             if state is None:
                 raise InvalidMessage(f"{question.key}: no such log")
+            if state.put_back or asked.first > state.sent.whole + 1:
+                # Who has all before that has it from a disk of before; its acknowledgement is awaited.
+                raise InvalidMessage(f"{question.key}: this disk has other changes before {asked.first}")
             last = min(asked.last, asked.first + MAX_ROWS - 1, state.newest)
             rows = self._journal.rows(state.map, asked.first, last)
         except MapweaveError as error:
@@ -470,4 +493,6 @@ class Replicator:
                 rows, last = rows[:count], rows[count - 1][0]
                 break
         answer = LogAnswer(state.log_id, asked.first, max(last, asked.first - 1), tuple(rows))
+        if last >= asked.first:
+            state.sent.add(asked.first, last)
         question.reply(answer.encode())

@@ -9,8 +9,11 @@ from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from mapweave.agent.replication.journal import Draft, Journal
+from mapweave.agent.replication.log_state import Ranges
 from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
 from mapweave.hybridmap.agent_status import FIRST_STATUS_PERIOD
 from mapweave.hybridmap.change import ChangeBody, NodeRetired
@@ -493,3 +496,12 @@ def test_what_later_changes_undo_leaves_the_disk_while_the_agent_runs(
     assert len(agent.journal.changes(MAP, 1, 9)) == 5 and agent.replicator.shared
     server.acknowledge(agent.log_id, 5)
     eventually(lambda: [change.sequence for change in agent.journal.changes(MAP, 1, 9)] == [5])
+
+
+@given(st.integers(0, 20), st.lists(st.tuples(st.integers(1, 40), st.integers(0, 6))))
+def test_ranges_are_the_set_of_their_numbers(last: int, added: list[tuple[int, int]]) -> None:
+    ranges, numbers = Ranges(last), set(range(last + 1))
+    for first, more in added:
+        ranges.add(first, first + more)
+        numbers |= set(range(first, first + more + 1))
+        assert ranges.whole == next(k for k in range(100) if k + 1 not in numbers)

@@ -1,0 +1,83 @@
+"""A robot on an older copy of its journal: its new changes have numbers of others that the server has."""
+
+from __future__ import annotations
+
+import shutil
+from collections.abc import Iterator
+from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from mapweave.agent.replication.replicator import Replicator
+from mapweave.hybridmap.change import NodePut
+from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.mapserver.log.ingest import Ingest
+from mapweave.mapserver.log.sqlite_store import SqliteStore
+from mapweave.wire.keys import Keys
+from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.mapserver.log.test_older_store import Robot, contents
+from tests.mapserver.log.test_store import node_put
+from tests.waiting import eventually
+
+MAP = MapId("r0", 1)
+PATIENCE = 60.0
+
+
+@pytest.fixture
+def put_back(tmp_path: Path) -> Path:
+    """A folder with a server's store that has nine changes, and a robot's journal of which five are left."""
+    hub, journal, before = MemoryHub(), tmp_path / "r0.sqlite", tmp_path / "before.sqlite"
+    store = SqliteStore(tmp_path / "s0.sqlite")
+    with closing(MemoryBus(hub)) as bus, closing(store), closing(serving(bus, store)):
+        with closing(Robot(hub, tmp_path)) as robot:
+            robot.send(*(node_put(k) for k in range(1, 6)))
+        shutil.copy(journal, before)
+        with closing(Robot(hub, tmp_path)) as robot:
+            robot.send(*(node_put(k) for k in range(6, 10)))
+    shutil.copy(before, journal)
+    return tmp_path
+
+
+def serving(bus: MemoryBus, store: SqliteStore) -> Ingest:
+    return Ingest(bus, Keys("fleet"), store, "s0", lambda change: None)
+
+
+@pytest.fixture
+def hub() -> Iterator[MemoryHub]:
+    yield MemoryHub()
+
+
+@pytest.mark.parametrize("away", [False, True], ids=["the server is there", "the network comes later"])
+def test_what_a_robot_maps_behind_an_older_journal_does_not_pass_for_what_the_server_has(
+    put_back: Path, hub: MemoryHub, away: bool
+) -> None:
+    store = SqliteStore(put_back / "s0.sqlite")
+    had = contents(change.body for change in store.replay(MAP))
+    with closing(MemoryBus(hub)) as bus, closing(store), closing(serving(bus, store)) as ingest:
+        with closing(Robot(hub, put_back)) as robot:
+            link = robot.replicator
+            if away:
+                hub.cut(robot._bus)
+            else:
+                eventually(lambda: "begin a fresh map" in link.status().failure, PATIENCE)
+            for number in range(20, 30):
+                link.submit([node_put(number)], 1)
+                assert link.flush(PATIENCE)
+            assert link.status().newest == 15
+            if away:
+                hub.restore(robot._bus)
+            eventually(lambda: "begin a fresh map" in link.status().failure, PATIENCE)
+            asked = ingest.counters().pulls
+            assert not link.wait_acknowledged(1.0)
+            assert link.status().unacknowledged == 10 and robot.journal.acknowledged(MAP) == {"s0": 5}
+        with closing(Robot(hub, put_back)) as robot:
+            assert "begin a fresh map" in robot.replicator.status().failure, "also after it starts again"
+            assert not robot.replicator.wait_acknowledged(1.0)
+            robot.journal.open_map(2)
+            with closing(Replicator(robot._bus, Keys("fleet"), robot.journal, MapId("r0", 2))) as fresh:
+                fresh.submit([NodePut(replace(node_put(1).node, id=NodeId("r0", 2, 1)))], 1)
+                assert fresh.wait_acknowledged(PATIENCE) and not fresh.status().failure
+        assert contents(change.body for change in store.replay(MAP)) == had and store.watermark(MAP) == 9
+        assert asked <= 2
