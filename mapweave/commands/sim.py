@@ -79,7 +79,6 @@ def _add_run(kinds: Any) -> None:
         "--seed", type=values.seed, help="other seeds, other worlds (default: the scenario's)"
     )
     parser.add_argument("-o", "--out", type=Path, help="folder for the report (default: out/sim/NAME-SEED)")
-    parser.add_argument("--no-film", action="store_true", help="make no film: a little quicker")
     parser.add_argument(
         "--view", type=values.port, nargs="?", const=8090, metavar="PORT",
         help="show the trial live at http://127.0.0.1:PORT (default port: 8090)",
@@ -99,14 +98,14 @@ def _add_batch(kinds: Any) -> None:
     parser = kinds.add_parser(
         "batch",
         help="try a scenario with many seeds",
-        description="Run a scenario once a seed and show the median and the worst of every figure. Exit "
-        "status 0: every trial met its expectations; 4: not; 1: the scenario could not be read.",
+        description="Run a scenario once a seed and show the median and the worst of every figure; "
+        "`sim run --seed` makes the film of one. Exit status 0: every trial met its expectations; 4: not; "
+        "1: the scenario could not be read.",
     )
     _add_scenario(parser)
     parser.add_argument("--seeds", type=values.count, default=10, metavar="N", help="how many (default: 10)")
     parser.add_argument("--first", type=values.seed, help="the first seed (default: the scenario's)")
     parser.add_argument("-o", "--out", type=Path, help="folder for the reports (default: out/sim/NAME)")
-    parser.add_argument("--film", action="store_true", help="make a film of each trial")
     _add_fleet(parser)
     parser.set_defaults(run=run_batch)
 
@@ -167,8 +166,7 @@ def run_one(arguments: argparse.Namespace) -> int:
     out = arguments.out or Path("out/sim") / f"{scenario.name}-{seed}"
     options = TrialOptions(
         seed, out, not arguments.one_process, settings.agent, arguments.settings,
-        film_every=0.0 if arguments.no_film else 1.0, view=arguments.view, rerun=arguments.rerun,
-        mcap_log=arguments.mcap_log,
+        view=arguments.view, rerun=arguments.rerun, mcap_log=arguments.mcap_log,
     )  # fmt: skip
     trial = run_trial(scenario, options)
     if arguments.json:
@@ -194,9 +192,8 @@ def run_batch(arguments: argparse.Namespace) -> int:
     first = scenario.seed if arguments.first is None else arguments.first
     out = check_output(arguments.out or Path("out/sim") / scenario.name)
     trial = TrialOptions(
-        first, out, not arguments.one_process, settings.agent, arguments.settings,
-        film_every=1.0 if arguments.film else 0.0,
-    )  # fmt: skip
+        first, out, not arguments.one_process, settings.agent, arguments.settings, film_every=0.0
+    )
     options = BatchOptions(trial, arguments.seeds, arguments.json)
     return DONE if run_batch_of_trials(scenario, options) else NO
 
