@@ -38,6 +38,7 @@ from rich.progress import Progress
 
 from benchmarks.command_line import command_line
 from benchmarks.liar.margins import MARGINS
+from benchmarks.liar.recovery import RecoveryOutcome, RecoveryTrial, recovery_row
 from benchmarks.rules.switches import ALL, Switch, switched_off
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver import active_nodes, answers
@@ -51,14 +52,7 @@ from mapweave.merge.outlier_rejection.fleet_chance import FleetChance
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
 from mapweave.merge.pose_graph.staged_optimization import StagedOptimization
 from mapweave.scenarios.liar.lies import EVERY, WAYS, Map, honest
-from mapweave.scenarios.liar.trial import (
-    ContainmentOutcome,
-    LiarTrial,
-    RecoveryOutcome,
-    recovery_row,
-    row,
-    totals,
-)
+from mapweave.scenarios.liar.trial import ContainmentOutcome, row, totals
 from synthetic.wrong_geometry import ODD, SCENES, FaultyFleet, OdometryFault, draw_fleet, lost_views
 
 SCENE = "house", 3
@@ -110,12 +104,12 @@ def draw(seed: int, scene: tuple[str, int] = SCENE) -> tuple[FaultyFleet, dict[M
     return fleet, maps
 
 
-def drawn_trial(seed: int, queries: int, folder: Path, scene: tuple[str, int] = SCENE) -> LiarTrial:
+def drawn_trial(seed: int, queries: int, folder: Path, scene: tuple[str, int] = SCENE) -> RecoveryTrial:
     """Three robots map the house, or another scene, and a fourth one is to lie."""
     fleet, maps = draw(seed, scene)
     honest_truth = {node: pose for node, pose in fleet.truth.items() if node.map != ODD}
     views = lost_views(replace(fleet, truth=honest_truth), SCENES[scene[0]], queries, seed)
-    return LiarTrial(ODD, maps, views, honest_truth, seed, folder)
+    return RecoveryTrial(ODD, maps, views, honest_truth, seed, folder)
 
 
 def tried(

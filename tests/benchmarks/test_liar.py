@@ -9,9 +9,9 @@ import pytest
 
 from benchmarks.liar.benchmark import RULES, draw, drawn_trial
 from benchmarks.liar.margins import MARGINS
+from benchmarks.liar.recovery import SAME_M
 from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.scenarios.liar.lies import UNDECIDABLE, WAYS, LieInputs
-from mapweave.scenarios.liar.trial import SAME_M
 from synthetic.wrong_geometry import ODD
 
 

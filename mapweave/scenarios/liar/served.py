@@ -7,25 +7,22 @@ from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
+from typing import Self
 
 import numpy as np
 
 from mapweave.hybridmap.agent_status import FleetStatus
-from mapweave.hybridmap.constraint_subject import RetiredMap
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.pose import Pose2, PoseGaussian, wrap_angle
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
 from mapweave.mapserver.relocalization.verdict import FLOOR_HEADING, FLOOR_XY, GATE
 from mapweave.mapserver.server import MapServer
-from mapweave.merge.explanation.map_standing import map_standings
-from mapweave.merge.explanation.twin_maps import TWINS
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.bus import Closing, Request, Sample
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Ack, Head, LogAnswer, LogRequest, Mark, decode_record
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from mapweave.wire.messages import decode, encode, encode_view
+from mapweave.wire.messages import decode, encode_view
 
 KEYS = Keys("liars")
 LOG_ID = 7
@@ -95,7 +92,7 @@ class Served:
         self._acks: dict[MapId, int] = {}
         self._tokens: list[Closing] = []
 
-    def __enter__(self) -> Served:
+    def __enter__(self) -> Self:
         """Begin to serve."""
         self._server.__enter__()
         return self
@@ -155,21 +152,6 @@ class Served:
     def links_joining(self, agent: str) -> int:
         """How many links there are between a robot's maps and those of others."""
         return sum((link.a.agent == agent) != (link.b.agent == agent) for link in self._server.merged().links)
-
-    def twins(self, agent: str) -> str:
-        """What the status says of two maps that show the same places, one of them of a robot; else empty."""
-        standings = map_standings(self._server.merged()).values()
-        said = (one.apart for one in standings if TWINS in one.apart)
-        return next((words for words in said if f"{agent}." in words.partition(TWINS)[0]), "")
-
-    def retire(self, maps: Iterable[MapId]) -> bool:
-        """Have a person retire maps; returns whether all is merged without them in time."""
-        for map_id in maps:
-            made = ManualConstraint(RetiredMap(map_id), True, "operator", time.time_ns(), "it is a copy")
-            replies = self._bus.ask(KEYS.constrain("s0"), encode(ConstraintRequest(made)), 20.0)
-            if not replies or replies[0].error:
-                return False
-        return self.settle()
 
     def seen(
         self, maps: Collection[MapId], lost: Sequence[tuple[View, Pose2]], truth: Mapping[NodeId, Pose2]

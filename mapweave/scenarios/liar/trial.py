@@ -21,9 +21,6 @@ from mapweave.scenarios.liar.served import FleetResult, Served, TrialAnswer, dif
 MOVED_M = 0.05
 """More than this moves no node of the others, m."""
 
-SAME_M = 0.001
-"""A node that has moved by less is where it was, m: poses are solved again."""
-
 Bools = NDArray[np.bool_]
 
 
@@ -57,28 +54,6 @@ class ContainmentOutcome:
     def accused(self) -> bool:
         """Whether both the page and the status of the robots name the robot that lies."""
         return bool(self.named) and self.in_status
-
-
-@dataclass(frozen=True)
-class RecoveryOutcome:
-    """What is left of a lie once a person has retired the maps of the robot that lies.
-
-    Attributes:
-        recovered: whether the others have what they had without it, node by node.
-        twins: what the status says before that of its map and another one that show the same places; empty if
-            nothing.
-        max_pose_difference_m: of the others' nodes.
-        answers_changed: of those to lost robots.
-        links_changed: among their maps.
-        superseded_otherwise: of their nodes.
-    """
-
-    recovered: bool
-    twins: str
-    max_pose_difference_m: float
-    answers_changed: int
-    links_changed: int
-    superseded_otherwise: int
 
 
 def changed_answer(before: TrialAnswer, after: TrialAnswer) -> bool:
@@ -140,26 +115,6 @@ class LiarTrial:
         """Add the fourth robot with a lie. Views that an honest one changes the answers to are left out."""
         return self._outcome(lie)[0]
 
-    def recovery(self, lie: Callable[[LieInputs], LyingMessages]) -> RecoveryOutcome:
-        """Add the fourth robot with a lie, retire its maps, and compare; and again after a restart."""
-        sent, folder = self._sent(lie), self._folder / "recovery"
-        shutil.copytree(self._base, folder)
-        with Served(folder / "s0.sqlite") as served:
-            alive = served.settle() and served.send(sent.logs, sent.extra) and served.settle()
-            twins = served.twins(self._liar.agent)
-            alive = served.retire(sent.logs) and alive
-            after = [served.seen(self._others, self._queries, self._truth)]
-        with Served(folder / "s0.sqlite") as served:
-            alive = served.settle() and alive
-            after.append(served.seen(self._others, self._queries, self._truth))
-        shutil.rmtree(folder)
-        each = [compared(self.before, one) for one in after]
-        moved, links = max(one[0] for one in each), max(one[2] for one in each)
-        answers = max(int(one[1].sum()) for one in each)
-        otherwise = max(len(self.before.superseded ^ one.superseded) for one in after)
-        recovered = alive and moved <= SAME_M and not answers and not links and not otherwise
-        return RecoveryOutcome(recovered, twins, round(moved, 4), answers, links, otherwise)
-
     def _sent(self, lie: Callable[[LieInputs], LyingMessages]) -> LyingMessages:
         rng = np.random.default_rng([self._seed, 0x11E])
         return lie(LieInputs(self._liar, self._own, self._others, rng))
@@ -202,16 +157,6 @@ def row(name: str, one: ContainmentOutcome) -> str:
     if one.named and not one.in_status:
         named += " (not in the status)"
     return f"{name}: {verdict}, {figures}, {one.seconds:.0f} s; {named}"
-
-
-def recovery_row(name: str, one: RecoveryOutcome) -> str:
-    """What is left of a lie as a line."""
-    figures = (
-        f"{one.max_pose_difference_m:.3f} m, {one.answers_changed} answers, "
-        f"{one.links_changed} links changed, {one.superseded_otherwise} nodes superseded otherwise"
-    )
-    verdict = "recovered" if one.recovered else "NOT RECOVERED"
-    return f"{name}: {verdict}, {figures}; {one.twins or 'joined, or not said to be a twin'}"
 
 
 def totals(outcomes: Mapping[str, ContainmentOutcome]) -> dict[str, Any]:
