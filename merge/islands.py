@@ -3,6 +3,8 @@
 Maps that links tie together, directly or by way of others, are an island. Nothing in one island bears on
 another, so an island that nothing has touched is kept as it is.
 
+What some of the maps are without the others says a second merge, of these alone: see `Islands.links_among`.
+
 Two sorts of manual constraints need a second merge of their islands: which nodes lie in a retired area says
 the merge without retired areas, and whether a link by hand is contradicted the merge without links by hand.
 """
@@ -66,6 +68,8 @@ class Islands:
         self._cut_maps = CutMaps()
         self._without_areas: Islands | None = None
         self._without_hand: Islands | None = None
+        self._some: Islands | None = None
+        self._asked, self._untold = False, set[MapId]()
         self._marginals: Sequence[Link] = ()
         self._standing: Set[Pair] = frozenset()
         self._fused: dict[Pair, tuple[Link, Link, Link | None]] = {}
@@ -85,7 +89,7 @@ class Islands:
         self._fused = {pair: entry for pair, entry in self._fused.items() if pair in pairs}
         # Much of what is remembered is about nodes that are gone.
         self._cache, self._abroad, self._cut_maps = MergeCache(), {}, CutMaps()
-        self._without_areas = self._without_hand = None
+        self._without_areas = self._without_hand = self._some = None
 
     def merge(
         self,
@@ -108,6 +112,9 @@ class Islands:
         """
         constraints = constraints.with_nodes(self._retired_nodes(maps, verdicts, touched, constraints))
         touched = touched | _touched_by(self._constraints, constraints)
+        if not self._asked:
+            self._some = None
+        self._asked, self._untold = False, self._untold | touched
         islands = self._ties(maps, verdicts, constraints)
         merged_islands: dict[frozenset[MapId], tuple[MergedMap, StandingDecisions]] = {}
         before = {one: island for island in self._merged_islands for one in island}
@@ -127,6 +134,18 @@ class Islands:
         )
         contradicted = self._contradicted(_around(maps, islands, constraints), verdicts, touched, constraints)
         return replace(whole, contradicted={**contradicted, **whole.contradicted}) if contradicted else whole
+
+    def links_among(self, maps: Mapping[MapId, HybridMap], verdicts: Verdicts) -> set[Pair]:
+        """The links, by their nodes, that a merge of some maps alone accepts, with the same constraints.
+
+        Args:
+            maps: some of those that were merged last.
+            verdicts: the same as then.
+        """
+        if self._some is None:
+            self._some = self._reference()
+        touched, self._untold, self._asked = self._untold, set(), True
+        return {link.key for link in self._some.merge(maps, verdicts, touched, self._constraints).links}
 
     def _decided(
         self,

@@ -87,11 +87,26 @@ class MergePipeline:
         merged = self._islands.merge(maps, verdicts, touched, constraints)
         _check_range(merged)
         odd = implausible(merged)
-        merged = self._frames.moved(self._staged.solved(merged, odd.keys()), pins)
+        only_beside_odd = self._only_beside(merged, odd.keys(), maps, verdicts)
+        merged = self._frames.moved(self._staged.solved(merged, odd.keys(), only_beside_odd), pins)
         _check_range(merged)
         merged = replace(merged, implausible=odd, pruned=pruned or PrunedNodes())
         unsure = {*merged.implausible, *fragments(maps, merged.pruned.maps)}
         return self._remover.fade(self._superseder.renewed(merged, unsure))
+
+    def _only_beside(
+        self,
+        merged: MergedMap,
+        odd: Set[MapId],
+        maps: Mapping[MapId, HybridMap],
+        verdicts: Verdicts,
+    ) -> Set[Pair]:
+        """The links between plausible maps that are accepted only since implausible ones bear them out."""
+        beside = {which for graph in merged.graphs if graph.maps & odd for which in graph.maps - odd}
+        links = {link.key for link in merged.links if beside.issuperset(link.maps)}
+        if not links:
+            return links
+        return links - self._islands.links_among({m: maps[m] for m in maps if m not in odd}, verdicts)
 
 
 def _check_range(merged: MergedMap) -> None:

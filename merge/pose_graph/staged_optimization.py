@@ -28,6 +28,8 @@ from mapweave.registration.pose_arrays import compose_poses, inverse_poses
 
 ALONE = "is implausible, and what it alone would join is not joined"
 """Reason of a refusal, after the name of the map."""
+BORNE_OUT = "only implausible maps bear it out"
+"""Reason of a refusal of a link between others."""
 
 
 class Staged(NamedTuple):
@@ -36,12 +38,14 @@ class Staged(NamedTuple):
     Attributes:
         before: the component.
         odd: these maps.
+        unsupported: nodes of it between which only these maps bear a link out.
         graphs: the components that it consists of.
         parted: nodes between which a link does not hold.
     """
 
     before: PoseGraph
     odd: Set[MapId]
+    unsupported: Set[Pair]
     graphs: Sequence[PoseGraph]
     parted: Set[Pair]
 
@@ -53,12 +57,15 @@ class StagedOptimization:
         """Nothing is solved yet."""
         self._solved: dict[int, Staged] = {}
 
-    def solved(self, merged: MergedMap, implausible: Set[MapId]) -> MergedMap:
+    def solved(
+        self, merged: MergedMap, implausible: Set[MapId], unsupported: Set[Pair] = frozenset()
+    ) -> MergedMap:
         """A merged map whose plausible maps are where they are without the others, and joined as without.
 
         Args:
             merged: as all measurements together have it.
             implausible: maps of it. Where one of them joins others by a link by hand, it does.
+            unsupported: nodes of other maps between which a link was accepted that is not without these.
         """
         by_hand = {(min(pair), max(pair)) for pair in merged.constraints.links}
         kept: dict[int, Staged] = {}
@@ -66,17 +73,19 @@ class StagedOptimization:
             odd = graph.maps & implausible
             if odd and odd < graph.maps:
                 known = self._solved.get(id(graph))
-                if known is None or known.odd != odd or known.parted & by_hand:
-                    known = _in_two_stages(graph, odd, merged.maps, by_hand)
+                alone = {pair for pair in unsupported if pair[0] in graph.rows}
+                same = known is not None and (known.odd, known.unsupported) == (odd, alone)
+                if known is None or not same or known.parted & by_hand:
+                    known = _in_two_stages(graph, odd, alone, merged.maps, by_hand)
                 kept[id(graph)] = known
         self._solved = kept
         if not kept:
             return merged
         graphs = [one for g in merged.graphs for one in (kept[id(g)].graphs if id(g) in kept else (g,))]
-        if len(graphs) == len(merged.graphs):
+        parted = set[Pair]().union(*(known.parted for known in kept.values()))
+        if not parted:
             return replace(merged, graphs=tuple(graphs), poses=NodePoses(graphs))
         graphs.sort(key=lambda graph: (-len(graph.nodes), graph.anchor))
-        parted = set[Pair]().union(*(known.parted for known in kept.values()))
         refused = sorted(
             (*merged.refused, *_refused(merged, implausible, parted, NodePoses(graphs))),
             key=lambda one: one.pair,
@@ -97,8 +106,8 @@ def _refused(
     """The links between what is not joined, and the drives."""
     for link in merged.links:
         if link.key in parted:
-            which = next(end.map for end in link.key if end.map in odd)
-            yield refuse(link, f"map {which} {ALONE}")
+            which = next((end.map for end in link.key if end.map in odd), None)
+            yield refuse(link, BORNE_OUT if which is None else f"map {which} {ALONE}")
     before = {refusal.edge for refusal in merged.refused}
     for hybrid_map in merged.maps.values():
         for edge in hybrid_map.edges.values():
@@ -107,11 +116,19 @@ def _refused(
 
 
 def _in_two_stages(
-    graph: PoseGraph, odd: Set[MapId], maps: Mapping[MapId, HybridMap], by_hand: Collection[Pair]
+    graph: PoseGraph,
+    odd: Set[MapId],
+    unsupported: Set[Pair],
+    maps: Mapping[MapId, HybridMap],
+    by_hand: Collection[Pair],
 ) -> Staged:
     """A component in which some maps move and join no others; as it is if a person has joined by them."""
     assert isinstance(graph, Component), "the solver's"
     nodes, factors = graph.nodes, graph.factors
+    if unsupported:
+        ends = zip(factors.a.tolist(), factors.b.tolist(), strict=True)
+        stands = [tuple(sorted((nodes[a], nodes[b]))) not in unsupported for a, b in ends]
+        factors = factors.take(np.flatnonzero(stands))
     is_odd = np.array([node.map in odd for node in nodes])
     ends_odd = is_odd[factors.a].astype(np.int64) + is_odd[factors.b]
     piece = pieces(factors.take(ends_odd != 1), len(nodes))
@@ -123,7 +140,7 @@ def _in_two_stages(
     # Rows are in the order of ids.
     parted = {(nodes[a], nodes[b]) for a, b in np.sort(rows_parted, axis=1).tolist()}
     if not parted.isdisjoint(by_hand):
-        return Staged(graph, odd, (graph,), set())
+        return Staged(graph, odd, unsupported, (graph,), set())
     graphs = []
     for label in np.unique(part).tolist():
         rows = np.flatnonzero(part == label)
@@ -138,7 +155,7 @@ def _in_two_stages(
             means = compose_poses(compose_poses(wanted, inverse_poses(means[:1])), means)
             means[0] = wanted[0]
         graphs.append(_part_in_two_stages(some, means, own, is_odd[rows], graph.unsettled))
-    return Staged(graph, odd, graphs, parted)
+    return Staged(graph, odd, unsupported, graphs, parted | unsupported)
 
 
 def _stays(across: Factors, piece: Rows, is_odd: NDArray[np.bool_]) -> NDArray[np.bool_]:

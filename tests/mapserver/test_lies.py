@@ -11,7 +11,7 @@ import pytest
 
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
-from mapweave.hybridmap.constraint_subject import Linked
+from mapweave.hybridmap.constraint_subject import Linked, RetiredMap
 from mapweave.hybridmap.edge_limits import unmeasurable
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
@@ -26,7 +26,7 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.plausibility import MOST_FRAGMENTS, unreliable_robots
 from mapweave.merge.mutual_exclusion.trajectories import trajectories_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.merge.pose_graph.staged_optimization import ALONE
+from mapweave.merge.pose_graph.staged_optimization import ALONE, BORNE_OUT
 from mapweave.wire.codec import decode_change
 from mapweave.wire.log_messages import Head
 from mapweave.wire.messages import encode
@@ -201,6 +201,49 @@ def test_an_implausible_map_does_not_join_what_nothing_else_joins(lies: bool) ->
     by_hand = Linked(*link.pair, link.a_from_b.mean, tuple(spread.tolist()))
     beside.constrain(ManualConstraints([ManualConstraint(by_hand, True, "bob", 0)]))
     assert beside.merged().joined(first, second)
+
+
+@pytest.mark.parametrize("lies", [False, True], ids=["honest", "its clock runs backwards"])
+def test_an_implausible_map_bears_out_no_links_of_others(lies: bool) -> None:
+    """Two robots have one weak link, which is too little, until a third one has been where both were."""
+    other = Pose2(20.0, 0.0, 0.0)
+    world = WORLD + room(20, 0, 5, 4, 600, np.random.default_rng(2))
+    there = [other @ pose for pose in TOUR[:3]]
+    tours = {MapId("b", 1): TOUR, MapId("r", 1): [*there, TOUR[1] @ Pose2(0.05, 0.02, 0.03)]}
+    merger = Merger()
+    for number, (map_id, tour) in enumerate(tours.items()):
+        nodes, edges = take_map(world, map_id, tour, np.random.default_rng(number))
+        if map_id.agent == "r":
+            nodes[-1] = replace(nodes[-1], landmarks=nodes[-1].landmarks.take(np.arange(40)))
+            edges[-1] = replace(edges[-1], shared=edges[-1].shared[:0])
+        for k, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)], start=1):
+            merger.on_change(Change(map_id, k, 0, body))
+    before, (first, second) = merger.merged(), tours
+    assert not before.joined(first, second)
+    few = {one.pair for one in before.refused if one.reason.startswith("no 2 links that share no node agree")}
+    assert few and all({end.map for end in pair} == {first, second} for pair in few)
+    way = [*TOUR, *there]
+    nodes = take_map(world, LAST, way, np.random.default_rng(8))[0]
+    for k, body in enumerate(driven(LAST, nodes, [a.inverse() @ b for a, b in pairwise(way)]), start=1):
+        if isinstance(body, NodePut) and lies:
+            body = NodePut(replace(body.node, stamp_ns=10**12 - body.node.stamp_ns, clock="utc"))
+        merger.on_change(Change(LAST, k, 0, body))
+    after = merger.merged()
+    assert after.joined(first, second) is not lies
+    if not lies:
+        return
+    assert after.implausible.keys() == {LAST}
+    assert few <= {one.pair for one in after.refused}
+    assert {one.pair for one in after.refused if one.reason == BORNE_OUT} <= few
+    assert [link.pair for link in after.links if LAST not in link.maps] == [
+        link.pair for link in before.links
+    ]
+    assert after.components == tuple(frozenset(graph.nodes) for graph in after.graphs)
+    for node, pose in before.poses.items():
+        assert after.pose(node).distance(pose.merged_from_robot.mean) < 1e-6
+    # What it was before comes back with the implausible map gone, and stays while others go on.
+    merger.constrain(ManualConstraints([ManualConstraint(RetiredMap(LAST), True, "bob", 0)]))
+    assert [link.pair for link in merger.merged().links] == [link.pair for link in before.links]
 
 
 def test_a_map_of_which_a_change_was_refused_moves_no_other() -> None:
