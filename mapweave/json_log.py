@@ -39,7 +39,7 @@ class JsonFormatter(logging.Formatter):
 
 
 def one_line(text: str) -> str:
-    """Text as a log or a terminal shows it, whoever wrote it: nothing in it controls the terminal."""
+    """Text of others as a log or a terminal shows it: nothing in it controls the terminal."""
     return escaped(" ".join(text.split()))
 
 

@@ -38,7 +38,7 @@ MERGE, MERGE_MARK = "merge", "merge_mark"
 """The newest merge, for servers that do not merge themselves, and a digest of it; see
 mapweave.mapserver.merging.merge_sharing."""
 CHOICE_KEY = "choice key"
-"""Likewise: decides which of many things are looked at, so that robots cannot. It is sent to nobody."""
+"""Likewise: decides which of many things are looked at, so that robots cannot. It never leaves the store."""
 MERGE_TROUBLE = "merge_trouble"
 """Why the server that leads cannot merge, or hand its merges over, in words (UTF-8); empty if it can."""
 SECRET_BYTES = 16
