@@ -139,9 +139,9 @@ def test_a_robot_that_no_common_node_places_is_shown_without_a_place() -> None:
     assert (entry["merged_from_robot"], entry["component"]) == (None, -1)
 
 
-@pytest.mark.parametrize("shown", [NOTHING, before()])
-def test_what_a_server_waits_for_is_said(shown: LastShown) -> None:
-    loading = LoadingServer()
+@pytest.mark.parametrize("there", [False, True])
+def test_what_a_server_waits_for_is_said(there: bool) -> None:
+    shown, loading = before() if there else NOTHING, LoadingServer()
     loading.wait("waiting: no database")
     with Web(("127.0.0.1", 0), loading, before=shown) as web, viewer(web) as person:
         assert answer(web, "/status") == (
