@@ -1,0 +1,104 @@
+"""When a server that leads hands its merges over, and what those that follow hear of it."""
+
+from __future__ import annotations
+
+from types import SimpleNamespace
+from typing import Any, cast
+
+import pytest
+
+from mapweave.mapserver.merging.merge_handover import SHARE, MergeHandover
+from mapweave.mapserver.merging.merge_sharing import MergeSharing
+from mapweave.mapserver.merging.merger import Merger
+from tests.clock import Clock
+
+
+class Followed:
+    """A store that others follow; a merge is written in one second, or fails."""
+
+    term, followed, fails = 1, True, False
+
+    def __init__(self, clock: Clock) -> None:
+        self._clock = clock
+        self.written, self.said = list[float](), [""]
+
+    def begin(self) -> None:
+        self.written.clear()
+
+    def tell(self, trouble: str) -> None:
+        if trouble != self.said[-1]:
+            self.said.append(trouble)
+
+    def write(self, *_: Any) -> int:
+        if self.fails:
+            raise OSError("no room")
+        self.written.append(self._clock())
+        self._clock.now += 1.0
+        return 1
+
+
+@pytest.fixture
+def clock() -> Clock:
+    return Clock(100.0)
+
+
+@pytest.fixture
+def followed(clock: Clock) -> Followed:
+    return Followed(clock)
+
+
+@pytest.fixture
+def handover(followed: Followed, clock: Clock) -> MergeHandover:
+    one = MergeHandover(cast(MergeSharing, followed), clock)
+    one.lead()
+    return one
+
+
+def hand_over(
+    handover: MergeHandover, merges: int, outdated: bool = False, trouble: str = ""
+) -> float | None:
+    merger = cast(Merger, SimpleNamespace(counters=SimpleNamespace(merges=merges)))
+    return handover.write(merger, {}, None, outdated, trouble)
+
+
+def test_a_slow_disk_takes_a_share_of_the_time(
+    handover: MergeHandover, followed: Followed, clock: Clock
+) -> None:
+    for merges in range(1, 200):
+        wait = hand_over(handover, merges)
+        clock.now += 0.5
+        assert wait is None or wait <= 1.0 / SHARE
+    assert len(followed.written) > 3
+    assert all(b - a >= 1.0 / SHARE for a, b in zip(followed.written, followed.written[1:], strict=False))
+
+
+def test_a_merge_is_handed_over_once_and_not_while_it_is_outdated(
+    handover: MergeHandover, followed: Followed
+) -> None:
+    assert hand_over(handover, 1, outdated=True) is None and not followed.written
+    for _ in range(3):
+        assert hand_over(handover, 1) is None
+    assert len(followed.written) == 1
+
+
+def test_an_older_merge_that_is_handed_over_withdraws_no_trouble_of_a_newer_one(
+    handover: MergeHandover, followed: Followed, clock: Clock
+) -> None:
+    hand_over(handover, 1)
+    assert hand_over(handover, 2) is not None, "it waits for its time"
+    clock.now += 100.0
+    hand_over(handover, 2, trouble="merging failed")
+    assert len(followed.written) == 2 and followed.said == ["", "merging failed"]
+    hand_over(handover, 3)
+    assert followed.said[-1] == ""
+
+
+def test_a_merge_that_cannot_be_written_is_said_until_one_can(
+    handover: MergeHandover, followed: Followed
+) -> None:
+    followed.fails = True
+    hand_over(handover, 1)
+    assert "no room" in followed.said[-1]
+    followed.fails = False
+    hand_over(handover, 2)
+    assert followed.said[-1] == ""
