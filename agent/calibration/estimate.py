@@ -80,12 +80,19 @@ class Estimate:
 
     @property
     def contradiction(self) -> tuple[Array, Array]:
-        """(10,) how far the values are from the declared ones, and (10,) the sigmas by which that is named.
+        """How far the values are from the declared ones, and the sigmas by which that is named: `against`."""
+        return self.against(self.declared)
+
+    def against(self, vector: Array) -> tuple[Array, Array]:
+        """(10,) how far the values are from others, and (10,) the sigmas by which they are contradicted.
 
         Where only the floor shows the wheels' scale, floor and wheels show its ratio to the height. That the
         ratio is wrong is surer than which of the two: what the height may be off is no part of its sigma.
+
+        Args:
+            vector: (10,) the others.
         """
-        off, variances = self.vector - self.declared, np.diag(self.covariance).copy()
+        off, variances = self.vector - vector, np.diag(self.covariance).copy()
         if self.lengths in (Lengths.FLOOR, Lengths.CONTRADICT):
             ratio = np.zeros(len(off))
             ratio[[P.WHEEL_SCALE, P.HEIGHT]] = 1.0, -1.0

@@ -65,7 +65,8 @@ by chance, more do not bear out. Without, one of nine simulated robots got three
 WORTH = np.full(COUNT, 2.0)
 """A change is put to use if it is larger than so many useful sigmas, and sure enough to be named."""
 WORTH[P.WHEEL_SCALE] = 1.0
-"""Wheels are corrected as soon as it is sure that it is they, and not the height."""
+"""Wheels that go less far than they report are corrected as soon as they are named: by the floor, the height
+counts. Those that go further, as soon as it is sure that it is they, and not the height."""
 
 NAMED_ONLY = [p for p in Parameter if p not in (P.FORWARD, P.HEADING, P.PITCH, P.DELAY)]
 """Named, but not used by themselves. The wheels' scales and drift are what all else is measured by; a camera
@@ -313,12 +314,16 @@ class OnlineCalibration:
     def _adopt(self, estimate: Estimate, settled: NDArray[np.bool_]) -> None:
         """Use what the drive shows where it differs enough from what is used."""
         target = self._next.vector
-        off = np.abs(estimate.vector - target)
+        off, sigmas = estimate.against(target)
+        w = P.WHEEL_SCALE
+        if estimate.vector[w] > target[w]:
+            # What stands on the floor and is taken for it makes the way seem longer, never shorter.
+            sigmas[w] = estimate.sigmas[w]
         change = (
             estimate.shown
             & settled
             & (off > WORTH * useful(estimate.declared))
-            & (off > SIGNIFICANT * np.hypot(estimate.sigmas, np.where(self._earlier, self._sigmas, 0.0)))
+            & (off > SIGNIFICANT * np.hypot(sigmas, np.where(self._earlier, self._sigmas, 0.0)))
         )
         by_floor = estimate.lengths in (Lengths.FLOOR, Lengths.BOTH)
         named_only = [p for p in NAMED_ONLY if not (p is P.WHEEL_SCALE and by_floor)]
@@ -329,7 +334,7 @@ class OnlineCalibration:
         # What is shown but differs less goes along: the estimates belong together. The wheels' scale brings
         # nothing along and does not go along: only lengths tell of it.
         belongs = change.any(where=np.arange(COUNT) != P.WHEEL_SCALE)
-        along = belongs & estimate.shown & settled & (off > estimate.sigmas)
+        along = belongs & estimate.shown & settled & (off > sigmas)
         along[[*named_only, P.WHEEL_SCALE]] = False
         self._next = DriveGeometry.of(np.where(change | along, estimate.vector, target))
         self._note(change | along, change, target, estimate)

@@ -11,11 +11,12 @@ from functools import cache
 import numpy as np
 import pytest
 
-from mapweave.agent.calibration.estimate import Lengths
+from mapweave.agent.calibration.correction import declaring
+from mapweave.agent.calibration.estimate import Estimate, Lengths
 from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.online import NAMED_ONLY, OnlineCalibration, _common
 from mapweave.agent.calibration.report import Cause, causes
-from mapweave.agent.drive_geometry import DriveGeometry, Parameter
+from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from tests.agent.calibration.room_drive import (
     CAMERA,
@@ -149,11 +150,50 @@ def with_long_wheels(seed: int) -> OnlineCalibration:
 
 
 @pytest.mark.parametrize("seed", first_quick([2, 3, 4], 1))
-def test_wheels_and_height_that_contradict_each_other_are_named_and_not_corrected(seed: int) -> None:
-    """That the two do not go together is sure; which of them is wrong is not."""
+def test_wheels_that_contradict_the_height_are_named_and_corrected(seed: int) -> None:
+    """4 % may be the height's, too. But that the two do not go together is sure, and the height counts."""
     online = with_long_wheels(seed)
     assert [cause.parameter for cause in online.causes] == [Parameter.WHEEL_SCALE]
-    assert online.geometry.wheel_scale == 1.04
+    assert abs(math.log(online.geometry.wheel_scale)) < 0.012
+
+
+def floor_estimate(wheels: float, lengths: Lengths = Lengths.FLOOR) -> Estimate:
+    """Of wheels that go so many times as far as they report, with the sigmas of a long drive."""
+    vector = TRUE.vector
+    vector[Parameter.WHEEL_SCALE] = math.log(wheels)
+    sigmas = np.full(COUNT, 10.0)
+    sigmas[[Parameter.WHEEL_SCALE, Parameter.HEIGHT]] = 0.0122, 0.0102
+    covariance = np.diag(sigmas**2)
+    pair = [Parameter.WHEEL_SCALE, Parameter.HEIGHT]
+    covariance[pair, pair[::-1]] = 0.01**2
+    return Estimate(vector, covariance, TRUE.vector, 100, 1000, lengths=lengths)
+
+
+@pytest.mark.parametrize(
+    ("wheels", "lengths", "corrected"),
+    [
+        (0.965, Lengths.FLOOR, True),
+        (0.965, Lengths.BOTH, False),
+        (0.965, Lengths.RANGERS, False),
+        (0.965, Lengths.CONTRADICT, False),
+        (1.035, Lengths.FLOOR, False),
+        (1.050, Lengths.FLOOR, True),
+    ],
+)
+def test_a_contradiction_of_the_height_corrects_what_only_the_floor_shows(
+    wheels: float, lengths: Lengths, corrected: bool
+) -> None:
+    """3.5 % are five sigmas of the ratio and three of the wheels alone.
+
+    A floor that seems too near, so that wheels seem to go further, may be the feet of walls.
+    """
+    online = OnlineCalibration(declaring(RobotDescription(CAMERA), TRUE))
+    for taken in (100, 150):
+        online._taken = taken
+        online._adopt(floor_estimate(wheels, lengths), np.ones(COUNT, np.bool_))
+    assert (online.pending is not None) == corrected
+    online.switched()
+    assert online.geometry.wheel_scale == pytest.approx(wheels if corrected else 1.0)
 
 
 @pytest.mark.parametrize("lengths", [Lengths.RANGERS, Lengths.BOTH])
