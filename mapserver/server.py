@@ -16,7 +16,6 @@ from types import TracebackType
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus
 from mapweave.hybridmap.annotation import Annotations
-from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.map_event import MapEvent
@@ -136,10 +135,23 @@ class MapServer:
         path.parent.mkdir(parents=True, exist_ok=True)
         self._store = open_store(address, name)
         try:
-            self._base = (base or BaseMap()).beside(self._store)
-        except InvalidFile:
+            self._take_up(path, base, s, surroundings)
+        except BaseException:
+            # Another attempt could not have the server's name while a session of this one held it.
+            clock.close()
             self._store.close()
             raise
+
+    def _take_up(
+        self,
+        path: Path,
+        base: BaseMap | None,
+        s: ServerSettings,
+        surroundings: Surround,
+    ) -> None:
+        """All that the store has, and what works on it; nothing runs yet."""
+        clock, name = self._schedule, self._name
+        self._base = (base or BaseMap()).beside(self._store)
         self._cluster = Cluster(s.cluster)
         places = PlaceDatabase(self._cluster.index)
         findings = VerificationCacheKeeper(path, not self._store.positions(), clock.monotonic)

@@ -188,10 +188,6 @@ def run(arguments: argparse.Namespace) -> int:
         how = ServerSettings(
             settings.admission_control, settings.merge, settings.quotas, cluster, settings.attendance
         )
-        schedule: Schedule = LiveSchedule()
-        surroundings = MergeSurroundings.live
-        if arguments.lockstep:
-            schedule, surroundings = LockstepSchedule(), MergeSurroundings.repeatable
         if arguments.demo:
             from mapweave.recorded_fleet.fleet import RecordedFleet, prepare
 
@@ -213,6 +209,10 @@ def run(arguments: argparse.Namespace) -> int:
             base = BaseMap.of(str(given.path), given.content)
 
         def make() -> MapServer:
+            schedule: Schedule = LiveSchedule()
+            surroundings = MergeSurroundings.live
+            if arguments.lockstep:
+                schedule, surroundings = LockstepSchedule(), MergeSurroundings.repeatable
             return MapServer(
                 bus, keys, arguments.store or path, name, how, schedule, base, data, surroundings
             )

@@ -12,8 +12,9 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
+from typing import Any
 from urllib.request import urlopen
 
 import pytest
@@ -21,6 +22,8 @@ import pytest
 from mapweave.connection import no_server, server_statuses, waits_for
 from mapweave.exit_status import FAILED
 from mapweave.hybridmap.errors import InvalidFile, StoreAway
+from mapweave.mapserver.map_history import MapHistory
+from mapweave.mapserver.server import MapServer
 from mapweave.processes.store_wait import Waiting, WaitingServer, made_with_store
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
@@ -114,6 +117,29 @@ def test_who_asks_for_a_servers_status_hears_that_it_waits() -> None:
     assert server_statuses(asker, keys, 1.0) == [] and not alive
     assert "no map server of fleet fleet answers" in str(no_server(asker, keys))
     waits.close()
+
+
+def test_a_database_that_goes_again_while_the_server_is_made_is_waited_for(
+    postgres: PostgresServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What was opened is closed: its session would hold the server's name against the next attempt."""
+    address, away = postgres.database(), [StoreAway("gone again")]
+
+    def history(*arguments: Any, **named: Any) -> MapHistory:
+        if away:
+            raise away.pop()
+        return MapHistory(*arguments, **named)
+
+    monkeypatch.setattr("mapweave.mapserver.server.MapHistory", history)
+    log = list[str]()
+    with closing(MemoryBus(MemoryHub())) as bus:
+        made = made_with_store(
+            lambda: MapServer(bus, Keys("fleet"), address, "s0", cache=tmp_path),
+            lambda: True, Waiting(log.append, log.append), threading.Event(), 60.0,
+        )  # fmt: skip
+        assert made is not None and log[0] == "waiting for at most 60 s: gone again"
+        with made:
+            pass
 
 
 @contextmanager
