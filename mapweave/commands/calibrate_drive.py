@@ -191,6 +191,10 @@ def _live(
     return description, observations(SensorMonitor(description))
 
 
+NUMBER = 6
+"""Characters of an estimate, also on a narrow terminal: -0.018."""
+
+
 def _print(console: Any, found: DriveCalibration) -> dict[str, str]:
     """Print a table of an estimate and what it finds wrong; returns a comment by field."""
     from rich.table import Table
@@ -200,7 +204,10 @@ def _print(console: Any, found: DriveCalibration) -> dict[str, str]:
 
     estimate, notes = found.estimate, {}
     declared, value, sigma = readable(estimate.declared), readable(estimate.vector), readable_sigmas(estimate)
-    table = Table("parameter", "declared", "estimated", "sigma", "shown by this drive")
+    table = Table("parameter")
+    for heading in ("declared", "estimated", "sigma"):
+        table.add_column(heading, min_width=NUMBER)
+    table.add_column("shown by this drive", overflow="fold")
     for p in Parameter:
         shown = bool(estimate.shown[p])
         table.add_row(

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import json
+import re
 import shutil
 import threading
 from dataclasses import replace
@@ -12,6 +14,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from rich.console import Console
 
 from mapweave.agent.calibration import recorded_drive
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
@@ -58,6 +61,21 @@ def calibrated(capfd: pytest.CaptureFixture[str], *arguments: object) -> dict[st
     assert main(["calibrate", "drive", *map(str, arguments), "--json"]) == 0
     figures: dict[str, Any] = json.loads(capfd.readouterr().out.splitlines()[-1])
     return figures
+
+
+@pytest.mark.slow
+def test_a_narrow_terminal_cuts_no_number(
+    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """On 40 columns a delay of -0.018 s was `-0.0…`."""
+    file = io.StringIO()
+    console = Console(file=file, force_terminal=True, width=40, color_system=None)
+    monkeypatch.setattr("mapweave.terminal.plain_or_terminal", lambda **_: console)
+    assert main(["calibrate", "drive", str(recording), "--calibration", str(tmp_path)]) == 0
+    rows = [line for line in file.getvalue().splitlines() if line.startswith("│") and "." in line]
+    assert max(map(len, rows)) <= 40
+    numbers = [re.findall(r"-?\d+\.\d{3}(?= *│)", row) for row in rows]
+    assert len(numbers) == len(Parameter) and all(len(row) == 3 for row in numbers)
 
 
 @pytest.mark.slow
