@@ -16,6 +16,7 @@ from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.mapserver.merging.copies import Copies
+from mapweave.mapserver.merging.counted_verdicts import CountedVerdicts
 from mapweave.mapserver.merging.implausible_maps import ImplausibleMaps
 from mapweave.mapserver.merging.isolation import Isolation, leave_out, reason_of
 from mapweave.mapserver.merging.merge_pipeline import MergePipeline
@@ -29,12 +30,12 @@ from mapweave.mapserver.relocalization.alias_cache import AliasCache
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.merge.islands import Islands
 from mapweave.merge.map_maintenance.node_superseding import Superseding
-from mapweave.merge.outlier_rejection.wrong_geometry import UNSOLVABLE, WrongGeometrySearch
+from mapweave.merge.outlier_rejection.wrong_geometry import UNSOLVABLE
 from mapweave.merge.pose_graph.candidates import Pair
-from mapweave.merge.pose_graph.links import Link, RefusedLink, refuse
-from mapweave.merge.pose_graph.merged_map import MergedMap, WrongGeometry
+from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.pinned_frames import PinnedFrames
-from mapweave.merge.pose_graph.verdicts import MapPair, Verdict, Verdicts
+from mapweave.merge.pose_graph.verdicts import Verdicts
 from mapweave.merge.retired_nodes import retired_nodes
 from mapweave.merge.settings import MergeSettings
 from mapweave.registration.recognition import RecognitionSettings
@@ -95,17 +96,13 @@ class Merger:
     def _begin(self) -> None:
         """Nothing is compared or merged."""
         self._comparisons = NodeComparisons(self.places, self.node, self.counters, self._compare, self._pause)
-        self._verdicts = Verdicts()
+        self._counted = CountedVerdicts(self._comparisons, self.settings.consistency)
         self._record: RestartRecord | None = None
         self._resumed: Superseding | None = None
         self._pipeline = self._new_pipeline()
         self._isolation = Isolation()
         self._copies, self._copied = Copies(), dict[MapId, str]()
-        self._contradictions = WrongGeometrySearch(self.settings.consistency)
         self._own_views = OwnViewsSearch(self._comparisons, self._choice_key)
-        self._wrong: dict[MapId, WrongGeometry] = {}
-        self._unlinked: dict[MapPair, str] = {}
-        self._stale: set[MapPair] = set()
         self._touched, self._changed = set(self.maps), set(self.maps)
 
     @property
@@ -267,7 +264,7 @@ class Merger:
         if any(not isinstance(c.about, Apart | Linked) for c in changed - {*constraints.in_force}):
             self.alike.forget()
         self._constraints = constraints
-        self._stale |= self._verdicts.at(self.maps.keys())
+        self._counted.changed(self.maps)
         self._dirty = True
 
     def pin(self, pins: Sequence[Pin]) -> None:
@@ -312,14 +309,10 @@ class Merger:
             self._comparisons.take_over()
         for pair, verdict in self._comparisons.changes():
             self._touched |= {pair[0].map, pair[1].map}
-            self._stale.add((pair[0].map, pair[1].map))
             self._copies.forget(pair)
             if isinstance(verdict, Link):
                 self._copies.compare(*(self.maps[node.map].nodes[node] for node in pair))
-            if verdict is None:
-                self._verdicts.drop(pair)
-            else:
-                self._verdicts.put(pair, self._counted(verdict))
+            self._counted.put(pair, verdict)
         self.copy_maps()
         for map_id in self._changed:
             self._implausible.changed(map_id, self._kept[map_id])
@@ -334,11 +327,11 @@ class Merger:
             log.exception("the search for maps with wrong geometry failed")
         for map_id in self._changed:
             self._hold_against_way(map_id)
-        self._leave_unlinked()
+        self._touched |= self._counted.leave_unlinked()
         apart = self._set_apart()
         maps = [kept_id for kept_id in self._kept if kept_id not in apart]
         try:
-            merged = self._made(self._pipeline, self._verdicts, maps, self._touched, use)
+            merged = self._made(self._pipeline, self._counted.verdicts, maps, self._touched, use)
         except MemoryError:
             # No map's fault. What is cached may be damaged, and takes memory.
             self._pipeline, self._touched = self._new_pipeline(), set(self.maps)
@@ -370,7 +363,7 @@ class Merger:
             merged,
             set_apart=self._set_apart(),
             copies={which: self._kept[which] for which in self._copied},
-            wrong=self._wrong,
+            wrong=self._counted.wrong,
             refused_changes={m: why for m, why in self._implausible.refused.items() if m in kept},
             disbelieved={m: why for m, why in self._implausible.disbelieved.items() if m in self._kept},
         )
@@ -384,53 +377,26 @@ class Merger:
 
     def _find_wrong_geometry(self) -> None:
         """Find the maps that contradict others that agree."""
-        self._stale |= self._verdicts.at(self._changed)
+        self._counted.changed(self._changed)
         # What a retired area holds only the merge says; the robot's way by it is no less true.
         nodes = retired_nodes(self._kept, self._constraints, ())
         self._constraints = self._constraints.with_nodes(nodes)
-        before, left_out = self._wrong, {*self._constraints.retired, *self._set_apart()}
-        self._wrong = self._contradictions.wrong(self._kept, self._links, self._stale, left_out)
-        self._stale = set()
-        if before.keys() - self._wrong.keys():
+        left_out = {*self._constraints.retired, *self._set_apart()}
+        if self._counted.find_wrong(self._kept, self._constraints, left_out):
             self.alike.forget()
 
     def _hold_against_way(self, map_id: MapId) -> None:
         """Hold the views of a map against its own way."""
         reason, hybrid_map = "", self._kept[map_id]
         try:
-            pieces = self._contradictions.pieces(map_id, hybrid_map)
-            compared = self._verdicts.between((map_id, map_id))
+            pieces = self._counted.search.pieces(map_id, hybrid_map)
+            compared = self._counted.verdicts.between((map_id, map_id))
             reason = self._own_views.reason(map_id, hybrid_map, pieces, compared)
         except UNSOLVABLE:
             log.debug("map %s has no way that its views could contradict", map_id)
         except Exception:  # a defect with one map must not hold up the merge
             log.exception("the views of map %s cannot be held against its own way", map_id)
         self._implausible.note_views(map_id, reason)
-
-    def _leave_unlinked(self) -> None:
-        """Maps with wrong geometry are joined with no other."""
-        wrong = {which: one.reason for which, one in self._wrong.items()}
-        unlinked: dict[MapPair, str] = {}
-        for maps in self._verdicts.at(wrong.keys()):
-            if maps[0] != maps[1] and (reason := wrong.get(maps[0]) or wrong.get(maps[1])):
-                unlinked[maps] = reason
-        before, self._unlinked = self._unlinked, unlinked
-        for maps, _ in before.items() ^ unlinked.items():
-            self._touched |= {*maps}
-            for pair in list(self._verdicts.between(maps)):
-                self._verdicts.put(pair, self._counted(self._comparisons[pair]))
-
-    def _links(self, maps: MapPair) -> list[Link]:
-        """The links between two maps that no constraint excludes, also of maps with wrong geometry."""
-        verdicts = (self._comparisons[pair] for pair in self._verdicts.between(maps))
-        return [v for v in verdicts if isinstance(v, Link) and self._constraints.against(*v.pair) is None]
-
-    def _counted(self, verdict: Verdict) -> Verdict:
-        """A verdict, or why it does not count."""
-        if isinstance(verdict, RefusedLink) or verdict.within:
-            return verdict
-        reason = self._unlinked.get(verdict.maps)
-        return verdict if reason is None else refuse(verdict, reason)
 
     def _made_without_bad(
         self, maps: Collection[MapId], first: Exception, use: Callable[[MergedMap], object] | None
@@ -439,7 +405,7 @@ class Merger:
 
         def attempt(some: Collection[MapId]) -> MergePipeline:
             pipeline = self._new_pipeline()
-            self._made(pipeline, self._verdicts, some, set(some), use)
+            self._made(pipeline, self._counted.verdicts, some, set(some), use)
             return pipeline
 
         # Those that are suspected before and the small ones last: they are rather set apart than others.
@@ -454,9 +420,8 @@ class Merger:
                 "the merge fails with cached state (%s) and not without it: the cache is dropped", first
             )
         self._pipeline = pipeline
-        return self._made(
-            pipeline, self._verdicts, [map_id for map_id in maps if map_id not in bad], set(), use
-        )
+        good = [map_id for map_id in maps if map_id not in bad]
+        return self._made(pipeline, self._counted.verdicts, good, set(), use)
 
     def _suspicion(self, map_id: MapId) -> int:
         return self._isolation.suspicion(map_id) + (map_id in self._suspects)
