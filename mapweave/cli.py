@@ -48,7 +48,7 @@ from mapweave.early_interrupt import came, remember
 from mapweave.exit_status import FAILED, INTERRUPTED, MISSING_EXTRA, NO, USAGE
 from mapweave.extras import MissingExtra, extra_of
 from mapweave.hybridmap.errors import MapweaveError, Refused
-from mapweave.json_log import json_line
+from mapweave.json_log import escaped, json_line
 from mapweave.storage.os_errors import reason_of
 
 EPILOG = "Start with `mapweave demo`. Each command has its own --help, with examples."
@@ -187,7 +187,9 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _complain(words: str) -> None:
     """Say why the command ends, as all else that a process logs."""
-    print(json_line(words, logging.ERROR) or f"mapweave: {words}", file=sys.stderr)
+    # A word may be of a file, whose name and content are another's.
+    lines = "\n".join(map(escaped, words.splitlines()))
+    print(json_line(words, logging.ERROR) or f"mapweave: {lines}", file=sys.stderr)
 
 
 if __name__ == "__main__":

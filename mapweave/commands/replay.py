@@ -278,10 +278,11 @@ def _report(
         maps: that were made.
         damage: a line each.
     """
+    from mapweave.json_log import one_line
     from mapweave.processes.agent_files import map_path
 
     for line in damage:
-        print(f"mapweave: {line}", file=sys.stderr)
+        print(f"mapweave: {one_line(line)}", file=sys.stderr)
     if arguments.json:
         files = [{"map": str(one), "path": str(map_path(arguments.data, one))} for one in maps]
         played = {"images": images[1], "played": images[0], "maps": files, "damage": list(damage)}

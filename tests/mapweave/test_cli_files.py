@@ -43,6 +43,14 @@ def test_map_files(tmp_path, capfd):
     assert "is damaged" in complaint(capfd, "map", "show", path)
 
 
+def test_a_name_of_a_file_controls_no_terminal(tmp_path, capfd):
+    path = tmp_path / "a\x1b[31mred\x07\x9b2J\u202e.mapweave"
+    path.write_bytes(b"garbage")
+    said = complaint(capfd, "map", "show", path)
+    assert "red" in said and "is neither a map file" in said
+    assert all(line.isprintable() for line in said.splitlines())
+
+
 @pytest.mark.parametrize("pipe", [False, True])
 def test_endless_input_is_not_read(tmp_path, capfd, pipe):
     path = tmp_path / "pipe" if pipe else Path("/dev/zero")
