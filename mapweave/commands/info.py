@@ -72,7 +72,7 @@ def run(arguments: argparse.Namespace) -> int:
             {"name": topic.name, "type": topic.kind, "count": topic.count} for topic in bag.topics
         ],
         "missing": [
-            *lacks,
+            *(words.removeprefix("no ").removeprefix("does not say ") for words in lacks),
             *([] if odometry else [ODOMETRY]),
             *([] if recording is None or recording.timed else [TIMES]),
         ],
