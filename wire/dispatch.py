@@ -158,15 +158,19 @@ class Failures:
         self._since: dict[str, tuple[float, int]] = {}
 
     def count(self, key: str) -> str | None:
+        """Count one by the key of the message or question; see `count_of`."""
+        return self.count_of(robot_of(key))
+
+    def count_of(self, robot: str) -> str | None:
         """Count one.
 
         Args:
-            key: of the message or question. What is in no robot's name is logged each time.
+            robot: in whose name it is; of what is in no robot's name each one is logged.
 
         Returns:
             How many were not logged since the last one that was, in words; None if this one is not to be.
         """
-        robot, now = robot_of(key), self._clock()
+        now = self._clock()
         if not robot:
             return ""
         with self._lock:

@@ -42,6 +42,7 @@ from mapweave.mapserver.quotas import Quotas
 from mapweave.storage.full_disks import logged
 from mapweave.wire.bus import Bus, Closing, Sample
 from mapweave.wire.codec import MAX_CHANGE_BYTES
+from mapweave.wire.dispatch import Failures
 from mapweave.wire.keys import Keys, robot_of
 from mapweave.wire.log_messages import Head, Mark
 
@@ -118,6 +119,7 @@ class Ingest:
         """
         self._bus, self._keys, self._store, self._name = bus, keys, store, check_name(server_name)
         self._objection = objection
+        self._refusals, self._damages = Failures(), Failures()
         self._quotas, self._unmerged = quotas or Quotas(clock=time.monotonic), unmerged
         self._on_change, self._observe_ack = on_change, observe_ack
         self._note_refusal, self._note_disbelief = note_refusal, note_disbelief
@@ -290,7 +292,8 @@ class Ingest:
         entry = ReceivedChange.read(map_id, mark.sequence, sample.payload if fits else b"")
         if isinstance(entry.change, str):
             self._counters.add(damaged=1)
-            log.info("%s %d came damaged (%s), pulling it", map_id, mark.sequence, entry.change)
+            if (also := self._damages.count_of(map_id.agent)) is not None:
+                log.info("%s %d came damaged (%s), pulling it%s", map_id, mark.sequence, entry.change, also)
         else:
             intake.keep_ahead_of(agent_log)
             agent_log.offer(entry, sample.received)
@@ -393,7 +396,8 @@ class Ingest:
             done.append((run, run.log.settled(result)))
             self._pulls.answers(run.log.map.agent)
             for refusal in result.refusals:
-                log.warning("refused %s %d: %s", run.log.map, refusal.sequence, refusal.reason)
+                if (also := self._refusals.count_of(run.log.map.agent)) is not None:
+                    log.warning("refused %s %d: %s%s", run.log.map, refusal.sequence, refusal.reason, also)
                 self._note_refusal(run.log.map, words_of(refusal))
             self._counters.add(applied=len(result.changes), refused=len(result.refusals))
             self._pass_on(changes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack
@@ -381,3 +382,22 @@ def test_undecodable_changes_fill_no_disk(tmp_path: Path, monkeypatch: pytest.Mo
     assert store.refusals(MAP, 1)[0].reason
     store.close()
     assert sum(file.stat().st_size for file in tmp_path.iterdir()) < 2_000_000
+
+
+def test_a_robot_whose_changes_are_all_refused_fills_no_log(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    caplog.set_level(logging.INFO, "mapweave.mapserver")
+    hub = MemoryHub()
+    server, agent = Server(hub, tmp_path / "s0.sqlite"), HandAgent(hub)
+    agent.serve(1, lambda asked: agent.answer(asked))
+    for sequence in range(1, 41):
+        agent.log[sequence] = b"\xc1" * 50
+        agent.publish(sequence, b"\xc1" * 50)
+    agent.beacon(40)
+    eventually(lambda: agent.acks and agent.acks[-1].watermark == 40)
+    server.end()
+    said = [record.getMessage() for record in caplog.records]
+    assert [line[:12] for line in said if line.startswith("refused ")] == [f"refused {MAP}"[:12]]
+    assert len([line for line in said if "came damaged" in line]) == 1
+    assert len(agent.acks[-1].refusals) == 16, "the robot hears why"
