@@ -125,6 +125,9 @@ class Traversability:
     def _open_ways(self, asked: NodeId, node: NodeId) -> dict[NodeId, float]:
         """Neighbours that count for the node that is asked about, with the distance, m."""
         ways = self._ways_of(node).items()
+        if not self._unsure:
+            # Asked for at each node of each way.
+            return {neighbour: step for neighbour, step in ways if neighbour not in self._removed}
         return {neighbour: step for neighbour, step in ways if self._counts(neighbour, asked)}
 
     def _counts(self, node: NodeId, asked: NodeId) -> bool:
