@@ -209,10 +209,15 @@ class PostgresStore(Store):
                 f"{self.address.words}: has only a part of a map store: a restore into it runs or failed; "
                 "if it failed, drop this database and restore into an empty one, or use that of before"
             )
+        if version is None:
+            raise InvalidFile(
+                f"{self.address.words}: has no map store: a map server makes one at its first start on it"
+            )
         if version != VERSION:
-            what = "no map store" if version is None else f"a map store of format {version}"
-            advice = "" if version is None else f": {what_to_do(version, VERSION)}"
-            raise InvalidFile(f"{self.address.words}: has {what}, this program uses format {VERSION}{advice}")
+            raise InvalidFile(
+                f"{self.address.words}: has a map store of format {version}, this program uses format "
+                f"{VERSION}: {what_to_do(version, VERSION)}"
+            )
 
     def _prepare_reader(self, connection: psycopg.Connection) -> None:
         if self._has_name:

@@ -281,7 +281,7 @@ def test_a_password_in_the_address_is_refused_and_not_repeated(
 
 def test_a_store_of_another_format_is_refused(postgres: PostgresServer) -> None:
     address = postgres.database()
-    with pytest.raises(InvalidFile, match="no map store"):
+    with pytest.raises(InvalidFile, match=r"has no map store: a map server makes one at its first start"):
         PostgresStore(address, read_only=True)
     PostgresStore(address).close()
     with psycopg.connect(address, autocommit=True) as connection:
