@@ -299,8 +299,16 @@ class Fleet(FleetMap, FleetConstraints):
                 the others are stopped.
         """
         self._check_role()
-        names = [check_name(robot)] if robot else self._stoppable()
-        return tuple(each_robot(names, lambda name: self._stop(name, because)))
+        if robot:
+            return tuple(each_robot([check_name(robot)], lambda name: self._stop(name, because)))
+        there = [entry.robot for entry in self.status().robots if entry.alive]
+        try:
+            stopped = each_robot(there, lambda name: self._stop(name, because))
+        finally:
+            # Those that drive wait for no server's answer about the others.
+            names = sorted(self._awaited().difference(there))
+            away = each_robot(names, lambda name: self._stop(name, because))
+        return (*stopped, *away)
 
     def portal_done(self, robot: str) -> str:
         """Tell a robot that it was taken through the portal at which it waits; it looks where it is then.
@@ -432,14 +440,13 @@ class Fleet(FleetMap, FleetConstraints):
             after_ns = self._newest(robot)
         return report
 
-    def _stoppable(self) -> list[str]:
-        """The robots that are there, and those that a map server would give a mission once they are back."""
-        names = {entry.robot for entry in self.status().robots if entry.alive}
-        # Without a server none waits for a mission.
+    def _awaited(self) -> set[str]:
+        """The robots that a map server would give a mission once they are back; without a server none."""
+        names: set[str] = set()
         for reply in self._bus.ask(self._keys.any_missions(), b"", ANSWERED):
             if not reply.error:
                 names |= decode(reply.payload, Missions).awaited()
-        return sorted(names)
+        return names
 
     def _stop(self, robot: str, because: str) -> MissionReport:
         """Stop a robot, directly; one that does not answer by way of the map server."""

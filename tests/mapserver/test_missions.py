@@ -170,6 +170,23 @@ def test_a_robot_that_is_away_gets_no_mission_from_before_it_was_stopped(house: 
     link.close()
 
 
+def test_a_robot_that_drives_is_stopped_before_a_server_says_who_is_away(
+    house: House, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link, control = house.robot()
+    asked: list[bool] = []
+
+    def slow(person: fleet.Fleet) -> set[str]:
+        asked.append(control.report is not None and control.report.order.kind is MissionKind.STOP)
+        return set()
+
+    monkeypatch.setattr(fleet.Fleet, "_awaited", slow)
+    house.person.explore("r0")
+    assert [report.order.robot for report in house.person.stop()] == ["r0"]
+    assert asked == [True]
+    link.close()
+
+
 def test_a_goal_is_of_the_map_that_a_robot_makes_now(house: House) -> None:
     """Right after a start of the server its status has not come, and after its own its last one is older."""
     bus, first = house.bus(), min(house.mapped.truth)
