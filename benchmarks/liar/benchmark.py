@@ -80,7 +80,7 @@ RULES: dict[str, tuple[Switch, ...]] = {
     ),
     "views that contradict the way": ((OwnViewsSearch, "reason", lambda *_: ""),),
     "false places of one robot": ((FleetChance, "_all_at_one_robot", lambda *_: False),),
-    "optimisation in two stages": ((StagedOptimization, "solved", lambda _self, merged, _maps: merged),),
+    "optimisation in two stages": ((StagedOptimization, "solved", lambda _self, merged, *_: merged),),
     "torn maps": ((wrong_geometry, "is_torn", lambda *_: False),),
     "answers without implausible maps": ((answers, "doubted", lambda _: []),),
     "fragments": ((active_nodes, "fragments", lambda *_: []),),
