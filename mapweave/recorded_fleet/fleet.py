@@ -14,7 +14,7 @@ from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.http.last_shown import LastShown
 from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
-from mapweave.mapserver.log.store import HISTORY
+from mapweave.mapserver.log.store import CHOICE_KEY, HISTORY
 from mapweave.mapserver.merging.verification_cache_keeper import SUFFIX
 from mapweave.recorded_fleet.recording import VERDICTS, recorded_maps
 from mapweave.recorded_fleet.robot import ReplayedRobot
@@ -49,6 +49,8 @@ def prepare(folder: Path, store: Path, shown: LastShown) -> None:
                 rows = journal.rows(map_id, 1, journal.head(map_id))
                 entries = [ReceivedChange(*row, change) for row, change in zip(rows, written, strict=True)]
                 filled.apply(map_id, journal.log_id(map_id), entries)
+        # As where nothing is left to chance: else other pairs would be compared than have been.
+        filled.put_result(CHOICE_KEY, b"")
         if VERDICTS.exists():
             shutil.copyfile(VERDICTS, store.with_name(store.name + SUFFIX))
         if shown:
