@@ -401,8 +401,9 @@ def changes() -> list[dict[str, Any]]:
 
 
 def _sensed(data: bytes) -> dict[str, Any]:
-    """An observation as a driver gives it."""
-    return {name: value for name, value in shown(decode_observation(data)).items() if name != "left_out"}
+    """An observation as it is sent."""
+    found = shown(decode_observation(data))
+    return {name: value for name, value in found.items() if name not in ("left_out", "silent")}
 
 
 def _refusal(data: bytes) -> Any:

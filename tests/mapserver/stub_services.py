@@ -15,7 +15,7 @@ from mapweave.hybridmap.errors import Busy, InvalidValue
 from mapweave.hybridmap.explanation import Explanation, FleetExplanation
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.map_event import MapEvent
-from mapweave.hybridmap.mission_order import MissionKind, MissionReport
+from mapweave.hybridmap.mission_order import MissionKind, MissionReport, Missions
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import (
     Certainty,
@@ -84,6 +84,9 @@ class StubServices:
 
     def annotations(self) -> Annotations:
         return self.said
+
+    def missions(self) -> Missions:
+        return Missions(())
 
     def give(
         self,

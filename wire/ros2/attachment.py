@@ -1,8 +1,8 @@
 """What rmw_zenoh attaches to each message: a number, a time, and who published it.
 
 A ROS 2 process that cannot read the attachment of a message ends. So only the form is written that is read
-since rmw_zenoh_cpp 0.1.2 (Humble), 0.2.4 (Jazzy) and 0.6.0, and nothing is ever published without it. The form of
-before is read as well.
+since rmw_zenoh_cpp 0.1.2 (Humble), 0.2.4 (Jazzy) and 0.6.0, and nothing is ever published without it. The
+form of before is read as well.
 """
 
 from __future__ import annotations
