@@ -161,17 +161,17 @@ class OnlineCalibration:
 
     @property
     def lever_error(self) -> float:
-        """How far the camera stands from where it is assumed on the robot, m, as far as images show it.
+        """How far the camera may stand from where it is assumed on the robot, m.
 
-        Two estimates are apart by their errors: of the squared distance to the last solution its variance is
-        taken off. What is left is in use until the difference is sure enough to be corrected.
+        By the last solution, root mean square: its distance, and how uncertain it is. Before images show
+        anything, as far as the camera stands above the floor, and never further.
         """
-        last = self._last
+        last, most = self._last, self._geometry.height
         if last is None:
-            return 0.0
+            return most
         lever = [P.FORWARD, P.LEFT]
-        squares = (last.vector - self._geometry.vector)[lever] ** 2 - np.diag(last.covariance)[lever]
-        return math.sqrt(np.maximum(squares, 0.0).sum())
+        squares = (last.vector - self._geometry.vector)[lever] ** 2 + np.diag(last.covariance)[lever]
+        return min(math.sqrt(squares.sum()), most)
 
     def correct(self, observation: Observation) -> Observation:
         """Count what the wheels report, and correct it by the geometry in use. Once a tick, first of all."""

@@ -110,9 +110,9 @@ def test_a_wrong_geometry_is_named_and_mended(parameter: Parameter, amount: floa
     assert np.allclose(online.geometry.vector[kept], TRUE.vector[kept])
 
 
-@pytest.mark.parametrize("wrong_m", [0.0, 0.3])
-def test_how_far_the_camera_stands_elsewhere_is_known_before_it_is_corrected(wrong_m: float) -> None:
-    """And no further off than that once it is corrected, nor with the right geometry."""
+@pytest.mark.parametrize("wrong_m", [0.0, 0.25])
+def test_how_far_the_camera_may_stand_elsewhere_is_never_less_than_it_does(wrong_m: float) -> None:
+    """From the first image on, when nothing is known of it; and little once it is corrected, or right."""
     declared = replace(TRUE, forward=TRUE.forward + wrong_m)
     camera = replace(CAMERA, mount_forward=declared.forward, mount_height=declared.height)
     doubts: dict[bool, list[float]] = {False: [], True: []}
@@ -129,7 +129,8 @@ def test_how_far_the_camera_stands_elsewhere_is_known_before_it_is_corrected(wro
         3,
         online=Noted(RobotDescription(camera, geometry=declared)),
     )
-    assert not wrong_m or max(doubts[False]) == pytest.approx(wrong_m, abs=0.1), "before it is in use"
+    assert not wrong_m or min(doubts[False]) > 0.9 * wrong_m, "before it is corrected"
+    assert max(doubts[False] + doubts[True]) <= declared.height, "no camera stands further off"
     assert max(doubts[True][-20:]) < 0.05
 
 
