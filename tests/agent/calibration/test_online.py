@@ -110,9 +110,9 @@ def test_a_wrong_geometry_is_named_and_mended(parameter: Parameter, amount: floa
     assert np.allclose(online.geometry.vector[kept], TRUE.vector[kept])
 
 
-@pytest.mark.parametrize("wrong_m", [0.0, 0.25])
-def test_how_far_the_camera_may_stand_elsewhere_is_never_less_than_it_does(wrong_m: float) -> None:
-    """From the first image on, when nothing is known of it; and little once it is corrected, or right."""
+@pytest.mark.parametrize("wrong_m", [0.0, 0.3])
+def test_how_far_the_camera_may_stand_elsewhere_holds_from_the_first_image_on(wrong_m: float) -> None:
+    """When nothing is known of it, too; and it is little once that is corrected, or right."""
     declared = replace(TRUE, forward=TRUE.forward + wrong_m)
     camera = replace(CAMERA, mount_forward=declared.forward, mount_height=declared.height)
     doubts: dict[bool, list[float]] = {False: [], True: []}
@@ -129,7 +129,8 @@ def test_how_far_the_camera_may_stand_elsewhere_is_never_less_than_it_does(wrong
         3,
         online=Noted(RobotDescription(camera, geometry=declared)),
     )
-    assert not wrong_m or min(doubts[False]) > 0.9 * wrong_m, "before it is corrected"
+    before = doubts[False]
+    assert not wrong_m or before == pytest.approx([wrong_m] * len(before), abs=0.1), "before it is corrected"
     assert max(doubts[False] + doubts[True]) <= declared.height, "no camera stands further off"
     assert max(doubts[True][-20:]) < 0.05
 
