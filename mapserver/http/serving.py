@@ -10,7 +10,9 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import errno
+import itertools
 import logging
+import select
 import socket
 import ssl
 import threading
@@ -43,10 +45,11 @@ MAX_VIEWER_BYTES = 1024
 """Of a message by a viewer, which has nothing to say."""
 GRACE = 1.0
 """s in which requests in work may end when the server ends."""
-ARRIVAL = 0.05
-"""s in which a request may still arrive then, of a client that has connected before."""
 STEP = 0.005
 """s between two looks at whether that has happened."""
+ARRIVAL = 10
+"""Steps in which a request may still arrive then, of a client that has connected before. Steps, and not a
+time: while a library loads or computes, the server's thread may come to nothing for longer than that."""
 NO_FILES = (errno.EMFILE, errno.ENFILE, errno.ENOBUFS, errno.ENOMEM)
 """Errors of a process, or a machine, that can open no more connections."""
 REMINDER = 60.0
@@ -259,10 +262,10 @@ class _Server(uvicorn.Server):
         With its port a connection is reset that has not been accepted, and one that was, a moment before, is
         not among the connections yet and would stay open without an answer.
         """
-        await asyncio.sleep(STEP)
+        await _while(lambda: any(map(_is_waited_for, sockets or ())), 0.0)
         for listening in (*self.servers, *(sockets or ())):
             listening.close()
-        await _while(self._arriving, ARRIVAL)
+        await _while(self._arriving, 0.0)
         state = self.server_state
         for connection in list(state.connections):
             connection.shutdown()
@@ -274,11 +277,20 @@ class _Server(uvicorn.Server):
         await asyncio.sleep(0)
 
 
+def _is_waited_for(listening: socket.socket) -> bool:
+    """Whether a connection waits to be accepted."""
+    waiting = select.poll()
+    waiting.register(listening, select.POLLIN)
+    return bool(waiting.poll(0))
+
+
 async def _while(holds: Callable[[], bool], seconds: float) -> None:
-    """Wait at least one step, and at most so many seconds."""
+    """Wait at least one step, and at most so many seconds or the steps of an arrival, if they take longer."""
     end = time.monotonic() + seconds
     await asyncio.sleep(STEP)
-    while holds() and time.monotonic() < end:
+    for step in itertools.count(1):
+        if not holds() or (step >= ARRIVAL and time.monotonic() >= end):
+            return
         await asyncio.sleep(STEP)
 
 

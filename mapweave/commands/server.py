@@ -9,6 +9,7 @@ import os
 import shutil
 import sys
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, suppress
 from dataclasses import replace
@@ -241,7 +242,9 @@ def run(arguments: argparse.Namespace) -> int:
             return 0
         if base is not None:
             print(stamped(f"with {base}"), flush=True)
-        started = end_if_stopped_before(stop, data if arguments.demo else None)
+        started = end_if_stopped_before(
+            stop, data if arguments.demo else None, web.close if web is not None else None
+        )
         stack.enter_context(server)
         started.set()
         if not arguments.lockstep:
@@ -295,7 +298,9 @@ def _stores_beside(path: Path) -> list[str]:
     return names
 
 
-def end_if_stopped_before(stop: threading.Event, temporary: Path | None = None) -> threading.Event:
+def end_if_stopped_before(
+    stop: threading.Event, temporary: Path | None = None, close: Callable[[], None] | None = None
+) -> threading.Event:
     """End the process on this event as long as the returned one is not set.
 
     A server reads its store at the start, which takes a minute for 100 000 places. Nothing is lost: what it
@@ -304,6 +309,7 @@ def end_if_stopped_before(stop: threading.Event, temporary: Path | None = None) 
     Args:
         stop: set by signals.
         temporary: a folder that is removed then.
+        close: ends the page, which answers while the server loads: else an answer may be cut off.
     """
     started = threading.Event()
 
@@ -313,6 +319,10 @@ def end_if_stopped_before(stop: threading.Event, temporary: Path | None = None) 
             from mapweave.terminal import stamped
 
             print(stamped(STOPPED), flush=True)
+            if close is not None:
+                close()
+            if started.is_set():  # meanwhile: it ends by itself
+                return
             # The server goes on writing until the process ends.
             if temporary is not None:
                 for _ in range(REMOVALS):

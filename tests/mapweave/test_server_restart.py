@@ -137,6 +137,37 @@ def test_a_server_that_reads_its_store_can_be_stopped(tmp_path: Path) -> None:
             running.kill()
 
 
+ANSWER_IN_TWO_PARTS = """
+import asyncio, threading
+from mapweave.commands.server import end_if_stopped_before
+from mapweave.mapserver.http.serving import HttpThread
+
+BODY = b"the second part"
+
+async def app(scope, receive, send):
+    length = [(b"content-length", str(len(BODY)).encode())]
+    await send({"type": "http.response.start", "status": 200, "headers": length})
+    stop.set()
+    await asyncio.sleep(0.3)
+    await send({"type": "http.response.body", "body": BODY})
+
+stop, web = threading.Event(), HttpThread(app, ("127.0.0.1", 0))
+end_if_stopped_before(stop, close=web.close)
+print(web.port, flush=True)
+threading.Event().wait()
+"""
+
+
+def test_a_server_that_is_stopped_while_it_starts_ends_the_answers_that_it_has_begun() -> None:
+    """A page that asked in that moment got the head of an answer without its content."""
+    command = [sys.executable, "-c", ANSWER_IN_TWO_PARTS]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
+        assert running.stdout is not None
+        with urlopen(f"http://127.0.0.1:{int(running.stdout.readline())}/", timeout=20) as reply:
+            assert reply.read() == b"the second part"
+        assert running.wait(20) == 0
+
+
 def test_a_server_that_begins_a_store_beside_those_of_others_says_so(tmp_path: Path) -> None:
     """As after a restore under another name: it began with nothing, and did not say so."""
     SqliteStore(tmp_path / "monday.sqlite").close()

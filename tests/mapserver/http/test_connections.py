@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import resource
 import socket
 import subprocess
@@ -10,6 +11,7 @@ import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack
+from typing import Any
 
 import numpy as np
 import pytest
@@ -346,3 +348,36 @@ def test_a_server_that_can_open_no_more_files_says_so_in_one_line_and_goes_on() 
     assert words == "here"
     assert done.stderr.splitlines() == ["no more connections can be taken: Too many open files"]
     assert int(calls) <= 10, "it is tried once a second"
+
+
+def test_who_has_connected_is_answered_when_a_busy_server_ends() -> None:
+    """While a library loads or computes, the server's thread comes to nothing for a while, again and again.
+
+    It gave up on requests after a time in which it had not looked for them, and reset their connections.
+    """
+    busy = threading.Event()
+
+    async def app(scope: Any, receive: Any, send: Any) -> None:
+        if not busy.is_set():
+            hold_up()
+            busy.set()
+        await send({"type": "http.response.start", "status": 200, "headers": [(b"content-length", b"4")]})
+        await send({"type": "http.response.body", "body": b"here"})
+
+    def hold_up() -> None:
+        time.sleep(0.06)
+        asyncio.get_running_loop().call_soon(hold_up)
+
+    thread = serving.HttpThread(app, ("127.0.0.1", 0))
+    with ExitStack() as stack:
+
+        def asked() -> socket.socket:
+            peer = stack.enter_context(socket.create_connection(("127.0.0.1", thread.port), timeout=20.0))
+            peer.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n")
+            return peer
+
+        peers = [asked()]
+        assert busy.wait(10.0)
+        peers += [asked() for _ in range(4)]
+        thread.close()
+        assert [peer.makefile("rb").read()[-4:] for peer in peers] == [b"here"] * 5
