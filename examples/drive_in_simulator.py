@@ -2,9 +2,10 @@
 
 from pathlib import Path
 
-import mapweave
-from mapweave.agent.mission import Explore
-from mapweave.agent.pipeline import Pipeline
+import mapweave.extras
+from mapweave.agent import mission, pipeline
+
+mapweave.extras.exit_without("sim")
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
 
@@ -16,13 +17,12 @@ PLACES = {"r0": mapweave.Pose2(1.9, 3.0, -2.8), "r1": mapweave.Pose2(2.2, 3.0, -
 def drive(robot: str) -> Path:
     if (path := FOLDER / f"{robot}.mapweave").exists():
         return path
-    # Of one seed they would share a clock, and be known to have been there at the same time.
-    with Simulation(OFFICE, [robot], seed=int(robot[1:]), poses=[PLACES[robot]]) as simulation:
-        pipeline, command = Pipeline(mapweave.MapId(robot, 1), simulation.describe(robot)), mapweave.Command()
-        pipeline.set_mission(Explore())
+    with Simulation(OFFICE, [robot], seed=int(robot[1:]), poses=[PLACES[robot]]) as sim:  # each its own clock
+        agent, command = pipeline.Pipeline(mapweave.MapId(robot, 1), sim.describe(robot)), mapweave.Command()
+        agent.set_mission(mission.Explore())
         for _ in range(400):  # of 0.1 s
-            command = pipeline.step(simulation.step({robot: command})[robot]).command
-    mapweave.write_map_file(path, mapweave.MapFile("agent", robot, tuple(pipeline.map.contents())))
+            command = agent.step(sim.step({robot: command})[robot]).command
+    mapweave.write_map_file(path, mapweave.MapFile("agent", robot, tuple(agent.map.contents())))
     return path
 
 

@@ -1,5 +1,8 @@
-"""Parks at random: how to use the Gymnasium environment. Needs `pip install mapweave[gym]`."""
+"""Parks at random: how to use the Gymnasium environment. Needs `pip install '.[gym]'`."""
 
+from mapweave.extras import exit_without
+
+exit_without("sim", "gym")
 import gymnasium
 
 env = gymnasium.make("mapweave.sim.gym:mapweave/Park-v0", seconds=10.0)

@@ -6,9 +6,10 @@ Without maps it takes those of two robots in the simulator, which have mapped th
 import sys
 from pathlib import Path
 
-from drive_in_simulator import FOLDER, drive
+import mapweave.extras
 
-import mapweave
+mapweave.extras.exit_without("sim", "server")
+from drive_in_simulator import FOLDER, drive
 
 paths = [Path(word) for word in sys.argv[1:]] or [drive("r0"), drive("r1")]
 office = mapweave.FileMap(mapweave.merge_map_files(paths))
@@ -21,8 +22,7 @@ for a, b, link in office.graph().edges(data=True):
         print(f"{a} and {b}: {link['inliers']:.0f} landmarks agree, p = {link['probability']:.3f}")
 
 first, *_, last = office.nodes.ids
-route = office.route(first, last)
-print(f"from {first} to {last}: {route.reason}")
+print(f"from {first} to {last}: {(route := office.route(first, last)).reason}")
 for hop in route.hops:
     print(f"  {hop.a} -> {hop.b}: {hop.distance:.2f} m, {hop.words}")
 

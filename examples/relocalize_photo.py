@@ -6,19 +6,19 @@ Without a photo it takes one in the simulator, beside the place where a robot be
 import math
 import sys
 
+import mapweave.extras
+
+mapweave.extras.exit_without("sim", "server")
 from drive_in_simulator import OFFICE, PLACES, drive
 
-import mapweave
 from mapweave.sim.simulation import Simulation
 
 if sys.argv[1:]:
-    file, photo, camera = sys.argv[1:]
-    answer = mapweave.open(file).relocalize(photo, camera)
+    answer = mapweave.open(sys.argv[1]).relocalize(sys.argv[2], sys.argv[3])
 else:
     beside = mapweave.Pose2(0.15, -0.1, 0.1)  # in the frame of the map, which began at the robot's place
     with Simulation(OFFICE, ["visitor"], seed=1, poses=[PLACES["r0"] @ beside]) as simulation:
         seen, robot = simulation.observe("visitor"), simulation.describe("visitor")
-    assert seen.image is not None
     answer = mapweave.open(drive("r0")).relocalize(seen.image, robot.camera)
     print(f"really at {beside.x:+.3f} {beside.y:+.3f} m, {math.degrees(beside.heading):+.1f} deg")
 

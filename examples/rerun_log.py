@@ -1,11 +1,14 @@
-"""See inside a robot: `python examples/rerun_log.py` writes out/examples/r0.rrd. Needs `mapweave[rerun]`.
+"""See inside a robot: `python examples/rerun_log.py` writes out/examples/r0.rrd.
 
-Look at it with `rerun out/examples/r0.rrd`. `mapweave agent`, `replay` and `sim run` have `--rerun`.
+Needs `pip install '.[sim,rerun]'`. Look at it with `rerun out/examples/r0.rrd`. `mapweave agent`, `replay`
+and `sim run` have `--rerun`.
 """
 
+import mapweave.extras
+
+mapweave.extras.exit_without("sim", "rerun")
 from drive_in_simulator import FOLDER, OFFICE, PLACES
 
-import mapweave
 from mapweave.agent.mission import Explore
 from mapweave.agent.pipeline import Pipeline
 from mapweave.processes.rerun_log import RerunLog

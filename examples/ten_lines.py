@@ -1,6 +1,9 @@
 """The simulator as a library: a world, a robot, steps, observations."""
 
 from mapweave.agent.observation import Command
+from mapweave.extras import exit_without
+
+exit_without("sim")
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
 

@@ -3,9 +3,10 @@
 import sys
 from pathlib import Path
 
-from matplotlib.figure import Figure
+import mapweave.extras
 
-import mapweave
+mapweave.extras.exit_without("viz")
+from matplotlib.figure import Figure
 
 endpoint = sys.argv[1] if sys.argv[1:] else "tcp/127.0.0.1:7447"
 picture = Path("out/examples/fleet.png")

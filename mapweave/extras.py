@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from importlib.util import find_spec
 from pathlib import Path
 
+from mapweave.exit_status import MISSING_EXTRA
 from mapweave.hybridmap.errors import MapweaveError
 
 MODULES = {
@@ -28,11 +29,12 @@ MODULES = {
     "postgres": ("psycopg",),
     "sim": ("pybullet",),
     "eval": ("evo",),
+    "gym": ("gymnasium",),
     "viz": ("matplotlib",),
     "rerun": ("rerun",),
     "metrics": ("prometheus_client",),
 }
-"""What each extra installs, by the names that are imported. No command needs `fast` or `gym`."""
+"""What each extra installs, by the names that are imported. No command needs `gym`; `fast` is left out."""
 TRIAL = ("server", "sim", "eval", "viz")
 """What a scenario with a whole fleet needs, its report included."""
 
@@ -77,6 +79,15 @@ def need(*extras: str) -> None:
     missing = [extra for extra in extras if any(find_spec(module) is None for module in MODULES[extra])]
     if missing:
         raise MissingExtra(missing)
+
+
+def exit_without(*extras: str) -> None:
+    """End a script in one line, as a command ends, if extras are not installed. Else nothing happens."""
+    try:
+        need(*extras)
+    except MissingExtra as error:
+        print(f"{Path(sys.argv[0]).name} {error}", file=sys.stderr)
+        sys.exit(MISSING_EXTRA)
 
 
 def extra_of(module: str | None) -> str | None:

@@ -3,7 +3,7 @@
     import gymnasium
     env = gymnasium.make("mapweave.sim.gym:mapweave/Park-v0")
 
-Gymnasium is an extra: `pip install mapweave[gym]`.
+Gymnasium is an extra: `pip install 'mapweave[gym]'`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ try:
     import gymnasium
     from gymnasium import spaces
 except ImportError:
-    raise SettingsError("mapweave.sim.gym needs Gymnasium: pip install mapweave[gym]") from None
+    raise SettingsError("mapweave.sim.gym needs Gymnasium: pip install 'mapweave[gym]'") from None
 
 REACHED = 0.05
 """A robot is parked when it is nearer than this to the goal, m,"""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import re
 import subprocess
 import sys
@@ -10,6 +11,8 @@ from pathlib import Path
 import pytest
 
 import mapweave
+from mapweave.exit_status import MISSING_EXTRA
+from mapweave.extras import MODULES
 from mapweave.mapserver.server import MapServer
 from mapweave.photographs import send_map
 from mapweave.wire.bus_settings import BusSettings
@@ -19,6 +22,12 @@ from tests.simulator import needs_simulator
 from tests.waiting import eventually, free_port
 
 EXAMPLES = Path(__file__).parents[1] / "examples"
+LACKING = {
+    "drive_in_simulator": ["sim"], "gym_random": ["sim", "gym"], "merge_maps": ["server"],
+    "plot_map": ["viz"], "relocalize_photo": ["server"], "rerun_log": ["rerun"],
+    "ten_lines": ["sim"], "watch_fleet": ["viz"],
+}  # fmt: skip
+"""Extras that are not there, by the example that needs them."""
 SHORT = sorted(path.stem for path in EXAMPLES.glob("*.py"))
 
 
@@ -35,6 +44,28 @@ def run(folder: Path, name: str, *words: str) -> str:
 @pytest.mark.parametrize("name", SHORT)
 def test_they_are_short(name: str) -> None:
     assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= 30
+
+
+@pytest.mark.parametrize("name", [*LACKING])
+def test_an_example_without_its_extra_ends_in_one_line(name: str, tmp_path: Path) -> None:
+    """As a command does: it was a traceback of fifteen lines."""
+    missing = sorted({module for extra in LACKING[name] for module in MODULES[extra]})
+    program = (
+        "import runpy, sys\n"
+        "from tests.mapweave.without_libraries import Without\n"
+        f"sys.meta_path[:] = [Without(finder, frozenset({missing})) for finder in sys.meta_path]\n"
+        "sys.argv[:] = sys.argv[1:]\n"
+        f"sys.path.insert(0, {str(EXAMPLES)!r})\n"
+        "runpy.run_path(sys.argv[0], run_name='__main__')\n"
+    )
+    ran = subprocess.run(
+        [sys.executable, "-c", program, str(EXAMPLES / f"{name}.py")],
+        cwd=tmp_path, env=os.environ | {"PYTHONPATH": str(EXAMPLES.parent)},
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    needs = " and ".join(f'"{extra}"' for extra in LACKING[name])
+    assert re.fullmatch(rf"{name}\.py needs the extras? {needs}: .*\n", ran.stderr), ran.stderr
+    assert (ran.returncode, ran.stdout) == (MISSING_EXTRA, "")
 
 
 @pytest.mark.slow

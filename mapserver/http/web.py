@@ -105,14 +105,14 @@ Answer = Callable[[Request], Awaitable[Mapping[str, Any] | Response]]
 
 
 def parse_address(text: str) -> tuple[str, int]:
-    """`PORT` (loopback only) or `HOST:PORT`.
+    """`PORT` (loopback only) or `HOST:PORT`; port 0 takes a free one.
 
     Raises:
         SettingsError: it is neither.
     """
     host, colon, port = text.rpartition(":")
     host = host.strip("[]") if colon else "127.0.0.1"
-    if not host or not port.isascii() or not port.isdigit() or not 1 <= int(port) <= 65535:
+    if not host or not port.isascii() or not port.isdigit() or not int(port) <= 65535:
         raise SettingsError(f"http {text!r}: write a port, or HOST:PORT, for example 8080 or 0.0.0.0:8080")
     return host, int(port)
 

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
+from mapweave.commands.completing import complete_drivers
 from mapweave.commands.network import (
     add_log_format,
     add_network,
@@ -109,12 +110,13 @@ def add_logs(parser: argparse.ArgumentParser) -> None:
 
 def add_robot(parser: argparse.ArgumentParser) -> None:
     """Declare which robot it is, and where it is reached."""
-    parser.add_argument(
+    robot = parser.add_argument(
         "--robot", metavar="DRIVER|FILE",
         help="a driver as `mapweave robots` lists them, your own class, FILE.py:CLASS, or the settings file, "
         "FILE.toml, that names the driver (default: [robot] driver of --settings, else remote, a base behind "
         "Zenoh keys such as the simulator's)",
     )  # fmt: skip
+    complete_drivers(robot)
     parser.add_argument(
         "--body",
         type=values.endpoint,

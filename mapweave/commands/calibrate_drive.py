@@ -17,6 +17,7 @@ from mapweave.commands.agent import (
     open_robot,
     take_robot_file,
 )
+from mapweave.commands.completing import complete_drivers
 from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 from mapweave.commands.replay import add_recording, name_of, options_of
 from mapweave.exit_status import INTERRUPTED, NO
@@ -42,11 +43,12 @@ def add_to(actions: Any) -> None:
         "now; it gets no commands.",
     )
     add_recording(parser, optional=True)
-    parser.add_argument(
+    robot = parser.add_argument(
         "--robot", metavar="NAME|DRIVER|FILE",
         help="of a recording: one of the robots in its splits.toml; without one: as for `agent` "
         "(default: [robot] driver of the settings)",
     )  # fmt: skip
+    complete_drivers(robot)
     parser.add_argument(
         "--name", type=values.name, help="the robot's name in the fleet (default: as `replay` names it)"
     )

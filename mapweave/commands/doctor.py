@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.agent import take_robot_file
+from mapweave.commands.completing import complete_drivers
 from mapweave.commands.network import add_network, network_of
 from mapweave.exit_status import DONE, NO
 
@@ -35,12 +36,13 @@ def add_to(commands: Any) -> None:
         "name the first thing that is wrong with what to do about it. Exit status 4 if something is wrong. "
         "Runs even where libraries are missing. The robot moves only with --drive.",
     )
-    parser.add_argument(
+    robot = parser.add_argument(
         "--robot",
         metavar="DRIVER|FILE",
         help="its driver, FILE.py:CLASS, or its settings file, FILE.toml, as of `agent` (default: the driver "
         "of --settings)",
     )
+    complete_drivers(robot)
     parser.add_argument("--name", type=values.name, help="of the robot in the fleet (default: r0)")
     parser.add_argument(
         "--data",

@@ -52,6 +52,7 @@ def run(arguments: argparse.Namespace) -> int:
         words, near = [arguments.node], arguments.near or ""
         if arguments.plan is not None:
             words = off_plan(words, record.plans().plan(arguments.plan), near, record.resolve)
+        floors = set(record.annotations().floors.values())
         node = record.resolve(ResolveRequest(tuple(words), near)).found[0].node
         name, because = str(node.map), arguments.because
         if arguments.undo:
@@ -59,7 +60,12 @@ def run(arguments: argparse.Namespace) -> int:
         else:
             fields = {"node": str(node), "label": arguments.label}
             said = [record.annotate("floor", name, because, check=arguments.check, **fields)]
-    if arguments.map is not None and not arguments.check:
-        said.append("links between floors fall when the file is merged again: mapweave map merge FILE -o OUT")
+        floors.update(record.annotations().floors.values())
+    # Of one floor alone there are no links to another.
+    if arguments.map is not None and not arguments.check and len(floors) > 1:
+        does = "may stand again" if arguments.undo else "fall"
+        said.append(
+            f"links between floors {does} when the file is merged again: mapweave map merge FILE -o OUT"
+        )
     print_said(arguments, *said)
     return 0

@@ -29,7 +29,7 @@ class HttpAccess:
     """How HTTP is served.
 
     Attributes:
-        address: host and port.
+        address: host and port; port 0 takes a free one.
         logins: of the fleet's members; None without keys.
         tls: serves HTTPS; None without certificates.
     """
@@ -38,10 +38,13 @@ class HttpAccess:
     logins: Logins | None
     tls: ssl.SSLContext | None
 
-    @property
-    def url(self) -> str:
-        """The address for people: where all addresses are served, by a name that the certificate has."""
-        host, port = self.address
+    def url(self, port: int) -> str:
+        """The address for people: where all addresses are served, by a name that the certificate has.
+
+        Args:
+            port: at which the page is served; of `Web.port`, since port 0 takes a free one.
+        """
+        host, _ = self.address
         if self.logins is not None and host in ALL_ADDRESSES:
             host = _name_of(self.logins.hosts)
         scheme = "http" if self.tls is None else "https"

@@ -6,6 +6,7 @@ import argparse
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands import values
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.commands.network import settings_of, stop_on_signals
 
@@ -21,8 +22,9 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument("file", type=map_source, metavar="FILE", help=SOURCES)
     parser.add_argument(
-        "--http", metavar="[HOST:]PORT", default="8080",
-        help="where; with --keys people log in, and 0.0.0.0:8080 serves other machines, too (default: 8080)",
+        "--http", type=values.given, metavar="[HOST:]PORT", default="8080",
+        help="where; 0 takes a free port; with --keys people log in, and 0.0.0.0:8080 serves other machines, "
+        "too (default: 8080)",
     )  # fmt: skip
     parser.add_argument("--keys", type=Path, metavar="FOLDER", help="folder of `mapweave keys init`")
     parser.add_argument("--settings", type=Path, metavar="FILE", help="TOML; [merge] says how it was merged")
@@ -40,8 +42,8 @@ def run(arguments: argparse.Namespace) -> int:
     one = opened(arguments.file)
     merged = merged_with_progress(one, settings.merge)
     stop = stop_on_signals()
-    with ReadOnlyServer(one, merged, settings.merge) as server, people.serve(server):
+    with ReadOnlyServer(one, merged, settings.merge) as server, people.serve(server) as page:
         print(f"{one.path}: {merged.summary()}", flush=True)
-        print(f"open {people.url} to see it; Ctrl-C ends", flush=True)
+        print(f"open {people.url(page.port)} to see it; Ctrl-C ends", flush=True)
         stop.wait()
     return 0

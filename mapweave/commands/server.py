@@ -88,8 +88,8 @@ def add_to(commands: Any) -> None:
     )
     parser.add_argument(
         "--http", type=values.given, metavar="[HOST:]PORT",
-        help="answer people over HTTP as well, for example 8080; with --keys people log in, over HTTPS, and "
-        "0.0.0.0:8080 serves other machines, too (default: off)",
+        help="answer people over HTTP as well, for example 8080; 0 takes a free port and prints it; with "
+        "--keys people log in, over HTTPS, and 0.0.0.0:8080 serves other machines, too (default: off)",
     )  # fmt: skip
     parser.add_argument(
         "--ray", metavar="auto|ADDRESS",
@@ -155,7 +155,7 @@ def run(arguments: argparse.Namespace) -> int:
             before = read_shown(DEMO_PAGE if arguments.demo else shown)
             web = people.serve(loading, before)
             stack.enter_context(web)
-            print(stamped(f"for people: {people.url}"), flush=True)
+            print(stamped(f"for people: {people.url(web.port)}"), flush=True)
 
         # The page is there: a browser can open it while all else is loaded. Whether another server has this
         # name takes a third of a second to find out, and what is loaded meanwhile takes longer.

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.answer import add_json
+from mapweave.commands.completing import complete_scenarios
 from mapweave.commands.network import (
     add_log_format,
     add_network,
@@ -49,7 +50,8 @@ def add_to(commands: Any) -> None:
 
 
 def _add_scenario(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scenario", help="a .toml file, or a name from `mapweave sim list`")
+    scenario = parser.add_argument("scenario", help="a .toml file, or a name from `mapweave sim list`")
+    complete_scenarios(scenario)
     parser.add_argument(
         "--set", action="append", default=[], metavar="KEY=VALUE", dest="overrides",
         help="override the file, for example --set world.rooms=5; may be given several times",

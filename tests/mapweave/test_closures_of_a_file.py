@@ -101,3 +101,22 @@ def test_what_a_person_says_is_said_again_for_a_script(
     assert said("place", "remove", "kitchen")["said"].startswith("place kitchen")
     assert main(["floor", "list", *at[:2]]) == 0
     assert capfd.readouterr().out.startswith("floor r0.1 is on floor ground")
+
+
+def test_links_between_floors_are_named_only_where_there_are_two(
+    tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """With one label in all, it was said that links between floors fall."""
+    store = write_store(tmp_path / "s0.sqlite", looked_around([MapId("r0", 1), MapId("r1", 1)], seed=8))
+    path = tmp_path / "a.mapweave"
+    assert main(["map", "merge", str(store), "-o", str(path)]) == 0
+
+    def said(*words: str) -> str:
+        capfd.readouterr()
+        assert main(["floor", *words, "--map", str(path)]) == 0
+        return capfd.readouterr().out
+
+    assert "links between floors" not in said("ground", "r0.1.1")
+    assert "links between floors fall when" in said("first", "r1.1.1", "--because", "twin rooms")
+    assert "links between floors may stand again when" in said("--undo", "r1.1.1")
+    assert "links between floors" not in said("--undo", "r0.1.1")

@@ -29,7 +29,7 @@ def test_the_address_of_the_page_is_one_that_its_certificate_has(
     """`https://0.0.0.0:8080/` opens on no other machine, and its name is in no certificate."""
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, at, "s0")
     access = http_access(words, folder, "s0")
-    assert access.url == url
+    assert access.url(8080) == url
     host = url.removeprefix("https://").rpartition(":")[0].strip("[]")
     assert host in folder.catalogue.hosts
     assert access.address[0] == words.rpartition(":")[0].strip("[]") or words == "8080"

@@ -6,12 +6,16 @@ import argparse
 import io
 import logging
 import os
+import pty
 import re
+import select
 import shlex
 import shutil
 import subprocess
 import sys
 import threading
+import time
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -70,28 +74,92 @@ def test_the_cheat_sheet_is_that_of_these_commands() -> None:
     assert page.read_text(encoding="utf-8") == as_markdown(), f"python -m mapweave.cheat_sheet > {page}"
 
 
-def test_bash_completes_commands_options_and_choices(tmp_path: Path) -> None:
-    """In a real shell, which asks the program itself."""
-    program = tmp_path / "mapweave"
-    program.write_text(f'#!/bin/sh\nexec {sys.executable} -m mapweave "$@"\n')
+@pytest.fixture
+def shell_folder(tmp_path: Path) -> Path:
+    """A folder with the program in `bin`, and a driver of one's own."""
+    program = tmp_path / "bin" / "mapweave"
+    program.parent.mkdir()
+    root = Path(__file__).parents[2]
+    program.write_text(f'#!/bin/sh\nPYTHONPATH={root} exec {sys.executable} -m mapweave "$@"\n')
     program.chmod(0o755)
-    script = """
-        source <(mapweave completion bash)
-        ask() {
-            COMP_LINE="$*" COMP_POINT=${#COMP_LINE} COMP_TYPE=9 COMP_WORDS=($*) COMP_CWORD=$(($# - 1))
-            COMP_POINT=${#COMP_LINE}
-            _python_argcomplete mapweave
-            echo "${COMPREPLY[@]}"
-        }
-        ask mapweave map sh
-        ask mapweave map explain --js
-        ask mapweave agent r0 --mission ca
-    """
-    environment = os.environ | {"PATH": f"{tmp_path}:{os.environ['PATH']}"}
-    done = subprocess.run(
-        ["bash", "-c", script], env=environment, capture_output=True, text=True, check=True, timeout=60
-    )
-    assert done.stdout.split() == ["show", "--json", "carried"], done.stderr
+    (tmp_path / "my_rover.py").touch()
+    (tmp_path / "notes.txt").touch()
+    return tmp_path
+
+
+COMPLETED = [
+    ("mapweave map sh", "mapweave map show "),
+    ("mapweave agent r0 --mission ca", "mapweave agent r0 --mission carried "),
+    ("mapweave agent r0 --robot koa", "mapweave agent r0 --robot koala "),
+    ("mapweave doctor --robot my", "mapweave doctor --robot my_rover.py "),
+    ("mapweave sim run wareh", "mapweave sim run warehouse "),
+]
+"""What is typed before Tab, and what stands there after it."""
+SHELL_COMMANDS = {
+    "bash": (["--norc", "-i"], "PS1=; source <(mapweave completion bash)"),
+    "zsh": (
+        ["-f", "-i"],
+        "PS1=; unsetopt zle_bracketed_paste; autoload -U compinit; compinit -u -D; "
+        "source <(mapweave completion zsh)",
+    ),
+}
+"""How a shell is started without a person's own files, and what a person has in these."""
+
+
+@pytest.mark.parametrize("shell", [*SHELL_COMMANDS])
+def test_a_shell_completes_what_is_typed(shell: str, shell_folder: Path) -> None:
+    """At a terminal, which asks the program itself."""
+    program = shutil.which(shell)
+    if program is None:
+        pytest.skip(f"{shell} is not installed")
+    arguments, setup = SHELL_COMMANDS[shell]
+    variables = {
+        "PATH": f"{shell_folder / 'bin'}:{os.environ['PATH']}", "TERM": "dumb", "HOME": str(shell_folder)
+    }  # fmt: skip
+    with Typed([program, *arguments], shell_folder, os.environ | variables) as typed:
+        typed.write(f"{setup}; echo rea''dy\n")
+        typed.until("ready\r\n")
+        for before, after in COMPLETED:
+            typed.write(f"{before}\t")
+            typed.until(after)
+            typed.write("\x15")  # the line is removed
+            typed.write("echo ne''xt\n")
+            typed.until("next\r\n")
+
+
+class Typed:
+    """A program at a terminal, typed at. A context manager, which ends it."""
+
+    def __init__(self, command: Sequence[str], folder: Path, environment: Mapping[str, str]) -> None:
+        """Start it."""
+        self._ours, theirs = pty.openpty()
+        self._program = subprocess.Popen(
+            command, stdin=theirs, stdout=theirs, stderr=theirs, cwd=folder, env=environment,
+            start_new_session=True,
+        )  # fmt: skip
+        os.close(theirs)
+
+    def __enter__(self) -> Typed:
+        """Nothing more to do."""
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        """End it."""
+        self._program.kill()
+        self._program.wait()
+        os.close(self._ours)
+
+    def write(self, keys: str) -> None:
+        """Type."""
+        os.write(self._ours, keys.encode())
+
+    def until(self, words: str) -> None:
+        """Read until it shows this; without colours and moves of the cursor."""
+        shown, end = "", time.monotonic() + 30.0
+        while words not in shown:
+            assert time.monotonic() < end, f"{words!r} is not in {shown!r}"
+            if select.select([self._ours], [], [], 0.1)[0]:
+                shown = re.sub(r"\x1b\[[0-9;?]*[a-zA-Z]", "", shown + os.read(self._ours, 65536).decode())
 
 
 def completed(*words: str) -> set[str]:

@@ -112,5 +112,5 @@ def test_without_gymnasium_one_line_names_the_package(monkeypatch: pytest.Monkey
 
     monkeypatch.delitem(sys.modules, "mapweave.sim.gym")
     monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(SettingsError, match=r"pip install mapweave\[gym\]"):
+    with pytest.raises(SettingsError, match=r"pip install 'mapweave\[gym\]'"):
         importlib.import_module("mapweave.sim.gym")
