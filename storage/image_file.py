@@ -96,10 +96,22 @@ def check_cost(data: bytes) -> None:
     """
     width, height = image_size(data)
     if width * height > MAX_PIXELS:
-        raise InvalidValue(f"an image of {width}x{height} px is too large, at most {MAX_PIXELS} are taken")
+        raise InvalidValue(
+            f"an image of {width}x{height} px is too large: at most {MAX_PIXELS / 1e6:g} megapixels"
+        )
     if data.startswith(b"\xff\xd8") and data.count(b"\xff\xda") > MAX_SCANS:
         raise InvalidValue(f"a JPEG of more than {MAX_SCANS} scans takes too long to decode")
     to_end(data)
+
+
+def check_size(width: int, height: int) -> None:
+    """Refuse an image of too many pixels.
+
+    Raises:
+        InvalidValue: it is too large.
+    """
+    if width * height > MAX_PIXELS:
+        raise InvalidValue(f"an image of {width}x{height} px is too large, at most {MAX_PIXELS} are taken")
 
 
 def to_end(data: bytes) -> bytes:

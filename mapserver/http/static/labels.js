@@ -6,7 +6,8 @@ const LINE = 15;              // px from line to line
 const BESIDE = 14;            // px from a point
 const LINES = 4;              // so many above and below a point are tried
 const STYLES = { robot: "600 12px system-ui, sans-serif", name: "600 13px system-ui, sans-serif",
-  component: "12px system-ui, sans-serif", node: "11px system-ui, sans-serif" };
+  component: "12px system-ui, sans-serif", node: "11px system-ui, sans-serif",
+  selected: "600 11px system-ui, sans-serif" };
 
 export class Labels {
   constructor(c, { width, height }, ground) {

@@ -9,6 +9,7 @@ const BORDER = 0.35;      // of the window's size, on each side of the bitmap
 const NEAR = 0.1;         // of the window's size, from the border at which a new bitmap is asked for
 const NAMED = 38;         // px a metre, from which on nodes have names
 const RULE = 90;          // px, longest ruler
+const RING = 10;          // px, radius of the ring about the selected node
 const SIGMAS = 2;         // of the ellipse about a robot
 
 const words = robot => robot.name + (robot.doing ? `: ${robot.doing}` : "");
@@ -106,7 +107,7 @@ export class Painter {
     if (this.selected >= 0 && m.nodes.state?.[this.selected]) {
       const [u, w] = v.toScreen(m.x[this.selected], m.y[this.selected]);
       c.strokeStyle = colours.select; c.lineWidth = 2;
-      c.beginPath(); c.arc(u, w, 10, 0, 7); c.stroke();
+      c.beginPath(); c.arc(u, w, RING, 0, 7); c.stroke();
     }
   }
   // Names of components where there are several, and of nodes.
@@ -120,15 +121,22 @@ export class Painter {
     if (v.scale < NAMED) return;
     const [left, bottom] = v.toPlane(0, v.height), [right, top] = v.toPlane(v.width, 0);
     for (const row of m.order) {
+      if (row === this.selected) continue;
       if (m.x[row] < left || m.x[row] > right || m.y[row] < bottom || m.y[row] > top) continue;
       const text = m.name(row), [u, w] = v.toScreen(m.x[row], m.y[row]);
       labels.at(u + 9, w - 4, text, "node", colours.soft, 6.2 * text.length);
     }
   }
-  // Robots come first: no text lies on one, and each has its name, with what it does where there is room.
+  // Robots come first: no text lies on one, and each has its name, with what it does where there is room. The selected
+  // node has its name at every scale: among many, that of its neighbour would lie in its ring.
   label(labels) {
-    const placed = this.robots.map(robot => [robot, ...this.viewport.toScreen(robot.x, robot.y)]);
+    const { model: m, viewport: v } = this, placed = this.robots.map(robot => [robot, ...v.toScreen(robot.x, robot.y)]);
     for (const [, u, w] of placed) labels.keep(u - 10, w - 7, u + 10, w + 7);
+    if (this.selected >= 0 && m.nodes.state?.[this.selected]) {
+      const [u, w] = v.toScreen(m.x[this.selected], m.y[this.selected]);
+      labels.keep(u - RING, w - RING, u + RING, w + RING);
+      labels.beside(u, w, [m.name(this.selected)], "selected", colours.select);
+    }
     for (const [robot, u, w] of placed)
       labels.beside(u, w, [words(robot), robot.name], "robot", robot.alive ? colours.robot : colours.soft);
   }

@@ -278,6 +278,42 @@ def test_labels_do_not_lie_on_each_other(
     assert all({f"r{k}", f"r{k}: driving"} & set(texts) for k in range(robots))
 
 
+def test_the_selected_node_has_its_name_at_every_scale(page: Browser) -> None:
+    """Its neighbour's name lay in its ring, and its own was left out; from afar no node has a name."""
+    eventually(lambda: page.run("return mapweave.model.rowOf('r0.1.3')") is not None)
+    page.run("document.getElementById('query').value = 'r0.1.3';"
+             "document.getElementById('search').requestSubmit()")  # fmt: skip
+    for scale in (20.0, 60.0, 200.0):
+        texts, within = page.run(f"""
+            const p = mapweave.painter, v = p.viewport, m = p.model, row = m.rowOf("r0.1.3");
+            v.show(m.x[row], m.y[row]); v.scale = {scale}; p.frame();
+            const [x, y] = v.toScreen(m.x[row], m.y[row]), texts = p.labels.texts;
+            return [texts.map(one => one.text), texts.filter(one => one.left < x + 10
+              && one.left + one.wide > x - 10 && one.base - 11 < y + 10 && one.base + 3 > y - 10)
+              .map(one => one.text)]
+        """)
+        assert (texts.count("r0.1.3"), within) == (1, []), scale
+
+
+@pytest.mark.parametrize("width", [320, 900, 1280])
+def test_a_number_and_its_unit_are_on_one_line(page: Browser, width: int) -> None:
+    """Beside the scroll bar of a long answer, the m of the lens's height was on a line of its own."""
+    page.look(width, 800)
+    try:
+        page.run("document.getElementById('tab-photo').click();"
+                 "document.getElementById('answer').style.minHeight = '2000px'")  # fmt: skip
+        lines = page.run("""
+            return ["height_m", "hfov"].map(name => {
+              const input = document.getElementById(name), unit = document.createRange();
+              unit.selectNode(input.nextSibling);
+              return unit.getBoundingClientRect().top < input.getBoundingClientRect().bottom;
+            })
+        """)
+    finally:
+        page.look(420, 800)
+    assert lines == [True, True]
+
+
 def test_a_browser_that_cannot_draw_says_so(page: Browser) -> None:
     assert page.run("return document.getElementById('undrawn').hidden")
     page.run("mapweave.painter.worker.dispatchEvent(new ErrorEvent('error'))")
