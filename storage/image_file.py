@@ -94,11 +94,7 @@ def check_cost(data: bytes) -> None:
     Raises:
         InvalidValue: it is too large, or no PNG, JPEG, PGM or BMP.
     """
-    width, height = image_size(data)
-    if width * height > MAX_PIXELS:
-        raise InvalidValue(
-            f"an image of {width}x{height} px is too large: at most {MAX_PIXELS / 1e6:g} megapixels"
-        )
+    check_size(*image_size(data))
     if data.startswith(b"\xff\xd8") and data.count(b"\xff\xda") > MAX_SCANS:
         raise InvalidValue(f"a JPEG of more than {MAX_SCANS} scans takes too long to decode")
     to_end(data)
@@ -111,7 +107,9 @@ def check_size(width: int, height: int) -> None:
         InvalidValue: it is too large.
     """
     if width * height > MAX_PIXELS:
-        raise InvalidValue(f"an image of {width}x{height} px is too large, at most {MAX_PIXELS} are taken")
+        raise InvalidValue(
+            f"an image of {width}x{height} px is too large: at most {MAX_PIXELS / 1e6:g} megapixels"
+        )
 
 
 def to_end(data: bytes) -> bytes:

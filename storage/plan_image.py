@@ -17,6 +17,8 @@ from mapweave.storage.os_errors import unreadable
 
 WITH_ALPHA = (4, 6)
 """Colour types of PNG files with transparency."""
+STRIP = 64
+"""Rows that are worked on at once."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -61,9 +63,9 @@ def plan_file(data: bytes, name: str = "", negate: bool = False) -> PlanFile:
     import cv2
 
     check_cost(data)
-    pixels = _pixels(data)
-    if max(pixels.shape[:2]) > MAX_SIDE:
+    if max(image_size(data)) > MAX_SIDE:
         raise InvalidValue(f"a plan has at most {MAX_SIDE} px a side: make it smaller")
+    pixels = _pixels(data)
     done, png = cv2.imencode(".png", 255 - pixels if negate else pixels, [cv2.IMWRITE_PNG_COMPRESSION, 6])
     if not done or len(png) > MAX_BYTES:
         raise InvalidValue(f"the plan takes more than {MAX_BYTES >> 20} MiB as PNG: make it smaller")
@@ -110,12 +112,22 @@ def _pixels(data: bytes) -> NDArray[np.uint8]:
         image = None
     if image is None:
         raise InvalidValue("the image is damaged")
-    if image.dtype != np.uint8:
-        image = np.right_shift(image.astype(np.uint16), 8).astype(np.uint8)
+    if image.dtype == np.uint16:
+        image = np.right_shift(image, 8, out=image).astype(np.uint8)
     if png_with_alpha and image.ndim == 3 and image.shape[2] in (2, 4):
-        alpha = image[:, :, -1:].astype(np.float32) / 255.0
-        image = np.rint(image[:, :, :-1] * alpha + 255.0 * (1.0 - alpha)).astype(np.uint8)
+        image = _on_white(np.asarray(image, np.uint8))
     return np.asarray(image[:, :, 0] if image.ndim == 3 and image.shape[2] == 1 else image, np.uint8)
+
+
+def _on_white(image: NDArray[np.uint8]) -> NDArray[np.uint8]:
+    """(H, W, C) of (H, W, C + 1), whose last channel is how opaque each pixel is."""
+    out = np.empty((*image.shape[:2], image.shape[2] - 1), np.uint8)
+    # All rows at once would take eight times the memory of the image.
+    for top in range(0, len(image), STRIP):
+        strip = image[top : top + STRIP]
+        alpha = strip[:, :, -1:].astype(np.float32) / 255.0
+        out[top : top + STRIP] = np.rint(strip[:, :, :-1] * alpha + 255.0 * (1.0 - alpha))
+    return out
 
 
 def _is_transparent(png: bytes) -> bool:

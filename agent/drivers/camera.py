@@ -19,7 +19,8 @@ from numpy.typing import NDArray
 
 from mapweave.agent.drivers.clock import now_ns, of_monotonic_ns
 from mapweave.agent.drivers.settings import CameraSettings
-from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
+from mapweave.storage.image_file import check_size
 
 log = logging.getLogger(__name__)
 
@@ -131,6 +132,14 @@ class Capture:
             raise DeviceError(
                 f"camera {source}: cannot be opened; is it connected, and not in use by another program?"
             )
+        try:
+            # Later frames of another size are scaled to the first one's.
+            check_size(
+                *(int(capture.get(of)) for of in (cv2.CAP_PROP_FRAME_WIDTH, cv2.CAP_PROP_FRAME_HEIGHT))
+            )
+        except InvalidValue as error:
+            capture.release()
+            raise DeviceError(f"camera {source}: {error}") from None
         return capture
 
     # In the camera's thread.

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave.agent.recordings.bounded_decompression import limit_rosbags
 from mapweave.agent.recordings.camera_info_check import doubts
 from mapweave.agent.recordings.damaged_bag import DamagedBag, full_type, standard_messages
 from mapweave.agent.recordings.geometry_file import LIMITS
@@ -153,6 +154,7 @@ class WholeBag:
         """
         from rosbags.highlevel import AnyReader
 
+        limit_rosbags()
         ros1 = path.suffix == ".bag"
         self._is_sqlite = any(file.suffix.lower() == ".db3" for file in files_of(path))
         self._standard = standard_messages(ros1)

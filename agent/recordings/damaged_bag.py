@@ -15,6 +15,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from mapweave.agent.recordings.bounded_decompression import MOST_BYTES, limit_rosbags
 from mapweave.hybridmap.errors import DeviceError
 
 Item = tuple[int, str, str] | tuple[int, int, bytes]
@@ -108,6 +109,7 @@ def _format_of(path: Path) -> tuple[Callable[[Path], Iterator[Item]], bool]:
 def _mcap(path: Path) -> Iterator[Item]:
     from rosbags.rosbag2.storage_mcap import decompress
 
+    limit_rosbags()
     with path.open("rb") as file:
         file.seek(len(MCAP_MAGIC))
         schemas: dict[int, str] = {}
@@ -115,15 +117,18 @@ def _mcap(path: Path) -> Iterator[Item]:
 
 
 def _mcap_records(
-    file: BinaryIO, schemas: dict[int, str], decompress: Callable[..., bytes]
+    file: BinaryIO, schemas: dict[int, str], decompress: Callable[..., bytes] | None
 ) -> Iterator[Item]:
+    """The items of a file, or, without `decompress`, of a chunk: there are no chunks in chunks."""
     while len(head := file.read(9)) == 9 and head[0] != MCAP_DATA_END:
         (size,) = struct.unpack("<Q", head[1:])
         content = _read(file, size)
         whole = len(content) == size
         try:
             if head[0] == MCAP_CHUNK:
-                yield from _mcap_records(_mcap_chunk(content, whole, decompress), schemas, decompress)
+                if decompress is None:
+                    return
+                yield from _mcap_records(_mcap_chunk(content, whole, decompress), schemas, None)
             elif whole and head[0] == MCAP_SCHEMA:
                 schemas[struct.unpack_from("<H", content)[0]] = _text(content, 2)[0]
             elif whole and head[0] == MCAP_CHANNEL:
@@ -158,12 +163,14 @@ def _text(content: bytes, at: int) -> tuple[str, int]:
 def _ros1(path: Path) -> Iterator[Item]:
     from rosbags.rosbag1.reader import decompressors
 
+    limit_rosbags()
     with path.open("rb") as file:
         file.seek(len(ROS1_MAGIC))
         yield from _ros1_records(file, decompressors)
 
 
 def _ros1_records(file: BinaryIO, decompressors: Any) -> Iterator[Item]:
+    """The items of a file, or, without `decompressors`, of a chunk."""
     while len(length := file.read(4)) == 4:
         try:
             fields = _ros1_fields(_read(file, struct.unpack("<I", length)[0]))
@@ -171,10 +178,12 @@ def _ros1_records(file: BinaryIO, decompressors: Any) -> Iterator[Item]:
             content = _read(file, size)
             whole, kind = len(content) == size, fields[b"op"][0]
             if kind == ROS1_CHUNK:
+                if decompressors is None:
+                    return
                 compression = fields[b"compression"].decode()
                 if whole or compression == "none":
                     inside = decompressors[compression](content) if whole else content
-                    yield from _ros1_records(io.BytesIO(inside), decompressors)
+                    yield from _ros1_records(io.BytesIO(inside), None)
             elif whole and kind == ROS1_CONNECTION:
                 name = _ros1_fields(content)[b"type"].decode().replace("/", "/msg/")
                 yield struct.unpack("<I", fields[b"conn"])[0], fields[b"topic"].decode(), name
@@ -218,9 +227,6 @@ def _sqlite(path: Path) -> Iterator[Item]:
         file.close()
 
 
-MOST_BYTES = 1 << 28
-"""Of one record: a damaged length would otherwise ask for all memory there is."""
-
-
 def _read(file: BinaryIO, size: int) -> bytes:
+    # A damaged length would otherwise ask for all memory there is.
     return file.read(min(size, MOST_BYTES))

@@ -15,8 +15,9 @@ from mapweave.agent.recordings.incomplete import complete
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.recordings.pose_files import read_poses
 from mapweave.agent.recordings.recording import Images, Recording
-from mapweave.hybridmap.errors import DeviceError
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.hybridmap.limits import MAX_STAMP_NS
+from mapweave.storage.image_file import check_size
 
 SUFFIXES = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
 
@@ -47,7 +48,7 @@ def video_images(path: Path) -> Images:
     Raises:
         DeviceError: it cannot be read.
     """
-    capture = cv2.VideoCapture(str(path))
+    capture = _opened(path)
     stamps: list[int] = []
     while _grabbed(capture):
         stamp = 1e6 * capture.get(cv2.CAP_PROP_POS_MSEC)
@@ -65,6 +66,20 @@ def video_images(path: Path) -> Images:
         assumed = "" if rate > 0 else f"frames without stamps: {ASSUMED_RATE:g} images a second are assumed"
         stamps = [round(1e9 * k / (rate if rate > 0 else ASSUMED_RATE)) for k in range(len(stamps))]
     return Images(np.array(stamps, np.int64), _sequential(path), damage, assumed)
+
+
+def _opened(path: Path) -> cv2.VideoCapture:
+    """Open a video.
+
+    Raises:
+        DeviceError: its frames are too large to be decoded.
+    """
+    capture = cv2.VideoCapture(str(path))
+    try:
+        check_size(int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
+    except InvalidValue as error:
+        raise DeviceError(f"{path}: {error}") from None
+    return capture
 
 
 def _grabbed(capture: cv2.VideoCapture) -> bool:
@@ -99,7 +114,7 @@ def _sequential(path: Path) -> Callable[[int], NDArray[np.uint8]]:
     def read(k: int) -> NDArray[np.uint8]:
         nonlocal at
         if "capture" not in state or k < at:
-            state["capture"], at = cv2.VideoCapture(str(path)), 0
+            state["capture"], at = _opened(path), 0
         while at < k and _grabbed(state["capture"]):
             at += 1
         try:

@@ -14,6 +14,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.sim import printed_textures as printed
 from mapweave.sim import shelving, signage, surface
 from mapweave.sim.texture import Image, Painter
+from mapweave.storage.image_file import decode_grey, image_size
 
 MAX_IMAGE_PX = 8192
 """Pictures have at most so many pixels across and down."""
@@ -182,17 +183,15 @@ def _read(path: Path, where: str) -> Image:
     try:
         if path.stat().st_size > MAX_IMAGE_BYTES:
             raise InvalidValue(f"{where}: {path} is larger than {MAX_IMAGE_BYTES >> 20} MiB")
-        packed = np.frombuffer(path.read_bytes(), np.uint8)
+        data = path.read_bytes()
     except FileNotFoundError:
         raise InvalidValue(f"{where}: no picture {path}") from None
     except (OSError, ValueError) as error:  # ValueError: a name with a zero byte
         raise InvalidValue(f"{where}: {path}: {error}") from None
     try:
-        image = cv2.imdecode(packed, cv2.IMREAD_GRAYSCALE) if len(packed) else None
-    except cv2.error:
-        image = None
-    if image is None:
-        raise InvalidValue(f"{where}: {path} is no PNG or JPEG picture")
-    if max(image.shape) > MAX_IMAGE_PX:
-        raise InvalidValue(f"{where}: {path} has more than {MAX_IMAGE_PX} pixels across or down")
-    return np.asarray(image, np.uint8)
+        width, height = image_size(data)
+        if max(width, height) > MAX_IMAGE_PX:
+            raise InvalidValue(f"more than {MAX_IMAGE_PX} pixels across or down")
+        return decode_grey(data)
+    except InvalidValue as error:
+        raise InvalidValue(f"{where}: {path} is no PNG or JPEG picture that can be used ({error})") from None

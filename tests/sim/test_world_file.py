@@ -193,6 +193,16 @@ def test_errors_are_reported_in_one_line(text: str, says: str, tmp_path: Path) -
     assert "\n" not in str(caught.value)
 
 
+def test_a_bomb_of_pixels_is_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A PNG of 1 MB may have 30000x30000 px."""
+    png = bytearray(cv2.imencode(".png", np.zeros((4, 4), np.uint8))[1].tobytes())
+    png[16:24] = (30_000).to_bytes(4, "big") * 2
+    (tmp_path / "mine.png").write_bytes(png)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(MapweaveError, match=r"mine\.png .*more than 8192 pixels across or down"):
+        load(tmp_path, ROOM + FURNITURE + "texture = 'mine.png'")
+
+
 def test_a_missing_file_is_reported_in_one_line(tmp_path: Path) -> None:
     """Its name, and that it is not there."""
     with pytest.raises(MapweaveError, match=r"gone\.toml: no such file"):

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import tracemalloc
 import zlib
 from pathlib import Path
 
@@ -13,7 +14,7 @@ import pytest
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.pose import Pose2
 from mapweave.storage.nav2_map import read_nav2_map
-from mapweave.storage.plan_image import check_plan_png, plan_file, plan_pixels, read_plan_file
+from mapweave.storage.plan_image import _on_white, check_plan_png, plan_file, plan_pixels, read_plan_file
 
 GREY = np.arange(48, dtype=np.uint8).reshape(6, 8) * 5
 COLOUR = np.dstack([GREY, 255 - GREY, GREY // 2])
@@ -66,6 +67,29 @@ def test_a_transparent_colour_of_a_palette_is_white() -> None:
         chunk(b"IDAT", zlib.compress(bytes([0, 0, 1, 0]))), chunk(b"IEND", b""),
     ])  # fmt: skip
     assert in_colour(plan_pixels(plan_file(png).png))[0, :, 0].tolist() == [255, 0, 255]
+
+
+def test_a_long_plan_is_refused_before_it_is_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+    long = bytearray(cv2.imencode(".png", GREY)[1].tobytes())
+    long[16:24] = (20_001).to_bytes(4, "big") + (2_000).to_bytes(4, "big")
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(InvalidValue, match="at most 20000 px a side"):
+        plan_file(bytes(long))
+
+
+def test_a_large_transparent_plan_takes_no_more_memory_than_its_pixels() -> None:
+    """A PNG of 50 kB with 50 million pixels took 1.8 GB: all of it as numbers of four bytes, twice."""
+    rows = 4096
+    image = np.zeros((rows, 1000, 4), np.uint8)
+    image[:, :, 3] = np.arange(rows)[:, None] % 256
+    image[:, :, :3] = 200
+    tracemalloc.start()
+    white = _on_white(image)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    expected = np.rint(200 * (np.arange(rows) % 256) / 255.0 + 255.0 - np.arange(rows) % 256)
+    assert np.abs(white.astype(float) - expected[:, None, None]).max() <= 1.0
+    assert peak < 1.5 * white.nbytes
 
 
 def test_no_image_and_too_large_ones_are_refused(tmp_path: Path) -> None:

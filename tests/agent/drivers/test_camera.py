@@ -266,6 +266,18 @@ def test_a_device_with_images_of_another_format_is_reported_once(
     assert line.startswith("camera /dev/video2 delivers no images (") and line.endswith("; opening it again")
 
 
+def test_a_source_of_too_many_pixels_is_refused_before_a_frame_is_decoded(
+    clip: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    device = Device(True)
+    device.properties |= {cv2.CAP_PROP_FRAME_WIDTH: 16_000.0, cv2.CAP_PROP_FRAME_HEIGHT: 16_000.0}
+    monkeypatch.setattr("cv2.VideoCapture", lambda *_: device)
+    monkeypatch.setattr(Device, "grab", lambda _: pytest.fail("it was decoded"))
+    with pytest.raises(DeviceError, match=r"clip.*: an image of 16000x16000 px is too large: at most"):
+        Capture(settings(clip))
+    assert device.released
+
+
 @pytest.mark.parametrize("locks", [True, False])
 def test_a_device_is_stamped_by_its_driver_and_its_exposure_locked(
     locks: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
