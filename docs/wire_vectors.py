@@ -70,6 +70,7 @@ from mapweave.wire.log_messages import (
     Mark,
     NewestMap,
     Refusal,
+    StoredChange,
     decode_record,
     encode_record,
 )
@@ -387,8 +388,10 @@ def changes() -> list[dict[str, Any]]:
     small: tuple[tuple[str, str, Any], ...] = (
         ("beacon", KEYS.head(MAP), Head(2**63, 1008, {"s0": 1000, "s1": 1008})),
         ("log question", KEYS.log(MAP), LogRequest(1003, 1008)),
+        ("log question", KEYS.log(MAP), LogRequest(1003, 1008, StoredChange(1001, 7))),
         ("log answer", KEYS.log(MAP), LogAnswer(2**63, 1003, 1008, ((1007, made[7]), (1008, b"")))),
         ("acknowledgement", KEYS.ack("s0", "r0"), Ack(MAP, 2**63, 1005, (Refusal(1004, "none"),), 77, 2.5)),
+        ("acknowledgement", KEYS.ack("s0", "r0"), Ack(MAP, 5, 1005, stored=StoredChange(1003, 2**32 - 1))),
         ("newest map", KEYS.ack("s0", "r0"), NewestMap(3)),
         ("kept nodes", KEYS.ack("s0", "r0"), KeptNodes(2, (1, 4, 1000))),
         ("newest map", KEYS.ack("s0", "r0"), NewestMap(3, pruned=True)),

@@ -73,6 +73,13 @@ class Mark:
         return Mark(sequence, log_id)
 
 
+class StoredChange(msgspec.Struct, frozen=True, array_like=True):
+    """A change that a server has stored of a log: its number, and the CRC-32 of its body."""
+
+    sequence: Sequence
+    crc: Annotated[int, Meta(ge=0, lt=2**32)]
+
+
 class LogMessage(msgspec.Struct, frozen=True, omit_defaults=True):
     """Any of them."""
 
@@ -124,6 +131,8 @@ class Ack(LogMessage, frozen=True):
         store: random, drawn when the server's store was made; 0 if unknown. A server that has lost its store
             acknowledges with another, and less.
         status_period: least time between two statuses, s, if the server has too many robots for more; else 0.
+        stored: the newest change up to the watermark, if the robot did not know the watermark; else None. See
+            LogRequest.
     """
 
     limit = Limit("ack", MAX_SMALL_BYTES)
@@ -133,6 +142,7 @@ class Ack(LogMessage, frozen=True):
     refusals: Annotated[tuple[Refusal, ...], Meta(max_length=MAX_REFUSALS)] = field(name="r", default=())
     store: Annotated[int, Meta(ge=0, le=2**63 - 1)] = field(name="s", default=0)
     status_period: Annotated[float, Meta(ge=0.0, le=LONGEST_STATUS_PERIOD)] = field(name="p", default=0.0)
+    stored: StoredChange | None = field(name="d", default=None)
 
     def encode(self) -> bytes:
         """The message as bytes, with the newest refusals and the beginning of their reasons."""
@@ -168,11 +178,19 @@ class KeptNodes(LogMessage, frozen=True):
 
 
 class LogRequest(LogMessage, frozen=True):
-    """A server asks for the changes first to last, both included."""
+    """A server asks for the changes first to last, both included.
+
+    Attributes:
+        first: the first one.
+        last: the last one.
+        stored: the newest change before the first that the server has; None if it has none. A robot of which
+            the disk was put back has another change by that number.
+    """
 
     limit = Limit("log request", MAX_SMALL_BYTES)
     first: Sequence = field(name="f")
     last: Sequence = field(name="q")
+    stored: StoredChange | None = field(name="d", default=None)
 
     def __post_init__(self) -> None:
         """Refuse what is no range (InvalidValue)."""

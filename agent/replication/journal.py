@@ -20,6 +20,7 @@ from mapweave.hybridmap.mission_order import MAX_KEPT, MissionReport, Missions
 from mapweave.storage.database import Database
 from mapweave.wire.codec import decode_body, element_of, encode_body, puts_node, wrap_body
 from mapweave.wire.keys import check_epoch
+from mapweave.wire.log_messages import StoredChange
 from mapweave.wire.messages import decode, encode
 
 log = logging.getLogger(__name__)
@@ -227,6 +228,15 @@ class Journal:
         """Sequence number of the newest change, 0 if there is none."""
         query = "SELECT coalesce(max(sequence), 0) FROM change WHERE epoch = ?"
         return int(self._read(query, self._epoch(map_id))[0][0])
+
+    def contradicts(self, map_id: MapId, stored: StoredChange) -> bool:
+        """Whether a log has another change by a number than a server has.
+
+        One that was dropped since, or that the disk has damaged, contradicts nothing.
+        """
+        query = "SELECT body, crc FROM change WHERE epoch = ? AND sequence = ?"
+        rows = self._read(query, (*self._epoch(map_id), stored.sequence))
+        return any(_body_holds(body, crc) and crc & 0xFFFFFFFF != stored.crc for body, crc in rows)
 
     def append(self, map_id: MapId, bodies: Iterable[ChangeBody], stamp_ns: int) -> list[Change]:
         """Write changes in one transaction; they are on the disk when this returns.

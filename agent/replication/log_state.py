@@ -60,8 +60,8 @@ class LogState:
         stores: by which id each server's store was known last, see mapweave.wire.log_messages.Ack.
         status_periods: that each server wants, s, likewise.
         sent: changes that others may have: those that were there when this began, and what left since.
-        put_back: whether a server has changes that have not left: the disk was put back to an older state,
-            and what is there instead has the same numbers.
+        put_back: whether a server has changes that have not left, or others than are here: the disk was put
+            back to an older state, and what is there instead has the same numbers.
         left: when which server was first heard of with another store than this one, in the last `LATE`; s of
             the monotonic clock.
     """
@@ -87,7 +87,7 @@ class LogState:
         """The state as the journal has it; raises InvalidValue if the map was never opened."""
         state = LogState(map_id, journal.log_id(map_id), journal.head(map_id), journal.acknowledged(map_id))
         if journal.was_put_back(map_id):
-            state.put_back, state.failure = True, PUT_BACK.format("a server", map_id)
+            state.lost_changes("a server")
         return state
 
     def settled(self, servers: Sequence[str]) -> int:
@@ -123,6 +123,13 @@ class LogState:
             self.left[server, before] = now
         return ack.watermark < self.acknowledged.get(server, 0)
 
+    def lost_changes(self, server: str) -> bool:
+        """Take note that a server has changes that this disk has lost; whether that is new."""
+        if self.put_back:
+            return False
+        self.put_back, self.failure = True, PUT_BACK.format(server, self.map)
+        return True
+
     def take(self, server: str, ack: Ack) -> list[str]:
         """Note the contents of an acknowledgement other than its watermark.
 
@@ -140,9 +147,4 @@ class LogState:
         if self.failure.startswith(f"{server}: ") and all(refusal.sequence for refusal in ack.refusals):
             # It takes the log again, for example since it has room for it.
             self.failure = ""
-        if ack.watermark > self.sent.whole and not self.put_back:
-            # New changes have numbers that the server has seen, and it drops them as doubles.
-            self.put_back = True
-            self.failure = PUT_BACK.format(server, self.map)
-            news.append(self.failure)
         return news

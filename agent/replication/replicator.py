@@ -27,7 +27,7 @@ from mapweave.storage.full_disks import logged
 from mapweave.wire.bus import Bus, Request, Sample
 from mapweave.wire.codec import wrap_body
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import MAX_ROWS, Ack, LogAnswer, LogRequest, Mark
+from mapweave.wire.log_messages import MAX_ROWS, Ack, LogAnswer, LogRequest, Mark, StoredChange
 
 log = logging.getLogger(__name__)
 
@@ -385,15 +385,22 @@ class Replicator:
         state = self._logs.get(ack.map)
         if state is None or ack.log_id != state.log_id or state.outdated(server, ack):
             return
-        was_put_back = state.put_back
+        try:
+            contradicted = self._contradicts(state, ack.stored)
+        except InvalidFile as error:
+            # Nothing is acknowledged by what cannot be compared: the next beacon asks again.
+            if not logged(error):
+                log.warning("%s", error)
+            return
         with self._changed:
             news = state.take(server, ack)
             lost = state.lost(server, ack)
         for line in news:
             log.warning("%s", line)
+        # New changes have numbers that the server has seen, and it drops them as doubles.
+        if contradicted or ack.watermark > state.sent.whole:
+            self._note_put_back(state, server)
         if state.put_back:
-            if not was_put_back:
-                self._note_put_back(state)
             return
         if lost:
             # It is to know how much it had: what was retired meanwhile may have been dropped here.
@@ -437,8 +444,15 @@ class Replicator:
             self._next_beacon = self._everyone_at
             self._beacon_after(self._ack_timer.timeout)
 
-    def _note_put_back(self, state: LogState) -> None:
-        """After the next start all that is on the disk may have left."""
+    def _contradicts(self, state: LogState, stored: StoredChange | None) -> bool:
+        return stored is not None and self._journal.contradicts(state.map, stored)
+
+    def _note_put_back(self, state: LogState, server: str) -> None:
+        """A server has changes that this disk has lost: all that is here may have left by the next start."""
+        with self._changed:
+            if not state.lost_changes(server):
+                return
+        log.warning("%s", state.failure)
         try:
             self._journal.note_put_back(state.map)
         except InvalidFile as error:
@@ -475,6 +489,8 @@ class Replicator:
             state = self._logs.get(self._keys.parse_log(question.key))
             if state is None:
                 raise InvalidMessage(f"{question.key}: no such log")
+            if self._contradicts(state, asked.stored):
+                self._note_put_back(state, "a server")
             if state.put_back or asked.first > state.sent.whole + 1:
                 # Who has all before that has it from a disk of before; its acknowledgement is awaited.
                 raise InvalidMessage(f"{question.key}: this disk has other changes before {asked.first}")

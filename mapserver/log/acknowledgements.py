@@ -47,18 +47,21 @@ class Acknowledgements:
         """
         return self._bus.serve(self._keys.all_acks(self._name), self._tell_newest)
 
-    def acknowledge(self, agent_log: AgentLog) -> None:
-        """Notify an agent of what is settled."""
-        watermark, refusals = agent_log.watermark, agent_log.refusals
+    def acknowledge(self, agent_log: AgentLog, compared: bool = False) -> None:
+        """Notify an agent of what is settled.
+
+        Args:
+            agent_log: of which.
+            compared: with the newest change, so that the agent sees whether its log has it.
+
+        Raises:
+            InvalidFile: the store cannot be read, where it is compared.
+        """
+        map_id, watermark = agent_log.map, agent_log.watermark
+        period = self._status_period(map_id.agent)
+        stored = self._store.newest_change(map_id, watermark) if compared else None
         self._send(
-            Ack(
-                agent_log.map,
-                agent_log.log_id,
-                watermark,
-                refusals,
-                self._store.id,
-                self._status_period(agent_log.map.agent),
-            )
+            Ack(map_id, agent_log.log_id, watermark, agent_log.refusals, self._store.id, period, stored)
         )
 
     def refuse(self, map_id: MapId, log_id: int, reason: str, watermark: int = 0) -> None:

@@ -130,9 +130,12 @@ class Ingest:
         self._group = GroupCommit(store, self._intakes)
         self._acks = Acknowledgements(bus, keys, server_name, store, taken, status_period, pruned)
         self._pieces = Pieces()
-        self._puller = Puller(bus, keys, self._intakes, unmerged, s.ask_timeout, self._put_pulled)
+        self._puller = Puller(
+            bus, keys, self._intakes, unmerged, store.newest_change, s.ask_timeout, self._put_pulled
+        )
         self._pulls = self._puller.schedule
-        self._unaware: dict[MapId, AgentLog] = {}
+        # Logs that are acknowledged once more; and whether the robot does not know how far it was.
+        self._unaware: dict[MapId, tuple[AgentLog, bool]] = {}
         self._work: Inbox[Sample | Pulled | PulledChanges | News | Reminder] = Inbox()
         self._follower = Follower(
             store, self._logs, self._intakes, self._pulls, s.pull, self._pass_on, note_refusal
@@ -258,7 +261,7 @@ class Ingest:
                 reminded = self._logs.get(item.map)
                 # What is not settled is acknowledged, or refused, anyway.
                 if reminded is not None and reminded.newest <= reminded.watermark:
-                    self._unaware[item.map] = reminded
+                    self._unaware.setdefault(item.map, (reminded, False))
                 return None
             if item.attachment:
                 return self._take_change(item)
@@ -313,7 +316,7 @@ class Ingest:
         if (had := head.acknowledged.get(self._name, 0)) != agent_log.watermark:
             self._compare_if_older(agent_log, had)
             # Behind the commit of this turn, which may be acknowledged anyway.
-            self._unaware[agent_log.map] = agent_log
+            self._unaware[agent_log.map] = agent_log, True
         return agent_log
 
     def _compare_if_older(self, agent_log: AgentLog, acknowledged: int) -> None:
@@ -409,13 +412,16 @@ class Ingest:
                 self._observe_ack(time.monotonic() - at)
             if run.full is not None:
                 self._rest(run.log, run.full)
-        self._acknowledge_unaware([*self._unaware.values()])
+        self._acknowledge_unaware([agent_log for agent_log, _ in self._unaware.values()])
 
     def _acknowledge_unaware(self, logs: Iterable[AgentLog]) -> None:
         """Before a refusal, which an acknowledgement behind it would take back."""
         for agent_log in logs:
-            if self._unaware.pop(agent_log.map, None) is not None:
-                self._acks.acknowledge(agent_log)
+            if (unaware := self._unaware.pop(agent_log.map, None)) is not None:
+                try:
+                    self._acks.acknowledge(*unaware)
+                except InvalidFile as error:  # the next beacon asks once more
+                    self._commit_failed(agent_log, error)
 
     def _recover(self, agent_log: AgentLog, first: int, piece: PulledChanges) -> None:
         """Put damaged changes in their places again, or verify others, and pass on what that changes."""

@@ -7,13 +7,18 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
+import msgspec
+
+from mapweave.hybridmap.errors import InvalidFile
+from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.intake import Intakes
 from mapweave.mapserver.log.pull_schedule import AT_ONCE, PullSchedule
 from mapweave.mapserver.log.pulled import Pulled
+from mapweave.storage.full_disks import logged
 from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import LogRequest
+from mapweave.wire.log_messages import LogRequest, StoredChange
 
 log = logging.getLogger(__name__)
 
@@ -31,6 +36,7 @@ class Puller:
         keys: Keys,
         intakes: Intakes,
         unmerged: Callable[[str], int],
+        newest_change: Callable[[MapId, int], StoredChange | None],
         ask_timeout: float,
         answered: Callable[[Pulled], None],
     ) -> None:
@@ -41,12 +47,14 @@ class Puller:
             keys: of the fleet.
             intakes: how much is taken of each robot.
             unmerged: how many changes of a robot were passed on and wait.
+            newest_change: up to a number of a log that is stored; called in one of the threads.
             ask_timeout: for a piece of a log, s.
             answered: called in one of the threads.
         """
         self.schedule = PullSchedule()
         self._bus, self._keys, self._intakes = bus, keys, intakes
         self._unmerged, self._timeout, self._answered = unmerged, ask_timeout, answered
+        self._newest_change = newest_change
         self._threads = ThreadPoolExecutor(AT_ONCE, thread_name_prefix="pull")
 
     def start(self) -> int:
@@ -73,7 +81,12 @@ class Puller:
         """Pull changes, in a thread of its own, because an agent may be slow."""
         replies: list[Reply] = []
         try:
+            stored = self._newest_change(agent_log.map, asked.first - 1)
+            asked = msgspec.structs.replace(asked, stored=stored)
             replies = self._bus.ask(self._keys.log(agent_log.map), asked.encode(), self._timeout)
+        except InvalidFile as error:
+            if not logged(error):
+                log.warning("%s", error)
         except Exception:  # without an end the robot would count as asked, and not be asked again
             log.exception("asking for %s failed", agent_log.map)
         self._answered(Pulled(agent_log, asked, replies))

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import logging
 import secrets
+import zlib
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from copy import copy
@@ -22,7 +23,7 @@ from mapweave.mapserver.log.entry import Applied, Position, ReceivedChange
 from mapweave.mapserver.log.sql_repairs import SqlRepairs, marks_of, numbers_of
 from mapweave.storage.full_disks import logged
 from mapweave.wire.codec import decode_body, element_of, unwrap_body
-from mapweave.wire.log_messages import Refusal
+from mapweave.wire.log_messages import Refusal, StoredChange
 
 log = logging.getLogger(__name__)
 
@@ -175,6 +176,15 @@ class Store(SqlRepairs):
         """Up to which change the log is settled, 0 without a log."""
         rows = self._read("SELECT watermark FROM log WHERE agent = ? AND epoch = ?", map_id)
         return int(rows[0][0]) if rows else 0
+
+    def newest_change(self, map_id: MapId, watermark: int) -> StoredChange | None:
+        """The newest change up to the watermark that is stored; None if there is none."""
+        query = (
+            "SELECT sequence, body FROM change WHERE agent = ? AND epoch = ? AND sequence <= ? "
+            "ORDER BY sequence DESC LIMIT 1"
+        )
+        rows = self._read(query, (*map_id, watermark))
+        return StoredChange(rows[0][0], zlib.crc32(rows[0][1])) if rows else None
 
     def apply(
         self, map_id: MapId, log_id: int, entries: Sequence[ReceivedChange], covered: int | None = None

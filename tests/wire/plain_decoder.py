@@ -334,7 +334,7 @@ class Plain:
 
     def _log_question(self, data: bytes) -> Any:
         fields = message(data)
-        return {"first": fields["f"], "last": fields["q"]}
+        return {"first": fields["f"], "last": fields["q"], "stored": self._stored(fields)}
 
     def _log_answer(self, data: bytes) -> Any:
         fields = message(data)
@@ -348,7 +348,11 @@ class Plain:
             "map": fields["m"], "log_id": fields["l"], "watermark": fields["q"], "refusals": refusals,
             "store": fields.get("s", 0),
             "status_period": fields.get("p", 0.0),
+            "stored": self._stored(fields),
         }  # fmt: skip
+
+    def _stored(self, fields: dict[str, Any]) -> Any:
+        return dict(zip(("sequence", "crc"), fields["d"], strict=True)) if "d" in fields else None
 
     def _newest_map(self, data: bytes) -> Any:
         fields = message(data)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import zlib
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -16,7 +17,8 @@ from mapweave.mapserver.log.entry import Applied, ReceivedChange
 from mapweave.mapserver.log.inbox import MOST
 from mapweave.mapserver.log.ingest_settings import IngestSettings
 from mapweave.wire.bus import Sample
-from mapweave.wire.log_messages import Ack, LogRequest
+from mapweave.wire.codec import unwrap_body
+from mapweave.wire.log_messages import Ack, LogRequest, StoredChange
 from mapweave.wire.memory import MemoryHub
 from tests.mapserver.played import KEYS, LOG_ID, MAP, HandAgent, Server
 from tests.waiting import eventually
@@ -85,14 +87,16 @@ def test_a_gap_is_pulled_and_only_the_gap(server: Server, agent: HandAgent) -> N
     for sequence in (5, 6):
         agent.publish(sequence)
     eventually(lambda: server.sequences == [1, 2, 3, 4, 5, 6])
-    assert agent.asked == [LogRequest(2, 4)]
+    # With what it has before, by which the agent sees whether that is its log.
+    before = zlib.crc32(unwrap_body(agent.log[1])[2])
+    assert agent.asked == [LogRequest(2, 4, StoredChange(1, before))]
 
 
 def test_a_beacon_alone_brings_everything_in_chunks(server: Server, agent: HandAgent) -> None:
     agent.serve(600)
     agent.beacon(600)
     eventually(lambda: server.sequences == list(range(1, 601)))
-    assert agent.asked == [LogRequest(1, 256), LogRequest(257, 512), LogRequest(513, 600)]
+    assert [(asked.first, asked.last) for asked in agent.asked] == [(1, 256), (257, 512), (513, 600)]
     eventually(lambda: agent.acks[-1].watermark == 600)
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -81,3 +81,37 @@ def test_what_a_robot_maps_behind_an_older_journal_does_not_pass_for_what_the_se
                 assert fresh.wait_acknowledged(PATIENCE) and not fresh.status().failure
         assert contents(change.body for change in store.replay(MAP)) == had and store.watermark(MAP) == 9
         assert asked <= 2
+
+
+@pytest.mark.parametrize("count", [4, 10], ids=["as many as were lost", "more than were lost"])
+def test_so_is_what_was_mapped_without_a_network_before_the_last_start(
+    put_back: Path, hub: MemoryHub, count: int
+) -> None:
+    """All that is on the disk may have left before the start: the server says which change it has."""
+    with closing(Robot(MemoryHub(), put_back)) as robot:
+        robot.replicator.submit([node_put(number) for number in range(20, 20 + count)], 1)
+        assert robot.replicator.flush(PATIENCE) and robot.journal.head(MAP) == 5 + count
+    store = SqliteStore(put_back / "s0.sqlite")
+    had = contents(change.body for change in store.replay(MAP))
+    with closing(MemoryBus(hub)) as bus, closing(store), closing(serving(bus, store)):
+        with closing(Robot(hub, put_back)) as robot:
+            eventually(lambda: "begin a fresh map" in robot.replicator.status().failure, PATIENCE)
+            assert not robot.replicator.wait_acknowledged(1.0)
+        assert contents(change.body for change in store.replay(MAP)) == had and store.watermark(MAP) == 9
+
+
+def test_a_robot_that_has_lost_nothing_is_acknowledged_what_it_did_not_know(
+    put_back: Path, hub: MemoryHub
+) -> None:
+    """Acknowledgements were lost: its server has the same changes by their numbers."""
+    with closing(Robot(MemoryHub(), put_back)) as robot:
+        robot.replicator.submit([node_put(number) for number in range(6, 12)], 1)
+        assert robot.replicator.flush(PATIENCE)
+    store = SqliteStore(put_back / "s0.sqlite")
+    with ExitStack() as stack:
+        bus = stack.enter_context(closing(MemoryBus(hub)))
+        stack.enter_context(closing(store))
+        stack.enter_context(closing(serving(bus, store)))
+        robot = stack.enter_context(closing(Robot(hub, put_back)))
+        assert robot.replicator.wait_acknowledged(PATIENCE)
+        assert robot.journal.acknowledged(MAP) == {"s0": 11} and not robot.replicator.status().failure

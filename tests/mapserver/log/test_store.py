@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -29,7 +30,7 @@ from mapweave.mapserver.log.sql_sizes import ROW_BYTES, SqlSizes
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import LogChanges, Store
 from mapweave.wire.codec import encode_body, encode_change
-from mapweave.wire.log_messages import Refusal
+from mapweave.wire.log_messages import Refusal, StoredChange
 from synthetic.postgres_server import PostgresServer
 
 MAP, OTHER = MapId("r0", 1), MapId("r1", 1)
@@ -87,6 +88,15 @@ def test_a_log_is_compared_where_the_store_once_had_more_of_it(store: Store, ack
     store.apply(MAP, 5, [entry(k, node_put(k)) for k in range(1, 6)])
     store.doubt(MAP, acknowledged)
     assert store.unverified(MAP) == ((MAP, 1, 5) if acknowledged > 5 else None)
+
+
+def test_the_newest_change_is_known_by_its_body(store: Store) -> None:
+    store.apply(MAP, 5, [entry(1), entry(2), broken(3)])
+    second = StoredChange(2, zlib.crc32(encode_body(NodeRetired(NodeId(*MAP, 2)))))
+    assert store.newest_change(MAP, 3) == store.newest_change(MAP, 2) == second, (
+        "what was refused is not here"
+    )
+    assert store.newest_change(MAP, 1) != second and store.newest_change(MAP, 0) is None
 
 
 def test_an_unknown_map_is_empty(store: Store) -> None:
