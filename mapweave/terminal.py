@@ -32,11 +32,15 @@ _T = TypeVar("_T")
 
 
 def plain_or_terminal(stderr: bool = True, quiet: bool = False) -> Console:
-    """A console that wraps nothing where there is no terminal."""
+    """A console that wraps nothing where there is no terminal.
+
+    It reads no markup: names in files and words of robots are printed, which may look like it.
+    """
     from rich.console import Console
 
     stream = sys.stderr if stderr else sys.stdout
-    return Console(file=stream, quiet=quiet, width=None if stream.isatty() else PLAIN_WIDTH)
+    width = None if stream.isatty() else PLAIN_WIDTH
+    return Console(file=stream, quiet=quiet, width=width, markup=False)
 
 
 def log_with_time(log_format: str = "text", **fields: str) -> None:
@@ -120,7 +124,8 @@ class Bar:
             # Of a line that is too long the detail is cut, not the numbers.
             whole, rest = Column(no_wrap=True), Column(no_wrap=True, overflow="ellipsis", ratio=1)
             columns = (
-                TextColumn("{task.description}", table_column=whole), BarColumn(20, table_column=whole),
+                TextColumn("{task.description}", markup=False, table_column=whole),
+                BarColumn(20, table_column=whole),
                 MofNCompleteColumn(table_column=whole), TimeElapsedColumn(table_column=whole),
                 TextColumn("{task.fields[detail]}", markup=False, table_column=rest),
             )  # fmt: skip

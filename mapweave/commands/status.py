@@ -189,8 +189,8 @@ def table(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> Ta
         width: characters of a line; what is long is cut: words before places, and numbers never.
         plan: in the coordinates of which robots are; None: of the merged map.
     """
-    from rich.markup import escape
     from rich.table import Table
+    from rich.text import Text
 
     rows = [cells(robot, plan) for robot in _in_order(status)]
     widths = _widths(rows, width)
@@ -204,7 +204,7 @@ def table(status: FleetStatus, width: int, plan: PlacedPlan | None = None) -> Ta
             overflow="ellipsis",
         )
     for row in rows:
-        lines.add_row(*(escape(row[column]) for column in widths))
+        lines.add_row(*(Text(row[column]) for column in widths))
     return lines
 
 

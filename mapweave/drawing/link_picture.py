@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from mapweave.drawing.names import plain_text
 from mapweave.hybridmap.explanation import PairExplanation
 from mapweave.hybridmap.node import Node
 from mapweave.storage.atomic_file import write_whole
@@ -65,6 +66,7 @@ def draw_link(explanation: PairExplanation, path: Path) -> None:
         figure.legend(loc="outside lower center", ncols=4, frameon=False, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     image = io.BytesIO()
+    plain_text(figure)
     # An axis that is off does not keep room for its title.
     figure.savefig(image, format="png", bbox_inches="tight", pad_inches=0.1)
     write_whole(path, image.getvalue())

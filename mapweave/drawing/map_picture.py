@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.drawing.names import Name, draw_names
+from mapweave.drawing.names import Name, draw_names, plain_text
 from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
@@ -163,12 +163,14 @@ def draw_map(picture: MapPicture, path: Path) -> None:
         figure.legend(loc="outside lower center", ncols=6, frameon=False, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     image = io.BytesIO()
+    plain_text(figure)
     # Laid out here: matplotlib would do it again, and draw all of it once more, for each file.
     layout = ConstrainedLayoutEngine()
     for _ in range(LAYOUTS):
         layout.execute(figure)
     axes.apply_aspect()
     draw_names(axes, _names(picture), _marks(picture))
+    plain_text(figure)
     figure.savefig(image, format="png")
     write_whole(path, image.getvalue())
 

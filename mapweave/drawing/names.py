@@ -38,6 +38,14 @@ class Name:
     must: bool = False
 
 
+def plain_text(figure: Any) -> None:
+    """Draw all text of a figure as it is: matplotlib reads what stands between two $ as a formula."""
+    from matplotlib.text import Text
+
+    for text in figure.findobj(Text):
+        text.set_parse_math(False)
+
+
 def draw_names(axes: Any, names: Sequence[Name], marks: NDArray[np.float64]) -> None:
     """Write names where they fit, the first ones first; the layout of the figure must be settled.
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from rich.table import Table
+from rich.text import Text
 
 from mapweave.scenarios.figures import as_text
 from mapweave.scenarios.run import TrialResult
@@ -20,14 +21,15 @@ SHOWN = (
 
 def summary_table(scenario: Scenario, seed: int, trial: TrialResult) -> Table:
     """Verdicts first, then the figures that were measured."""
-    verdict = "[green]passed[/]" if trial.passed else "[red]failed[/]"
-    table = Table(title=f"{scenario.name}, seed {seed}: {verdict}", show_header=False)
+    verdict = Text("passed", "green") if trial.passed else Text("failed", "red")
+    table = Table(title=Text(f"{scenario.name}, seed {seed}: ") + verdict, show_header=False)
     table.add_column(justify="right", style="bold")
     table.add_column()
     judged = {row.name: row for row in trial.verdicts}
     for row in trial.verdicts:
         colour = "green" if row.good else "red"
-        table.add_row(row.name, f"[{colour}]{'as wanted' if row.good else 'NOT as wanted'}[/]: {row}")
+        words = Text("as wanted" if row.good else "NOT as wanted", colour)
+        table.add_row(row.name, words + Text(f": {row}"))
     for name in SHOWN:
         value = getattr(trial.figures, name)
         if name not in judged and value is not None:

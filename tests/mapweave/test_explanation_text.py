@@ -48,7 +48,7 @@ def test_every_number_of_the_evidence_is_next_to_its_name(explanation: PairExpla
         assert any(f"{name} {value:.3g}" in line for line in rest)
 
 
-@pytest.mark.parametrize("words", ["short", "quite long " * 60])
+@pytest.mark.parametrize("words", ["short", "quite long " * 60, r"no formula: $\frac{$"])
 def test_the_picture_holds_all_words_of_its_title(
     explanation: PairExplanation, words: str, tmp_path: Path
 ) -> None:

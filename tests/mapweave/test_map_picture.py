@@ -23,6 +23,7 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.sim.floorplan import BuildingPlan, Rectangle
+from tests.quick import first_quick
 
 NODES = {
     NodeId(agent, 1, k): Pose2(k, i, 0.2 * k) for i, agent in enumerate(("r0", "r1")) for k in range(1, 5)
@@ -75,7 +76,7 @@ def test_the_title_is_written(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "title", ["", "87 nodes, 4 maps", "87 nodes, 4 maps, 2 components\ndrawn: component 0"]
+    "title", first_quick(["87 nodes, 4 maps, 2 components\ndrawn: component 0", "87 nodes, 4 maps", ""], 1)
 )
 @pytest.mark.parametrize(("width", "height"), [(1, 1), (24, 3), (24, 11), (10, 9), (3, 24)])
 def test_nothing_is_cut_at_the_edge(tmp_path, title, width, height):
@@ -84,6 +85,13 @@ def test_nothing_is_cut_at_the_edge(tmp_path, title, width, height):
     image = drawn(tmp_path, MapPicture(title, nodes, [], starts={node.agent: nodes[node] for node in nodes}))
     edges = image[0], image[-1], image[:, 0], image[:, -1]
     assert all((edge == 255).all() for edge in edges)
+
+
+@pytest.mark.parametrize("name", [r"$\frac{$", "$" + "{" * 60 + "$", "[/b] <svg onload=x>"])
+def test_names_are_no_formulas(tmp_path, name):
+    """What people call a place or a room ended in a traceback: `$` begins a formula for matplotlib."""
+    outline = Outline(((name, np.array([[0.0, 0.0], [4.0, 0.0], [4.0, 2.0], [0.0, 2.0]])),), ())
+    assert drawn(tmp_path, MapPicture(name, NODES, EDGES, outline, places={name: (1.5, 0.5)})).size
 
 
 def test_the_floor_the_landmarks_and_the_drive_are_drawn(tmp_path):

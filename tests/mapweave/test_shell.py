@@ -22,6 +22,7 @@ from typing import Any
 import pytest
 from argcomplete.finders import CompletionFinder
 from rich.console import Console
+from rich.table import Table
 
 from mapweave import terminal
 from mapweave.cheat_sheet import as_markdown
@@ -33,7 +34,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.storage.os_errors import NO_ROOM
-from mapweave.terminal import EVERY, PLAIN_WIDTH, Bar, EventLog, tracked
+from mapweave.terminal import EVERY, PLAIN_WIDTH, Bar, EventLog, plain_or_terminal, tracked
 from synthetic.maps import looked_around, write_store
 from tests.mapweave.command_line import parsers
 from tests.waiting import eventually
@@ -230,6 +231,17 @@ def test_progress_is_a_plain_line_now_and_then_where_there_is_no_terminal() -> N
     ]
     console, file = plain()
     assert list(tracked([], "frames", console=console)) == [] and file.getvalue() == ""
+
+
+@pytest.mark.parametrize("words", ["/cam[/b]/image_raw", "[link=file:///etc/passwd]press[/]", "[red]bad"])
+def test_words_in_brackets_are_no_markup(words: str, capfd: pytest.CaptureFixture[str]) -> None:
+    """Topics of bags, names of folders and words of robots ended a command, or were links."""
+    table = Table("", title=words)
+    table.add_row(words)
+    console = plain_or_terminal(stderr=False)
+    console.print(table)
+    console.print(words)
+    assert capfd.readouterr().out.count(words) == 3
 
 
 def test_progress_goes_on_while_one_step_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
