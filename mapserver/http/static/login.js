@@ -1,5 +1,6 @@
 // Who is logged in, on a fleet with keys: GET session, POST login and logout.
 import { ask, byId } from "./dom.js";
+import { limits } from "./live.js";
 
 let shown = false, asking = null; // whether anything of the fleet is shown; a question on its way
 
@@ -8,7 +9,8 @@ export const admitted = () => asking ??= check().finally(() => { asking = null; 
 
 async function check() {
   for (;;) {
-    const answer = await ask("session");
+    // A question to a network that says nothing has no end by itself.
+    const answer = await ask("session", { signal: AbortSignal.timeout(limits.silent) });
     if (answer.status !== 401) {
       shown ||= !answer.error;
       byId("who").textContent = answer.name ? `${answer.name}, ${answer.role}` : "";

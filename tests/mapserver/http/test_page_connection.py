@@ -34,7 +34,7 @@ class Relay:
     """A network between a browser and a server, which can lose everything without a word."""
 
     def __init__(self, port: int) -> None:
-        self._server, self.works = port, True
+        self._server, self.works, self.lost = port, True, 0
         self._listening = socket.create_server(("127.0.0.1", 0))
         self.port = int(self._listening.getsockname()[1])
         self._sockets = [self._listening]
@@ -61,6 +61,7 @@ class Relay:
             while data := source.recv(65536):
                 # What was lost once is not made good by TCP: the connection says nothing any more.
                 lost = lost or not self.works
+                self.lost += lost
                 if not lost:
                     sink.sendall(data)
             if not lost:
@@ -94,6 +95,9 @@ def test_a_network_that_says_nothing_any_more_is_noticed(
     relay.works = False
     eventually(lambda: person.text("connection") == "no server, trying again")
     assert "alive" not in person.text("robots")
+    # It tries again, and what it asks for then is lost as well.
+    before = relay.lost
+    eventually(lambda: relay.lost > before)
     # The server keeps nothing of it either.
     eventually(lambda: served.connections == 0)
     services.map = less(two_maps())
