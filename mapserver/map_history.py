@@ -53,11 +53,14 @@ class MapHistory:
         self._lock = threading.Lock()
         self._kept = KeptHistory()
         self._links: Collection[Link] | None = None
+        self._stored: tuple[bytes | None, ...] = ()
+        """What may be stored: a commit that is not confirmed may be one all the same."""
         self.reload()
 
     def reload(self) -> None:
         """Read the record, which the server that leads may have written."""
         record = None if self._store is None else self._store.result(HISTORY)
+        self._stored = (record,)
         if record is not None:
             try:
                 kept = decode(record, KeptHistory)
@@ -179,7 +182,13 @@ class MapHistory:
         if self._store is None or not self._store.leads:
             return
         try:
-            self._store.put_result(HISTORY, encode(kept))
+            record = encode(kept)
+            known, self._stored = self._stored, (self._stored[0], record)
+            if self._store.replace_result(HISTORY, record, known):
+                self._stored = (record,)
+            else:
+                # Another server leads since this one stood still.
+                self.reload()
         except (InvalidFile, InvalidValue) as error:
             if not logged(error):
                 log.warning("what has happened to the maps is not kept: %s", error)

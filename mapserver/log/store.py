@@ -335,6 +335,27 @@ class Store(SqlRepairs):
         with self._transaction():
             self._put("result", (name, value))
 
+    def replace_result(self, name: str, value: bytes, known: Collection[bytes | None]) -> bool:
+        """Store another result, unless another server has written it meanwhile.
+
+        Args:
+            name: of the result.
+            value: to be stored.
+            known: what may be stored now; None: nothing.
+
+        Returns:
+            Whether it is stored: not if what is there is none of these.
+
+        Raises:
+            InvalidFile: the disk does not take it.
+        """
+        with self._transaction():
+            self._lock_table("result")
+            if self.result(name) not in known:
+                return False
+            self._put("result", (name, value))
+        return True
+
     def result(self, name: str) -> bytes | None:
         """The result of this name."""
         rows = self._read("SELECT value FROM result WHERE name = ?", (name,))

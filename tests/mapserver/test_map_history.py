@@ -188,10 +188,10 @@ def test_a_disk_that_does_not_take_it_ends_nothing(
     history = MapHistory(store)
     history.follow(one)
 
-    def full(name: str, value: bytes) -> None:
+    def full(name: str, value: bytes, known: object) -> bool:
         raise InvalidFile("the disk is full")
 
-    store.put_result = full  # type: ignore[method-assign]
+    store.replace_result = full  # type: ignore[method-assign]
     history.follow(two)
     assert events(history) == [JOINED, PARTED] and "is not kept: the disk is full" in caplog.text
     store.close()

@@ -25,6 +25,7 @@ from mapweave.mapserver.log.entry import Applied
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.store import LogChanges
+from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.server import MapServer
 from mapweave.opened_map import open_map
 from mapweave.wire.codec import encode_change
@@ -280,6 +281,22 @@ def test_a_frozen_server_does_not_lead_for_ever(address: str, monkeypatch: pytes
     eventually(lambda: not frozen.leads)
     other.close()
     frozen.close()
+
+
+def test_a_leader_that_was_frozen_writes_over_no_record_of_the_one_behind_it(
+    address: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It has just looked whether it leads, and goes on where it stood still."""
+    monkeypatch.setattr(PostgresStore, "leads", True)
+    with closing(PostgresStore(address, "s0")) as store, closing(PostgresStore(address, "s1")) as other:
+        frozen = MapHistory(store)
+        frozen.failed("first")
+        MapHistory(other).failed("second")
+        frozen.failed("third")
+        assert [event.words for event in MapHistory(other).events] == ["first", "second"]
+        assert [event.words for event in frozen.events] == ["first", "second"], "it goes on from there"
+        frozen.failed("fourth")
+        assert [event.words for event in MapHistory(other).events] == ["first", "second", "fourth"]
 
 
 def test_what_a_leader_publishes_is_stored_whole(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
