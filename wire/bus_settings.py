@@ -103,6 +103,12 @@ class BusSettings:
                     f"without keys a router stays on this machine alone, not {endpoint}: make keys with "
                     "`mapweave keys init`, and give them with --keys"
                 )
+            if self.mode == "router" and self.credentials is None and endpoint.startswith("ws/"):
+                # Zenoh does not look at the header Origin.
+                raise SettingsError(
+                    f"without keys a router takes no WebSockets, as {endpoint}: any page in a browser of "
+                    "this machine could command robots; use tcp/, or give --keys"
+                )
             if (
                 self.credentials is not None
                 and self.credentials.certified

@@ -1,9 +1,10 @@
 """Whether a request comes from this server's own pages or from no page at all.
 
-A page of another site can make a browser on the robots' network send requests here. Two headers that a page
+A page of another site can make a browser on the robots' network send requests here. Headers that a page
 cannot choose prevent this: `Origin` names the page's site, `Host` the name under which this server was looked
 up. A name that an attacker points at this machine (DNS rebinding) is not in the list; an address is always
 its own.
+Images and scripts of a page are asked for without `Origin`: `Sec-Fetch-Site` says that the page is another's.
 """
 
 from __future__ import annotations
@@ -41,6 +42,7 @@ class SameSite:
         answer, encrypted = self._app, scope["scheme"] in ("https", "wss")
         try:
             check_site(headers.get("Host"), headers.get("Origin"), self._names, encrypted)
+            check_part(headers.get("Sec-Fetch-Site"), headers.get("Sec-Fetch-Dest"))
         except InvalidValue as error:
             content = json_bytes({"error": str(error)})
             answer = Response(content, HTTPStatus.FORBIDDEN, media_type="application/json")
@@ -76,6 +78,20 @@ def check_site(host: str | None, origin: str | None, names: frozenset[str], encr
     schemes = ("https",) if encrypted else ("http", "https")
     if origin is not None and origin.lower() not in {f"{scheme}://{host.lower()}" for scheme in schemes}:
         raise InvalidValue(f"pages of {origin[:80]!r} may not ask here")
+
+
+def check_part(site: str | None, destination: str | None) -> None:
+    """Refuse what another site's page shows as a part of itself: each request may keep this server busy.
+
+    Args:
+        site: the header `Sec-Fetch-Site`, which scripts and older browsers do not send.
+        destination: the header `Sec-Fetch-Dest`; a link to this server's page opens a document.
+
+    Raises:
+        InvalidValue: another site's, in words.
+    """
+    if site in ("cross-site", "same-site") and destination != "document":
+        raise InvalidValue("pages of other sites may not show parts of this server")
 
 
 def _without_port(host: str) -> str:

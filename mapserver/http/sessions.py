@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ipaddress
 import secrets
 import time
 from collections import deque
@@ -56,8 +57,12 @@ class Sessions:
         self._open.pop(secret, None)
 
 
+IPV6_NETWORK = 64
+"""Bits: who has one address of IPv6 has all of this network."""
+
+
 class Failures:
-    """Failed attempts, by address."""
+    """Failed attempts, by address; of IPv6 by network."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:
         """Begin with none.
@@ -70,15 +75,27 @@ class Failures:
 
     def wait(self, address: str) -> float:
         """How long an address has to wait before its next attempt, s; 0 if it may try."""
-        times = self._times.get(address)
+        times = self._times.get(_counted(address))
         if times is None or len(times) < MOST_FAILURES:
             return 0.0
         return max(times[0] + WINDOW - self._clock(), 0.0)
 
     def add(self, address: str) -> None:
         """Note a failure."""
+        address = _counted(address)
         times = self._times.pop(address, None) or deque(maxlen=MOST_FAILURES)
         times.append(self._clock())
         if len(self._times) >= MOST_ADDRESSES:
             del self._times[next(iter(self._times))]
         self._times[address] = times
+
+
+def _counted(address: str) -> str:
+    """The network of an address of IPv6, and any other word as it is."""
+    try:
+        known = ipaddress.IPv6Address(address)
+    except ValueError:
+        return address
+    if known.ipv4_mapped is not None:
+        return str(known.ipv4_mapped)
+    return str(ipaddress.IPv6Network((int(known), IPV6_NETWORK), strict=False))

@@ -286,6 +286,19 @@ def test_what_failed_long_ago_is_forgotten() -> None:
     assert len(failures._times) == sessions.MOST_ADDRESSES
 
 
+def test_addresses_of_one_ipv6_network_are_one() -> None:
+    """Each of a network's 2^64 addresses had ten attempts of its own, each a line of the log."""
+    failures = sessions.Failures(lambda: 0.0)
+    for number in range(sessions.MOST_FAILURES):
+        failures.add(f"2001:db8:0:1::{number:x}")
+    assert failures.wait("2001:db8:0:1:ffff::1") == sessions.WINDOW == failures.wait("2001:db8:0:1::0%eth0")
+    assert failures.wait("2001:db8:0:2::1") == 0.0
+    for _ in range(sessions.MOST_FAILURES):
+        failures.add("::ffff:10.0.0.1")
+    assert failures.wait("10.0.0.1") == sessions.WINDOW and failures.wait("10.0.0.2") == 0.0
+    assert failures.wait("no address") == 0.0
+
+
 @pytest.mark.parametrize("body", [b"{}", b'{"token": 3}', b'{"token": "x", "name": "otto"}', b"\xff", b"[]"])
 def test_a_login_that_is_none(keyed: Keyed, body: bytes) -> None:
     given = {"Content-Type": "application/json"}

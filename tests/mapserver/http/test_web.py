@@ -265,6 +265,9 @@ def test_a_head_of_a_part_costs_next_to_nothing(served: Web) -> None:
         ({"Origin": "https://evil.example"}, "pages of 'https://evil.example' may not ask here"),
         ({"Origin": "null"}, "pages of 'null' may not ask here"),
         ({"Host": "127.0.0.1:1", "Origin": "http://127.0.0.1:2"}, "pages of 'http://127.0.0.1:2'"),
+        ({"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "image"}, "may not show parts of this server"),
+        ({"Sec-Fetch-Site": "same-site", "Sec-Fetch-Dest": "iframe"}, "may not show parts of this server"),
+        ({"Sec-Fetch-Site": "cross-site"}, "may not show parts of this server"),
     ],
 )
 def test_pages_of_other_sites_are_refused(
@@ -276,6 +279,14 @@ def test_pages_of_other_sites_are_refused(
     for path in ("/", "/why", "/status", "/history", "/explain", "/nothing"):
         status, _, content = ask(served, "GET", path, headers=headers)
         assert status == 403 and words in json.loads(content)["error"]
+
+
+@pytest.mark.parametrize(
+    ("site", "part"), [("cross-site", "document"), ("same-origin", "script"), ("none", "document")]
+)
+def test_links_lead_here_and_own_pages_show_own_parts(served: Web, site: str, part: str) -> None:
+    headers = {"Sec-Fetch-Site": site, "Sec-Fetch-Dest": part}
+    assert ask(served, "GET", "/", headers=headers)[0] == 200
 
 
 @pytest.mark.parametrize(

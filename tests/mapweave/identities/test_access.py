@@ -371,12 +371,29 @@ def test_who_was_alive_is_so_after_the_keys_have_changed_unless_revoked(fleet: F
 
 
 @pytest.mark.parametrize(
-    "endpoint", ["tcp/0.0.0.0:7447", "tcp/192.168.1.7:7447", "tcp/[::]:7447", "tcp/maps.local:1"]
+    "endpoint",
+    [
+        "tcp/0.0.0.0:7447",
+        "tcp/192.168.1.7:7447",
+        "tcp/[::]:7447",
+        "tcp/maps.local:1",
+        "tcp/[fe80::1%lo]:1",
+        "tcp/[::ffff:127.0.0.1]:1",
+        "tcp/127.0.0.1:1,tcp/0.0.0.0:1",
+        "tcp/0.0.0.0:1?a=127.0.0.1:1",
+    ],
 )
 def test_without_keys_a_router_listens_on_its_own_machine_alone(endpoint: str) -> None:
     with pytest.raises(SettingsError, match="mapweave keys init"):
         BusSettings(mode="router", listen=(endpoint,))
     BusSettings(mode="router", listen=("tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/localhost:7447"))
+
+
+def test_without_keys_a_router_takes_no_connections_of_pages_in_a_browser() -> None:
+    """Pages of any site may open WebSockets to this machine, and Zenoh answered them as all others."""
+    with pytest.raises(SettingsError, match="takes no WebSockets"):
+        BusSettings(mode="router", listen=("tcp/127.0.0.1:7447", "ws/127.0.0.1:7448"))
+    BusSettings(endpoints=("ws/127.0.0.1:7448",))
 
 
 def test_a_server_with_keys_is_a_client_of_routers(fleet: Fleet) -> None:
