@@ -11,6 +11,7 @@ person's words or constraints name; those of maps with anything held against the
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, fields, is_dataclass
 
@@ -28,6 +29,8 @@ from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.marginalization import is_marginal, marginal_links
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.wire.messages import KeptPruned, KeptPruning, decode, encode
+
+log = logging.getLogger(__name__)
 
 DAY_NS = 86_400_000_000_000
 AT_ONCE = 300
@@ -74,12 +77,16 @@ class Pruning:
         self._since: dict[NodeId, int] = {}
         self._linked_since: dict[Pair, int] = {}
         self._looked_ns = 0
+        self._restored = False
         # The parts that are full, and what is in the next one.
         self._parts = 0
         self._part: dict[NodeId, PrunedNode] = {}
 
     def due(self, merged: MergedMap, now_ns: int, keep_days: float) -> tuple[set[NodeId], set[Pair]] | None:
         """Nodes that are superseded, and pairs that are linked, for long enough.
+
+        The time since the last look of another process counts as half of `keep_days` at most: one of the two
+        clocks may be wrong, and a node that leaves does not come back.
 
         Args:
             merged: by the newest merge.
@@ -89,6 +96,7 @@ class Pruning:
         Returns:
             None: it is not asked more often than once a day.
         """
+        self._doubt(now_ns, round(keep_days * DAY_NS / 2))
         self._since = {node: min(self._since.get(node, now_ns), now_ns) for node in merged.superseded}
         linked = self._linked_since
         self._linked_since = {
@@ -114,6 +122,18 @@ class Pruning:
         """
         self._since = {node: since + leap_ns for node, since in self._since.items()}
         self._linked_since = {pair: since + leap_ns for pair, since in self._linked_since.items()}
+        self._looked_ns += leap_ns
+
+    def _doubt(self, now_ns: int, most_ns: int) -> None:
+        """Have no more than so much time pass between the last look of another process and now."""
+        restored, self._restored = self._restored, False
+        passed = now_ns - self._looked_ns
+        if restored and passed > most_ns:
+            log.info(
+                "what is superseded was looked at %.1f days ago, by this clock: that counts as %.1f days",
+                passed / DAY_NS, most_ns / DAY_NS,
+            )  # fmt: skip
+            self.put_forward(passed - most_ns)
 
     def take(self, plan: PrunePlan) -> None:
         """It is done."""
@@ -167,7 +187,7 @@ class Pruning:
         self.marginals = tuple(marginal_of(link) for link in kept.links)
         self.standing = frozenset(kept.standing)
         self._linked_since = {(a, b): stamp for a, b, stamp in kept.linked_since}
-        self._looked_ns = kept.looked_ns
+        self._looked_ns, self._restored = kept.looked_ns, True
 
 
 def marginal_of(kept: Linked) -> Link:

@@ -259,6 +259,25 @@ def test_a_clock_that_is_set_makes_nothing_older(logs: Logs, tmp_path: Path, yea
         assert server.prune(day), "kept for as long as ever, and then it leaves"
 
 
+@pytest.mark.parametrize("years", [-50.0, 0.1], ids=["behind", "ahead"])
+def test_no_clock_of_a_server_that_takes_over_is_enough_for_nodes_to_leave(
+    logs: Logs, tmp_path: Path, years: float
+) -> None:
+    path, off = tmp_path / "s0.sqlite", years * 365.0
+    with serving(path) as server:
+        for map_id in MAPS:
+            server.take(logs.changes[map_id])
+        nodes = len(server.merged().poses)
+        assert server.merged().superseded and not server.prune(1.0)
+    with serving(path) as server:
+        assert not server.prune(2.0 + off)
+    with serving(path) as server:
+        for day in (3.0, 3.0 + 0.4 * DAYS):
+            assert not server.prune(day), day
+        assert len(server.merged().poses) == nodes
+        assert server.prune(4.0 + DAYS), "it leaves all the same"
+
+
 def test_what_is_left_of_many_nodes_takes_few_records(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mapweave.mapserver.merging.pruning.PART_NODES", 4)
     results: dict[str, bytes] = {}
