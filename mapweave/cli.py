@@ -65,6 +65,14 @@ class CommandParser(argparse.ArgumentParser):
         self.set_defaults(command=self.prog, parser=self)
         # Positions begin with a minus as well, and are no options: -3.1,2 and -3.1,2=40,50.
         self._negative_number_matcher = NEGATIVE
+        self._given: Sequence[str] = ()
+
+    def parse_known_args(
+        self, args: Any = None, namespace: Any = None
+    ) -> tuple[argparse.Namespace, list[str]]:
+        """Parse, and remember what was given, of which an error may be."""
+        self._given = sys.argv[1:] if args is None else args
+        return super().parse_known_args(args, namespace)
 
     def _get_value(self, action: argparse.Action, arg_string: str) -> Any:
         """Read a value; if it is none, say of which argument."""
@@ -86,7 +94,17 @@ class CommandParser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         """End with status 2: in one line, as every error."""
-        self.exit(USAGE, f"{self.prog}: {message}; see `{self.prog} --help`\n")
+        taken = next((word for word in self._given if word.startswith("-") and _is_file(word)), None)
+        advice = f"write ./{taken}: {taken} is taken for options" if taken else f"see `{self.prog} --help`"
+        self.exit(USAGE, f"{self.prog}: {message}; {advice}\n")
+
+
+def _is_file(word: str) -> bool:
+    """Whether a word on the command line is the name of a file or folder here."""
+    try:
+        return os.path.lexists(word)
+    except ValueError:  # a null byte
+        return False
 
 
 class PrintVersion(argparse.Action):

@@ -52,6 +52,9 @@ def _opener(path: Path) -> Callable[[Path, RecordingOptions], Recording]:
         except OSError as error:
             # Those that read bags and videos say that it is none.
             raise DeviceError(str(unreadable(path, error))) from None
+        if not path.stat().st_size:
+            # As a copy that has failed. Readers say that it is another format, or that its index is lost.
+            raise DeviceError(f"{path}: the file is empty")
         if path.suffix.lower() in bags.SUFFIXES:
             return bags.bag
         if path.suffix.lower() in videos.SUFFIXES:

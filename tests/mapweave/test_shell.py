@@ -300,6 +300,21 @@ def test_an_option_that_is_none_names_the_help_of_its_command(capfd: pytest.Capt
     )
 
 
+@pytest.mark.parametrize("line", ["map show -r0.mapweave", "map merge a.mapweave -o -r0.mapweave"])
+def test_a_file_whose_name_begins_with_a_dash_is_named(
+    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """It was said that no file is given."""
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "-r0.mapweave").touch()
+    with pytest.raises(SystemExit) as ended:
+        main(line.split())
+    assert ended.value.code == USAGE
+    said = capfd.readouterr().err
+    assert said.endswith("; write ./-r0.mapweave: -r0.mapweave is taken for options\n"), said
+    assert said.count("\n") == 1
+
+
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [

@@ -428,6 +428,16 @@ def test_what_is_no_recording_is_refused_in_one_line(name: str, tmp_path: Path) 
     assert str(path) in str(error.value) and "\n" not in str(error.value)
 
 
+@pytest.mark.parametrize("name", ["a.mp4", "a.avi", "a.bag", "a.mcap", "a.db3", "a.txt"])
+def test_an_empty_file_is_named_as_such(name: str, tmp_path: Path) -> None:
+    """Of a copy that has failed it was said that the index of an MP4 is lost, or how a bag begins."""
+    path = tmp_path / name
+    path.touch()
+    with pytest.raises(DeviceError) as refusal:
+        open_recording(path)
+    assert str(refusal.value) == f"{path}: the file is empty"
+
+
 def test_files_of_an_editor_of_windows(drive: Drive, tmp_path: Path) -> None:
     """Such editors begin a file with an invisible mark, and end lines with CR LF."""
     folder = tmp_path / "drive"
