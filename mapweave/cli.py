@@ -67,7 +67,7 @@ class CommandParser(argparse.ArgumentParser):
         self._negative_number_matcher = NEGATIVE
         self._given: Sequence[str] = ()
 
-    def parse_known_args(
+    def parse_known_args(  # type: ignore[override]
         self, args: Any = None, namespace: Any = None
     ) -> tuple[argparse.Namespace, list[str]]:
         """Parse, and remember what was given, of which an error may be."""
