@@ -137,6 +137,12 @@ class AgentLog:
         settled = [sequence for sequence in self._received if sequence <= self.watermark]
         return [self._received.pop(sequence) for sequence in settled]
 
+    def go_back(self, watermark: int, now: float) -> None:
+        """The store has lost what it had behind this change: it is missing again."""
+        since = min(now, self._announced[0][1]) if self._announced else now
+        self._announced.appendleft((self.watermark, since))
+        self.watermark, self.pull_at = watermark, NEVER
+
     def heard(self, now: float) -> None:
         """The agent is reachable: shorten the wait for the next attempt."""
         self._pause = min(self._pause, self.settings.first_pause)

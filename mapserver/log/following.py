@@ -69,10 +69,16 @@ class Follower:
         self._settings, self._pass_on, self._note_refusal = settings, pass_on, note_refusal
 
     def take(self, news: News) -> None:
-        """Pass on what other servers have written."""
+        """Pass on what other servers have written, and pull what the store has lost."""
         try:
-            for map_id, (log_id, watermark) in self._store.positions(news.maps).items():
+            positions = self._store.positions(news.maps)
+            if news.maps is None:
+                lost = [one for one in self._logs.values() if one.watermark and one.map not in positions]
+                positions |= {one.map: Position(one.log_id, 0) for one in lost}
+            for map_id, (log_id, watermark) in positions.items():
                 agent_log = self._logs.get(map_id)
+                if agent_log is not None and agent_log.log_id == log_id and watermark < agent_log.watermark:
+                    self._go_back(agent_log, watermark)
                 if agent_log is None or (agent_log.log_id != log_id and agent_log.watermark == 0):
                     agent_log = AgentLog(map_id, log_id, self._settings)
                     self._logs.add(agent_log)
@@ -91,3 +97,16 @@ class Follower:
         except InvalidFile as error:
             # With the next news everything is looked at.
             log.warning("%s", error)
+
+    def _go_back(self, agent_log: AgentLog, watermark: int) -> None:
+        """The store has less of a log than it had: a standby that was behind is the primary now.
+
+        Its robot knows the rest to be acknowledged, and says nothing more of it while this server runs.
+        """
+        map_id, had = agent_log.map, agent_log.watermark
+        log.warning("%s %d to %d are gone from the store: they are pulled again", map_id, watermark + 1, had)
+        self._store.doubt(map_id, had)
+        agent_log.unverified = self._store.unverified(map_id)
+        agent_log.go_back(watermark, time.monotonic())
+        self._intakes.of(map_id.agent).recount(map_id)
+        self._pulls.note(agent_log, time.monotonic())

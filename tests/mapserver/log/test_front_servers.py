@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import closing
+from contextlib import ExitStack, closing
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +14,10 @@ import pytest
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
-from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.change import Change, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.explainer import ConstraintRecord
@@ -32,7 +33,8 @@ from mapweave.wire.codec import encode_change
 from mapweave.wire.memory import MemoryBus, MemoryHub, MessageFaults
 from synthetic.postgres_server import PostgresServer
 from tests.mapserver.log.acknowledged_fleet import AGENT, KEYS, ROBOTS, SERVER, life
-from tests.mapserver.log.test_store import MAP, entry
+from tests.mapserver.log.test_older_store import PATIENCE, Robot, contents
+from tests.mapserver.log.test_store import MAP, entry, node_put
 from tests.postgres import started
 from tests.waiting import eventually
 
@@ -133,6 +135,45 @@ def test_what_one_server_acknowledges_counts_for_all_with_its_store(
     assert journal.acknowledged(map_id)["s0"] == len(bodies)
     robot.close()
     servers[1].close()
+
+
+def test_what_a_promoted_standby_lacks_comes_again_from_robots_that_are_idle(
+    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """It was behind when it was promoted; the server has run on."""
+    monkeypatch.setattr(postgres_follower, "POLL", 0.1)
+    hub = MemoryHub()
+    with ExitStack() as stack:
+        store = stack.enter_context(closing(PostgresStore(address, "s0")))
+        bus = stack.enter_context(closing(MemoryBus(hub)))
+        ingest = stack.enter_context(closing(Ingest(bus, KEYS, store, "s0", lambda change: None)))
+        store.follow(ingest.follow)
+        robot = stack.enter_context(closing(Robot(hub, tmp_path)))
+        robot.send(*(node_put(k) for k in range(1, 8)))
+        robot.send(NodeRetired(NodeId(*MAP, 2)), node_put(8))
+        assert robot.journal.prune(MAP, ["s0"]) == 2, "neither the node nor its retirement is kept"
+        robot.journal.open_map(2)
+        other = stack.enter_context(
+            closing(Replicator(robot._bus, KEYS, robot.journal, MapId("r0", 2), ("s0",)))
+        )
+        other.submit([NodePut(replace(node_put(1).node, id=NodeId("r0", 2, 1)))], 1)
+        assert other.wait_acknowledged(PATIENCE)
+        with psycopg.connect(address) as behind:
+            behind.execute("SET search_path TO mapweave")
+            behind.execute("DELETE FROM change WHERE epoch = 2 OR sequence > 5")
+            behind.execute("DELETE FROM node WHERE epoch = 2 OR number > 5")
+            behind.execute("DELETE FROM log WHERE epoch = 2")
+            behind.execute("UPDATE log SET watermark = 5")
+        wanted = [*robot.journal.replay(MAP)], [*robot.journal.replay(MapId("r0", 2))]
+        assert [len(one) for one in wanted] == [7, 1]
+        eventually(
+            lambda: all(
+                contents(change.body for change in store.replay(map_id)) == contents(bodies)
+                for map_id, bodies in zip((MAP, MapId("r0", 2)), wanted, strict=True)
+            ),
+            PATIENCE,
+        )
+        assert store.watermark(MAP) == 9 and store.unverified(MAP) is None
 
 
 def test_one_server_leads_and_another_when_it_is_gone(address: str, postgres: PostgresServer) -> None:
