@@ -8,12 +8,12 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 
 import numpy as np
 
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.merging.node_comparisons import NodeComparisons
@@ -23,9 +23,13 @@ from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.fragments import Fragment
 from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.verdicts import Verdict
+from mapweave.registration.recognition import RecognitionSettings
 
 MOST_NEIGHBOURS, MOST_COMPARED, MOST_NEAR = 40, 40, 60
 """Of a map: pairs of nodes that its own edges connect, that the merge compares, and that are near."""
+LEAST_LANDMARKS = RecognitionSettings().least_inliers
+"""Of a node: if one of two has fewer, they are never linked, and tell nothing. Counted, they took the places
+of those that do."""
 MOST_NODES = 150
 """Of a piece of map, among which those that are near each other are searched."""
 NEAR_XY, NEAR_HEADING = 3.0, math.radians(60.0)
@@ -58,10 +62,12 @@ class OwnViewsSearch:
         """
         edges = (edge for edge in hybrid_map.edges.values() if edge.kind is not EdgeKind.DRIVEN)
         ends = ((min(edge.a, edge.b), max(edge.a, edge.b)) for edge in edges)
-        pairs = self._some((pair for pair in ends if hybrid_map.nodes.keys() >= {*pair}), MOST_NEIGHBOURS)
-        pairs += self._some((pair for piece in pieces for pair in self._near(piece)), MOST_NEAR)
+        telling = {name for name, node in hybrid_map.nodes.items() if len(node.landmarks) >= LEAST_LANDMARKS}
+        pairs = self._some((pair for pair in ends if telling >= {*pair}), MOST_NEIGHBOURS)
+        near = (pair for piece in pieces for pair in self._near(piece, telling))
+        pairs += self._some(near, MOST_NEAR)
         self._comparisons.verify(pairs)
-        pairs += self._some(compared, MOST_COMPARED)
+        pairs += self._some((pair for pair in compared if telling >= {*pair}), MOST_COMPARED)
         pairs = [pair for pair in dict.fromkeys(pairs) if pair in self._comparisons]
         known, self._lost[map_id] = self._lost.get(map_id, {}), {}
         return contradiction(self._views(map_id, hybrid_map, pieces, pairs, known))
@@ -93,9 +99,10 @@ class OwnViewsSearch:
                 self._lost[map_id][pair] = verdict, lost
                 yield PairOfViews(a, b, way, None, lost)
 
-    def _near(self, piece: Fragment) -> list[Pair]:
+    def _near(self, piece: Fragment, telling: Set[NodeId]) -> list[Pair]:
         """Pairs of nodes that are likely to show the same by the way."""
-        nodes = sorted(sorted(piece.nodes, key=lambda node: (self._drawn(f"{node}"), node))[:MOST_NODES])
+        drawn = sorted(telling & {*piece.nodes}, key=lambda node: (self._drawn(f"{node}"), node))
+        nodes = sorted(drawn[:MOST_NODES])
         x, y, heading = piece.graph.means[piece.graph.index(nodes)].T
         away = np.hypot(x[:, None] - x, y[:, None] - y)
         turn = np.abs(np.remainder(heading[:, None] - heading + np.pi, math.tau) - np.pi)
