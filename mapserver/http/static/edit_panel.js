@@ -117,7 +117,7 @@ export class EditPanel {
   counts() {
     const { selection, model, editor } = this, { names, area } = selection;
     let words = this.lacks ? this.lacks : area && !selection.corners().length ? `${area.anchor}, on which the area hangs, is not on the map any more.` : area ? `An area of ${selection.size().toFixed(1)} m\u00b2 at ${area.anchor}: ${selection.words()}.`
-      : names.length ? `${selection.words()}.` : "Nothing is selected. Click nodes on the map, type them, or draw an area.";
+      : names.length ? `${selection.words()}.` : "Nothing to change yet. Click nodes on the map, type them, or draw an area.";
     if (editor?.whole?.(this.values()) && names.length === 1) {
       const row = model.rowOf(names[0]), map = model.nodes.map[row];
       words = row === undefined ? `${names[0]} is not on the map.`

@@ -264,6 +264,11 @@ def test_the_open_tab_is_marked_in_colours_of_the_system(page: Browser) -> None:
         " getComputedStyle(document.querySelector(one)).backgroundColor)"
     )
     assert swatch != panel
+    # What is disabled has the system's colour for it, and was half transparent beside that.
+    opacities = page.run(
+        "return [...document.querySelectorAll('button:disabled')].map(one => getComputedStyle(one).opacity)"
+    )
+    assert opacities and set(opacities) == {"1"}
 
 
 @pytest.mark.parametrize(("width", "height"), [(320, 256), (667, 375)])
