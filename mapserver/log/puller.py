@@ -15,7 +15,6 @@ from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.intake import Intakes
 from mapweave.mapserver.log.pull_schedule import AT_ONCE, PullSchedule
 from mapweave.mapserver.log.pulled import Pulled
-from mapweave.storage.full_disks import logged
 from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import LogRequest, StoredChange
@@ -84,9 +83,8 @@ class Puller:
             stored = self._newest_change(agent_log.map, asked.first - 1)
             asked = msgspec.structs.replace(asked, stored=stored)
             replies = self._bus.ask(self._keys.log(agent_log.map), asked.encode(), self._timeout)
-        except InvalidFile as error:
-            if not logged(error):
-                log.warning("%s", error)
+        except InvalidFile as error:  # what comes cannot be kept now either, and that is logged
+            log.debug("%s", error)
         except Exception:  # without an end the robot would count as asked, and not be asked again
             log.exception("asking for %s failed", agent_log.map)
         self._answered(Pulled(agent_log, asked, replies))

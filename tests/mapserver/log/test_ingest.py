@@ -11,11 +11,13 @@ from pathlib import Path
 import pytest
 
 from mapweave.hybridmap.change import Change
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.agent_log import AgentLog, PullSettings
 from mapweave.mapserver.log.entry import Applied, ReceivedChange
 from mapweave.mapserver.log.inbox import MOST
 from mapweave.mapserver.log.ingest_settings import IngestSettings
+from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.bus import Sample
 from mapweave.wire.codec import unwrap_body
 from mapweave.wire.log_messages import Ack, LogRequest, StoredChange
@@ -98,6 +100,32 @@ def test_a_beacon_alone_brings_everything_in_chunks(server: Server, agent: HandA
     eventually(lambda: server.sequences == list(range(1, 601)))
     assert [(asked.first, asked.last) for asked in agent.asked] == [(1, 256), (257, 512), (513, 600)]
     eventually(lambda: agent.acks[-1].watermark == 600)
+
+
+def test_a_store_that_cannot_be_read_is_no_line_for_each_pull(
+    hub: MemoryHub,
+    agent: HandAgent,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    away, read = [True], SqliteStore.newest_change
+
+    def newest_change(store: SqliteStore, map_id: MapId, watermark: int) -> StoredChange | None:
+        if away[0]:
+            raise InvalidFile("the store is away")
+        return read(store, map_id, watermark)
+
+    monkeypatch.setattr(SqliteStore, "newest_change", newest_change)
+    settings = IngestSettings(PullSettings(grace=0.01, first_pause=0.01, longest_pause=0.02))
+    server = Server(hub, tmp_path / "s0.sqlite", settings=settings)
+    agent.serve(3)
+    agent.beacon(3)
+    eventually(lambda: server.ingest.counters().pulls >= 5)
+    assert not agent.asked and "the store is away" not in caplog.text
+    away[0] = False
+    eventually(lambda: server.sequences == [1, 2, 3])
+    server.end()
 
 
 def test_a_shorter_answer_than_asked_for_goes_on_where_it_ends(server: Server, agent: HandAgent) -> None:
