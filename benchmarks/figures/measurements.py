@@ -37,6 +37,7 @@ MEASUREMENTS: dict[str, str] = {
     "lies_margins": "python -m benchmarks.liar --margins --seed 759 --json",
     "wrong_geometry": "python -m benchmarks.wrong_geometry --runs 1 --kinds slip carried --scenes room "
     "--seed 723 --json",
+    "trust": "python -m benchmarks.trust --seed 9041 --json",
     "agent": "python -m benchmarks.agent --seed 724 --json",
     "geometry": "python -m benchmarks.geometry --recording DATA/kitti03 --seed 737 --json",
     "fleet": "python -m benchmarks.fleet --agents 10 50 200 1000 --seconds 30 --seed 733 --json",

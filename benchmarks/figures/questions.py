@@ -431,6 +431,17 @@ HOSTILE_INPUT = Question(
             "0, 0, 0",
         ),
         Row("memory at most", "{peak_rss_mb:.0f} MB", "fuzz"),
+        Row(
+            "a map server that lies to a lost robot, once in each way: drives; touches, false arrivals",
+            "{drives}; {touches}, {false_arrivals}",
+            "trust",
+            "0, 0",
+        ),
+        Row(
+            "the same: goals given up; robots that arrive once the answers are true",
+            "{gave_up} of {drives}; {arrived_by_the_truth} of {drives}",
+            "trust",
+        ),
     ),
 )
 SMALL_COMPUTERS = Question(
