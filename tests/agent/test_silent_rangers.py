@@ -114,7 +114,7 @@ def test_a_single_sensor_is_named() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("broken", [NONE, FEWER])
+@pytest.mark.parametrize("broken", first_quick([NONE, FEWER], 1))
 def test_a_simulated_robot_touches_nothing(broken):
     """24 s in an office: with free room assumed it touched a wall several times."""
     world = make_world("office", 3)

@@ -15,6 +15,7 @@ from mapweave.agent.calibration.pair_information import ImagePair
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
 from mapweave.hybridmap.pose import Array
 from tests.agent.calibration.room_drive import CAMERA
+from tests.quick import first_quick
 
 HEIGHT = 0.25
 SPEED, PAIR_S = 0.5, 0.4
@@ -56,7 +57,7 @@ def road_pairs(radius: float, seconds: float, seed: int) -> list[ImagePair]:
     return pairs
 
 
-@pytest.mark.parametrize("radius", [75.0, -75.0, 1e6], ids=["dip", "crest", "plane"])
+@pytest.mark.parametrize("radius", first_quick([75.0, 1e6, -75.0], 2), ids=["dip", "plane", "crest"])
 def test_a_road_that_bends_tells_the_scale(radius: float) -> None:
     """A street with a vertical curve of 500 m under a camera of 1.65 m, made smaller: 2 m ahead it is 27 mm
     off the plane under the robot, a tenth of the camera's height.

@@ -285,12 +285,17 @@ def test_without_a_router_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> N
 
 @pytest.mark.parametrize(
     ("degrees", "lens", "words"),
-    [
-        (0.0, {}, ""), (2.0, {}, ""),
-        (12.0, {}, "the camera looks 12 deg down by tf"), (-12.0, {}, "the camera looks 12 deg up by tf"),
-        (0.0, {"lens": (-0.1, 0.02, 0.001)}, "3 coefficients of distortion"),
-    ],
-)  # fmt: skip
+    first_quick(
+        [
+            (2.0, {}, ""),
+            (12.0, {}, "the camera looks 12 deg down by tf"),
+            (0.0, {"lens": (-0.1, 0.02, 0.001)}, "3 coefficients of distortion"),
+            (-12.0, {}, "the camera looks 12 deg up by tf"),
+            (0.0, {}, ""),
+        ],
+        3,
+    ),
+)
 def test_what_is_not_taken_into_account_of_a_camera_is_said(
     start: Start, caplog: pytest.LogCaptureFixture, degrees: float, lens: dict[str, Any], words: str
 ) -> None:

@@ -14,6 +14,7 @@ from synthetic.world import World
 from tests.agent.reserving_robot import reserving_robot
 from tests.agent.scripted_fleet import BODY, Trial
 from tests.mapserver.test_reservations import node, router  # noqa: F401 - a fixture
+from tests.quick import first_quick
 
 EDGE = {node(4), node(5)}
 """In the corridor; node 9 is in a niche beside its one end."""
@@ -84,7 +85,7 @@ AGAINST_ONE = [(3, 7), (2, 6), (6, 9)]
 """Two to the right, one towards them and into the niche."""
 
 
-@pytest.mark.parametrize("ways", [ONE_WAY, AGAINST_TWO, AGAINST_ONE])
+@pytest.mark.parametrize("ways", first_quick([AGAINST_TWO, ONE_WAY, AGAINST_ONE], 2))
 def test_one_drives_and_two_wait_and_say_so_then_the_next(home, router, ways) -> None:  # noqa: F811
     corridor = Corridor(home, router, ways)
     corridor.until_all_are_there()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -10,11 +11,30 @@ import pytest
 from numpy.typing import NDArray
 
 from mapweave.agent.observation import Observation, Odometry
+from mapweave.agent.sensor_health import odometry_convention
 from mapweave.agent.sensor_health.odometry_convention import OdometryConvention
+from mapweave.agent.vision.visual_odometry import VisualMotion, visual_motion
+from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2
 from tests.agent.conftest import CAMERA, PhotoWalls
 
 REVERSED, DEGREES = "the other way", "in degrees"
+
+
+@pytest.fixture(scope="module", autouse=True)
+def compared_once() -> Iterator[None]:
+    """The same images are held against many odometries: two of them are compared with each other once."""
+    known: dict[tuple[bytes, bytes, Camera], VisualMotion | None] = {}
+
+    def compared(before: NDArray[np.uint8], now: NDArray[np.uint8], camera: Camera) -> VisualMotion | None:
+        key = before.tobytes(), now.tobytes(), camera
+        if key not in known:
+            known[key] = visual_motion(before, now, camera)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(odometry_convention, "visual_motion", compared)
+        yield
 
 
 def drive(
@@ -139,7 +159,8 @@ def spoilt(seen: list[Observation], how: str) -> list[Observation]:
     elif how == "another drive":
         images = [furnished(rng, image.shape) for image in images]
     elif how == "dark":
-        images = [rng.poisson(4.0, image.shape).astype(np.uint8) for image in images]
+        electrons = rng.poisson(4.0, 1 << 16).astype(np.uint8)
+        images = [electrons[rng.integers(0, len(electrons), image.shape, np.uint16)] for image in images]
     odometry = [Odometry(*row) for row in rows]
     return [replace(a, odometry=b, image=c) for a, b, c in zip(seen, odometry, images, strict=True)]
 
