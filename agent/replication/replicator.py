@@ -74,6 +74,12 @@ COMPACTED = 1000
 """After so many further changes that servers have, what later ones undo is dropped from the disk."""
 LOOK = 0.1
 """Between two looks whether a wait for acknowledgements is still worthwhile, s."""
+MOST_AT_ONCE = 256
+"""Messages that are taken before changes are committed again: a flood of them must not hold those up."""
+MOST_WAITING = 4096
+"""Messages of servers that wait for the thread; more of them are dropped, or refused."""
+BUSY = 1.0
+"""After this a question that was refused may be asked again, s."""
 RAREST = 4
 """A beacon on which nothing follows is sent again after twice the time, up to so many times that of the
 first: the beacons of a fleet that a server cannot keep up with must not hold it up further."""
@@ -142,8 +148,8 @@ class Replicator:
         self._thread = threading.Thread(target=self._run, name=f"replicate-{map_id}", daemon=True)
         self._thread.start()
         self._declared = [
-            bus.subscribe(keys.acks(map_id.agent), self._work.put, direct=True),
-            bus.serve(keys.logs(map_id.agent), self._work.put),
+            bus.subscribe(keys.acks(map_id.agent), self._hear, direct=True),
+            bus.serve(keys.logs(map_id.agent), self._take_question),
             bus.watch(keys.servers_alive(), self._see_server),
         ]
 
@@ -267,8 +273,9 @@ class Replicator:
         while not stop:
             questions: list[Request] = []
             try:
-                item = self._work.get(timeout=max(0.0, self._next_turn() - time.monotonic()))
-                while True:
+                for count in range(MOST_AT_ONCE):
+                    left = max(0.0, self._next_turn() - time.monotonic())
+                    item = self._work.get_nowait() if count else self._work.get(timeout=left)
                     if item is None:
                         stop = True
                     elif isinstance(item, list):
@@ -285,7 +292,6 @@ class Replicator:
                         self._beacon_after(0.0)
                     else:
                         questions.append(item)
-                    item = self._work.get_nowait()
             except queue.Empty:
                 pass
             now = time.monotonic()
@@ -298,10 +304,24 @@ class Replicator:
         if self._pending:
             log.error("%s: %d changes never reached the disk", self._map, len(self._pending))
 
+    def _hear(self, sample: Sample) -> None:
+        if self._has_room():
+            self._work.put(sample)
+
+    def _take_question(self, question: Request) -> None:
+        if self._has_room():
+            self._work.put(question)
+        else:
+            question.refuse(f"{self._map.agent} is asked too much at once", BUSY)
+
     def _see_server(self, key: str, alive: bool) -> None:
         del key
-        if alive:
+        if alive and self._has_room():
             self._work.put(True)
+
+    def _has_room(self) -> bool:
+        """Whether messages may wait; what is lost of them, servers send after the next beacon."""
+        return self._work.qsize() < MOST_WAITING
 
     def _next_turn(self) -> float:
         return min(self._next_beacon, self._retry_at) if self._pending else self._next_beacon

@@ -12,6 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave.agent.replication import replicator
 from mapweave.agent.replication.journal import Draft, Journal
 from mapweave.agent.replication.log_state import Ranges
 from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
@@ -162,6 +163,45 @@ def test_a_change_that_cannot_be_encoded_is_refused_at_once(agent: Agent) -> Non
             agent.replicator.submit([*bodies(1, 2), bad], 0)
     assert agent.replicator.flush(30)
     assert agent.journal.head(MAP) == 0
+
+
+def test_a_flood_of_acknowledgements_holds_up_no_change_and_fills_no_memory(
+    agent: Agent, hub: MemoryHub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Of a server that lies, or of any program without keys: nothing reached the disk while it lasted."""
+    over, again = threading.Event(), Ack(MAP, agent.log_id, 0).encode()
+    take, most, stood = agent.replicator._take_ack, [0], threading.Event()
+
+    def slow(sample: Sample) -> None:
+        stood.wait(0.004)
+        take(sample)
+
+    def flood(bus: MemoryBus) -> None:
+        while not over.wait(0.0005):
+            bus.publish(KEYS.ack("s0", "r0"), again)
+            most[0] = max(most[0], agent.replicator._work.qsize())
+
+    monkeypatch.setattr(replicator, "MOST_WAITING", 16)
+    monkeypatch.setattr(replicator, "MOST_AT_ONCE", 4)
+    monkeypatch.setattr(agent.replicator, "_take_ack", slow)
+    thread = threading.Thread(target=flood, args=(MemoryBus(hub),))
+    thread.start()
+    try:
+        eventually(lambda: most[0] >= 16)
+        agent.replicator.submit(bodies(1, 3), 0)
+        assert agent.replicator.flush(5.0)
+    finally:
+        over.set()
+        thread.join()
+    assert most[0] <= 18, "and what was submitted"
+
+
+def test_a_question_for_which_there_is_no_room_is_refused(
+    agent: Agent, hub: MemoryHub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(replicator, "MOST_WAITING", 0)
+    (reply,) = MemoryBus(hub).ask(KEYS.log(MAP), pack({"f": 1, "q": 1}), 5)
+    assert reply.error == "r0 is asked too much at once" and reply.retry_after == 1.0
 
 
 def test_a_full_disk_is_logged_once_and_retried(
