@@ -218,8 +218,12 @@ def _is_whole(of: Any) -> bool:
 
 
 def _scalar(hint: Any) -> Any:
-    """Type of the elements of an annotated array."""
-    return get_args(get_args(get_args(hint)[0])[1])[0]
+    """Type of the elements of an annotated array.
+
+    From NumPy 2.5 on `NDArray` is an alias, which has the type itself and not the `dtype` of it.
+    """
+    last = get_args(get_args(hint)[0])[-1]
+    return next(iter(get_args(last)), last)
 
 
 def _type_of(hint: Any) -> Any:

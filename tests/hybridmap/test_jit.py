@@ -5,9 +5,14 @@ import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import Annotated, Any, TypeVar
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from typing_extensions import TypeAliasType
+
+from mapweave.hybridmap import jit
 
 MODULE = """
 from typing import NamedTuple
@@ -160,3 +165,18 @@ def test_a_kernel_whose_file_is_cut_off_is_compiled_again(tmp_path: Path, kind: 
         path.write_bytes(path.read_bytes()[:left])
     assert run(tmp_path, "with", cache)["hits"] == 0
     assert run(tmp_path, "with", cache)["hits"] == 1
+
+
+Scalar = TypeVar("Scalar", bound=np.generic)
+ALIAS = TypeAliasType("ALIAS", np.ndarray[tuple[Any, ...], np.dtype[Scalar]], type_params=(Scalar,))
+"""As NumPy 2.5 declares NDArray, which Python 3.12 and newer get: no command that reads a map ran with it."""
+
+
+@pytest.mark.parametrize("array", [NDArray, ALIAS])
+@pytest.mark.parametrize("scalar", [np.float64, np.int64, np.uint8])
+def test_the_elements_of_an_array_are_known_from_each_numpys_annotation(array: Any, scalar: type) -> None:
+    def one(values: Annotated[array[scalar], 1]) -> None:
+        raise AssertionError("only its annotations are read")
+
+    assert jit._scalar(Annotated[array[scalar], 2]) is scalar
+    assert jit._is_whole(one) == (scalar is not np.float64)
