@@ -14,13 +14,15 @@ from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.wire.bus import Bus, BusClient, Sample
 from mapweave.wire.keys import Keys
-from mapweave.wire.pose_messages import MergedPose, PoseNews
+from mapweave.wire.pose_messages import MAX_POSTURES, MergedPose, PoseNews
 
 log = logging.getLogger(__name__)
 
 
 TIMEOUT = 3.0
 """How long a question may take, s."""
+MOST_WAITING = 64
+"""Messages that wait for the thread: a server sends one after a merge. More of them are dropped."""
 
 
 class MergedPoses(BusClient):
@@ -39,13 +41,13 @@ class MergedPoses(BusClient):
         self._key = keys.poses(server, agent)
         self._places: dict[NodeId, MergedPose] = {}
         self._run: int | None = None
-        self._sequence = 0
+        self._sequence, self._complaint = 0, ""
         self._work: queue.SimpleQueue[Sample | bool | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._listen, name=f"poses-{agent}", daemon=True)
         self._thread.start()
         self._closing = [
-            bus.subscribe(self._key, self._work.put, direct=True),
-            bus.watch(keys.server_alive(server), lambda _, alive: self._work.put(alive)),
+            bus.subscribe(self._key, self._hear, direct=True),
+            bus.watch(keys.server_alive(server), lambda _, alive: self._hear(alive)),
         ]
 
     def of(self, node: NodeId) -> MergedPose | None:
@@ -62,6 +64,10 @@ class MergedPoses(BusClient):
         self._work.put(None)
         self._thread.join(TIMEOUT + 1.0)
 
+    def _hear(self, item: Sample | bool) -> None:
+        if self._work.qsize() < MOST_WAITING:
+            self._work.put(item)
+
     def _listen(self) -> None:
         while (item := self._work.get()) is not None:
             if isinstance(item, bool):
@@ -71,7 +77,9 @@ class MergedPoses(BusClient):
             try:
                 self._take(PoseNews.decode(item.payload, self._agent))
             except InvalidMessage as error:
-                log.warning("%s", error)
+                if str(error) != self._complaint:
+                    self._complaint = str(error)
+                    log.warning("%s", error)
                 self._ask()
 
     def _take(self, news: PoseNews) -> None:
@@ -80,7 +88,11 @@ class MergedPoses(BusClient):
         elif news.after == self._sequence < news.sequence:
             gone = frozenset(news.gone)
             left = {node: place for node, place in self._places.items() if node not in gone}
-            self._places, self._sequence = left | dict(news.placed), news.sequence
+            if len(left.keys() | news.placed.keys()) > MAX_POSTURES:
+                # As many as one message holds: a server that lies could name nodes without end.
+                self._ask()
+            else:
+                self._places, self._sequence = left | dict(news.placed), news.sequence
 
     def _ask(self) -> None:
         """Ask for all of it. Without an answer it stays as it is: the next news will show the gap again."""
