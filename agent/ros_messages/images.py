@@ -8,8 +8,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.errors import DeviceError
-from mapweave.storage.image_file import decode_grey
+from mapweave.hybridmap.errors import DeviceError, InvalidValue
+from mapweave.storage.image_file import check_size, decode_grey
 
 CHANNELS = {
     "mono8": 1,
@@ -33,10 +33,14 @@ def grey_of(message: Any) -> NDArray[np.uint8]:
     """(H, W) of a sensor_msgs Image or CompressedImage.
 
     Raises:
-        DeviceError: its encoding is not supported, or it is damaged.
+        DeviceError: its encoding is not supported, or it is damaged, empty or too large.
     """
-    if not hasattr(message, "encoding"):
-        return decode_grey(bytes(message.data))
+    try:
+        if not hasattr(message, "encoding"):
+            return decode_grey(bytes(message.data))
+        check_size(int(message.width), int(message.height))
+    except InvalidValue as error:
+        raise DeviceError(str(error)) from None
     encoding = str(message.encoding).lower()
     if encoding not in CHANNELS:
         raise DeviceError(
@@ -45,7 +49,7 @@ def grey_of(message: Any) -> NDArray[np.uint8]:
     size, row = CHANNELS[encoding], int(message.step)
     height, width = int(message.height), int(message.width)
     data = np.asarray(message.data, np.uint8)
-    if row < width * size or len(data) < height * row:
+    if not (width and height) or row < width * size or len(data) < height * row:
         raise DeviceError(f"an image of {width}x{height} px has {len(data)} bytes")
     pixels = data[: height * row].reshape(height, row)[:, : width * size]
     if encoding in ("mono16", "16uc1"):
