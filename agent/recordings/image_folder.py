@@ -85,10 +85,15 @@ def read_times(path: Path, count: int) -> tuple[np.ndarray[Any, np.dtype[np.floa
     given = len(words)
     # The number that a file without a last line's end ends in may have had more digits.
     words = words[:-1] if given < count and not text.endswith("\n") else words
-    try:
-        times = np.array([float(word) for word in words])
-    except ValueError as error:
-        raise DeviceError(f"{path}: {error}") from None
+    times = np.empty(len(words))
+    for row, word in enumerate(words):
+        try:
+            times[row] = float(word)
+        except ValueError:
+            raise DeviceError(
+                f"{path}: line {row + 1}: {word[:20]!r} is no time; there must be seconds alone, a line for "
+                "each image"
+            ) from None
     if given > count or not len(times):
         raise DeviceError(
             f"{path}: {given} times for {count} images; there must be a line for each image: remove the "

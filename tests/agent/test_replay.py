@@ -294,6 +294,7 @@ WRONG = {
     "times too many": (written("times.txt", "\n".join(map(str, range(15)))), "15 times for 14 images; there"),
     "times go back": (written("times.txt", "\n".join(map(str, [*range(13), 3]))), "line 14: 3.0: times must"),
     "times with text": (written("times.txt", "noon"), "times.txt"),
+    "times with a title": (written("times.txt", "seconds\n0.1\n0.2\n"), "line 1: 'seconds' is no time"),
     "times not finite": (written("times.txt", "nan " * COUNT), "ascend"),
     "times are no text": (written("times.txt", b"\xff" * 9), "times.txt: is no text in UTF-8; it must be"),
     "times are a folder": (folder_at("times.txt"), "times.txt"),
