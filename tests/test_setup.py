@@ -73,13 +73,15 @@ def test_a_missing_network_is_not_taken_for_a_missing_wheel(checkout: Path) -> N
     assert status != 0 and "wheel" not in said, said
 
 
-@pytest.mark.parametrize("workers", [(), ("-n", "1")])
-def test_what_was_skipped_is_said_in_one_line_for_each_reason(workers: tuple[str, ...]) -> None:
-    """Without a browser all tests are green; how many were left out, and why, must be seen."""
+def test_what_was_skipped_is_said_in_one_line_for_each_reason() -> None:
+    """Without a browser all tests are green; how many were left out, and why, must be seen.
+
+    A process of its own runs them, as in `make test`, and another one says it.
+    """
     tests = [f"tests/mapserver/http/{name}.py" for name in ("test_page_robots", "test_page_connection")]
     environment = {**os.environ, "PATH": ""}
     ran = subprocess.run(
-        [sys.executable, "-m", "pytest", *tests, *workers],
+        [sys.executable, "-m", "pytest", *tests, "-n", "1"],
         cwd=MAKEFILE.parent,
         env=environment,
         capture_output=True,
