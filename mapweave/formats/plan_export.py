@@ -49,7 +49,7 @@ def export_nav2(placed: PlacedPlan, part: PlanPart) -> str:
     return "\n".join([
         f"# Plan {placed.name}, Mapweave component {part.component}.",
         "# Either: the image in the frame of the merged map. Many parts of Nav2 ignore the yaw of an origin.",
-        f"image: {placed.plan.image.file}",
+        f"image: {json.dumps(placed.plan.image.file, ensure_ascii=False)}",
         f"resolution: {part.metres_per_pixel:.6g}",
         f"origin: [{corner.x:.4f}, {corner.y:.4f}, {corner.heading:.6f}]",
         "# Or: keep the map.yaml as it is, and publish where its frame lies in that of the merged map:",

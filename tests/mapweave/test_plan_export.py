@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import math
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -86,6 +87,13 @@ def test_nav2_puts_each_pixel_under_the_map(placed: PlacedPlan) -> None:
             y + math.sin(yaw) * along + math.cos(yaw) * up,
         )
         assert point == pytest.approx(tuple(MERGED_FROM_CORNER.apply(np.array([along, up]))), abs=2e-3)
+
+
+@pytest.mark.parametrize("name", ["!!python/object/apply:os.system [id]", "a: b # c.png", "'\"*&.png"])
+def test_the_name_of_an_image_is_a_text_and_no_yaml(placed: PlacedPlan, name: str) -> None:
+    """Some programs of ROS 1 read a map.yaml with a loader that runs what such a tag names."""
+    named = replace(placed, plan=replace(placed.plan, image=replace(placed.plan.image, file=name)))
+    assert YAML(typ="safe").load(export_nav2(named, named.part()))["image"] == name
 
 
 def test_tf_places_the_frame_of_the_plan_in_that_of_the_map(placed: PlacedPlan) -> None:
