@@ -291,7 +291,7 @@ def _chosen(opened: Bag, wanted: str | None, kinds: Sequence[str], what: str) ->
         for topic in opened.topics:
             if topic.name == wanted:
                 if topic not in fitting:
-                    kind = f"{topic.count} messages of {topic.kind}"
+                    kind = f"{counted(topic.count, 'message')} of {topic.kind}"
                     raise DeviceError(f"{opened.path}: {wanted} has {kind}; {what} are {' or '.join(kinds)}")
                 return topic
         raise DeviceError(f"{opened.path}: no topic {wanted}; it has {names_of(opened.topics)}")

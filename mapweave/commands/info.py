@@ -127,12 +127,14 @@ def _described(recording: Recording, camera_lacks: bool, odometry: bool) -> dict
 
 def _print(facts: dict[str, Any]) -> None:
     """The same for people."""
+    from mapweave.hybridmap.counted import counted
+
     print(f"{facts['recording']}: {facts['format']}")
     if facts["images"]:
         if facts["seconds"] is None:
-            print(f"  {facts['images']} images, at unknown times")
+            print(f"  {counted(facts['images'], 'image')}, at unknown times")
         else:
-            print(f"  {facts['images']} images in {facts['seconds']:.1f} s, ", end="")
+            print(f"  {counted(facts['images'], 'image')} in {facts['seconds']:.1f} s, ", end="")
             print(f"{facts['images_per_second']:g} a second, longest gap {facts['longest_gap_s']:g} s")
         print(f"  camera {facts['width']}x{facts['height']} px", end="")
         if facts["focal_px"] is not None:
@@ -144,7 +146,7 @@ def _print(facts: dict[str, Any]) -> None:
     if facts["driven_m"] is not None:
         print(f"  odometry {facts['driven_m']:.1f} m, {facts['turned_rad']:.1f} rad of turns")
     for topic in facts["topics"]:
-        print(f"  {topic['name']} ({topic['type']}), {topic['count']} messages")
+        print(f"  {topic['name']} ({topic['type']}), {counted(topic['count'], 'message')}")
     for words in facts["missing"]:
         print(f"  missing: {words}")
     for note in (*facts["notes"], *facts["damage"]):

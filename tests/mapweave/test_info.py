@@ -64,9 +64,19 @@ def test_a_bag_without_images_is_described_by_its_topics(tmp_path: Path, capfd) 
         for second in range(4):
             message = store.types[kind](structure_needs_at_least_one_member=0)
             writer.write(opened, second * 10**9, store.serialize_cdr(message, kind))
+            if not second:
+                once = writer.add_connection("/once", kind, typestore=store)
+                writer.write(once, 0, store.serialize_cdr(message, kind))
     facts = facts_of(capfd, tmp_path / "drive")
     assert (facts["images"], facts["seconds"]) == (0, 3.0)
-    assert facts["topics"] == [{"name": "/tick", "type": kind, "count": 4}]
+    counts = {"/once": 1, "/tick": 4}
+    assert facts["topics"] == [{"name": name, "type": kind, "count": n} for name, n in counts.items()]
+    assert main(["info", str(tmp_path / "drive")]) == 0
+    printed = capfd.readouterr().out
+    assert (
+        "/once (std_msgs/msg/Empty), 1 message\n" in printed
+        and "(std_msgs/msg/Empty), 4 messages\n" in printed
+    )
     assert facts["missing"][0].startswith("images (") and "--odometry FILE" in facts["missing"][1]
 
 
