@@ -35,6 +35,7 @@ from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
 from synthetic.wrong_geometry import SCENES, OdometryFault, draw_fleet
 from tests.examined import examined_once
+from tests.quick import first_quick
 
 
 @cache
@@ -48,7 +49,7 @@ def logs() -> list[tuple[MapId, ChangeBody]]:
     return [(map_id, body) for map_id, some in bodies.items() for body in some]
 
 
-@pytest.mark.parametrize("rule", [*TRIAL_RULES, *PLACE_RULES])
+@pytest.mark.parametrize("rule", first_quick([*TRIAL_RULES, *PLACE_RULES], 3))
 def test_fleets_are_merged_and_answered_without_a_rule(rule: str, caplog: pytest.LogCaptureFixture) -> None:
     """None of these rules is on how nodes are compared, so each pair of them is compared once."""
     switches: tuple[Switch, ...] = {**TRIAL_RULES, **PLACE_RULES}[rule]
@@ -66,8 +67,8 @@ def test_fleets_are_merged_and_answered_without_a_rule(rule: str, caplog: pytest
 
 
 def test_one_link_joins_two_maps_only_if_it_is_strong() -> None:
-    found = by_rule(SINGLE_RULES, lambda: single_links(seed=4, count=30))
-    assert found["one strong link"]["joined_alone"] < found[ALL]["joined_alone"] < found[ALL]["fleets"] == 30
+    found = by_rule(SINGLE_RULES, lambda: single_links(seed=4, count=15))
+    assert found["one strong link"]["joined_alone"] < found[ALL]["joined_alone"] < found[ALL]["fleets"] == 15
 
 
 def test_own_loop_closures_are_drawn_as_they_are_called() -> None:
@@ -122,7 +123,7 @@ def test_a_drive_without_faults_is_mapped_well(drive: tuple[RobotDescription, Dr
     assert found["error_m"] < 0.05
 
 
-@pytest.mark.parametrize("rule", FRAME_RULES)
+@pytest.mark.parametrize("rule", first_quick(FRAME_RULES, 1))
 def test_a_drive_is_mapped_without_a_rule_on_frames(rule: str, drive: tuple[RobotDescription, Drive]) -> None:
     """Without faults it is as good as with it."""
     with switched_off(FRAME_RULES[rule]):

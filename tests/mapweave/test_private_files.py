@@ -11,6 +11,7 @@ import pytest
 
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.wire.credentials import Role
+from tests.quick import first_quick
 from tests.waiting import eventually, free_port
 
 DRIVER = """
@@ -40,8 +41,10 @@ def modes(folder: Path) -> dict[str, int]:
     return {str(path.relative_to(folder)): path.stat().st_mode & 0o077 for path in paths if path.exists()}
 
 
-@pytest.mark.parametrize("keys", [True, False])
-@pytest.mark.parametrize("process", ["server", "agent"])
+@pytest.mark.parametrize(
+    ("process", "keys"),
+    first_quick([("server", False), ("server", True), ("agent", True), ("agent", False)], 3),
+)
 def test_files_are_for_their_owner_alone_if_there_are_keys(keys: bool, process: str, tmp_path: Path) -> None:
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, [], "s0", free_port())
     folder.add("r0", Role.ROBOT)

@@ -50,7 +50,7 @@ MB = 2**20
 def merged(self, maps, *arguments):
     # What a large map takes: only merges of all three maps are large here.
     if len(maps) > 2:
-        np.ones(1024 * MB, np.uint8)
+        np.empty(1024 * MB, np.uint8)
     return real(self, maps, *arguments)
 
 MergePipeline.merged = merged

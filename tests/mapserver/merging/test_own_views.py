@@ -82,7 +82,9 @@ def test_a_map_whose_views_contradict_its_own_way_is_named(lie: Lie, seed: int) 
 
 
 @pytest.mark.parametrize("seed", first_quick([33001, 33002], 1, 1))
-@pytest.mark.parametrize("fault", [OdometryFault.NONE, OdometryFault.SLIP, OdometryFault.CARRIED])
+@pytest.mark.parametrize(
+    "fault", first_quick([OdometryFault.SLIP, OdometryFault.CARRIED, OdometryFault.NONE], 2)
+)
 def test_views_do_not_contradict_a_way_that_slipped_once(fault: OdometryFault, seed: int) -> None:
     """Wrong geometry has rules of its own: one slip is no share by which all is too long."""
     assert not merged(draw_fleet(seed, SCENES["room"], fault, stops=2)).implausible

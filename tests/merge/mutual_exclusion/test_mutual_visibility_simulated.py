@@ -29,6 +29,7 @@ from mapweave.merge.settings import ExclusionSettings
 from mapweave.sim.events import Fail
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
+from tests.quick import first_quick
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)
 RADIUS = 0.16
@@ -118,7 +119,7 @@ def between_twins(seed: int) -> float:
     return first.x - second.x
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", first_quick(range(4), 2))
 def test_twins_should_have_seen_each_other(seed: int) -> None:
     """Within five minutes, in any room: where little floor is free they rarely see each other."""
     collision = walked("twins", seed, (0, 1), 150).collision_on(between_twins(seed))
@@ -170,7 +171,7 @@ def test_robots_in_one_room_are_not_refused_by_views_on_the_way(
     assert walks.collision_on(settings=ExclusionSettings(doubt=0.9)) is None
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", first_quick(range(3), 1))
 @pytest.mark.parametrize("kind", ["office", "arena"])
 def test_robots_that_are_in_one_room_are_not_refused(
     kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
