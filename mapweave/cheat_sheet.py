@@ -53,9 +53,9 @@ Agents, servers and routers print an event as one line with the time.
 """
 COMPLETION = """## Completion
 
-    mapweave completion bash > ~/.local/share/bash-completion/completions/mapweave
-    mapweave completion fish > ~/.config/fish/completions/mapweave.fish
-    echo 'source <(mapweave completion zsh)' >> ~/.zshrc    # after compinit
+    mapweave completion bash >> ~/.bashrc
+    mapweave completion zsh >> ~/.zshrc      # after compinit
+    mkdir -p ~/.config/fish/completions && mapweave completion fish > ~/.config/fish/completions/mapweave.fish
 """
 
 

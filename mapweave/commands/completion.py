@@ -14,9 +14,8 @@ def add_to(commands: Any) -> None:
         "completion",
         help="print what makes a shell complete commands and options",
         description="Print the code that makes a shell complete commands, options, choices and files. "
-        "bash reads it from ~/.local/share/bash-completion/completions/mapweave, fish from "
-        "~/.config/fish/completions/mapweave.fish; for zsh put `source <(mapweave completion zsh)` into "
-        "~/.zshrc, after compinit.",
+        "Append it to ~/.bashrc, or to ~/.zshrc after compinit; fish reads it from "
+        "~/.config/fish/completions/mapweave.fish.",
     )
     parser.add_argument("shell", choices=SHELLS, help="which shell")
     parser.set_defaults(run=run)

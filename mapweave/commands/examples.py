@@ -102,7 +102,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "eval merge": ("mapweave eval merge drive/ --robots 3",),
     "eval replay": ("mapweave eval replay drive/ --truth truth.csv",),
     "settings": ("mapweave settings > robot.toml",),
-    "completion": ("mapweave completion bash > ~/.local/share/bash-completion/completions/mapweave",),
+    "completion": ("mapweave completion bash >> ~/.bashrc",),
 }
 """By the command's words."""
 

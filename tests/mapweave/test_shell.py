@@ -49,7 +49,7 @@ def test_every_command_says_what_it_does_with_examples_that_parse(words: str) ->
     assert command.epilog and "example" in command.epilog, "add one to mapweave/commands/examples.py"
     for example in EXAMPLES[words]:
         assert f"\n  {example}" in command.format_help(), "it stands there as a line of its own"
-        program, *arguments = shlex.split(example.partition(" > ")[0])
+        program, *arguments = shlex.split(re.split(" >>? ", example)[0])
         parsed = parser().parse_args(arguments)
         assert program == "mapweave" and parsed.command.startswith(f"mapweave {words}")
 
@@ -97,11 +97,11 @@ COMPLETED = [
 ]
 """What is typed before Tab, and what stands there after it."""
 SHELL_COMMANDS = {
-    "bash": (["--norc", "-i"], "PS1=; source <(mapweave completion bash)"),
+    "bash": (["--norc", "-i"], "PS1=; mapweave completion bash >> rc; source ./rc"),
     "zsh": (
         ["-f", "-i"],
         "PS1=; unsetopt zle_bracketed_paste; autoload -U compinit; compinit -u -D; "
-        "source <(mapweave completion zsh)",
+        "mapweave completion zsh >> rc; source ./rc",
     ),
 }
 """How a shell is started without a person's own files, and what a person has in these."""
