@@ -88,7 +88,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "open": ("mapweave open office.mapweave",),
     "map merge": ("mapweave map merge r0.1.mapweave r1.1.mapweave -o office.mapweave",),
     "map fetch": ("mapweave map fetch office.mapweave",),
-    "map backup": ("mapweave map backup out/server/s0.sqlite -o backup/monday.sqlite",),
+    "map backup": ("mapweave map backup out/server/s0.sqlite -o monday.sqlite",),
     "map export": ("mapweave map export office.mapweave --format geojson -o office.geojson",),
     "map extract": ("mapweave map extract out/agents/r0.sqlite -o maps/",),
     "map import": ("mapweave map import graph.g2o -o optimum.g2o",),
