@@ -52,8 +52,9 @@ def test_every_command_says_what_it_does_with_examples_that_parse(words: str) ->
         program, *arguments = shlex.split(re.split(" >>? ", example)[0])
         parsed = parser().parse_args(arguments)
         assert program == "mapweave" and parsed.command.startswith(f"mapweave {words}")
-        if {"-o", "--out"} & {*arguments}:
-            assert Path(parsed.out).parent == Path(), "where it is pasted there is no folder of that name"
+        for option in {"-o", "--out"} & {*arguments}:
+            out = Path(arguments[arguments.index(option) + 1])
+            assert out.parent == Path(), "where it is pasted there is no folder of that name"
 
 
 @pytest.mark.parametrize("words", parsers())
