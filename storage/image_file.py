@@ -24,6 +24,8 @@ MAX_SCANS = 20
 BARE = (0x00, 0x01, *range(0xD0, 0xDA))
 """Markers of a JPEG that have no segment: none belongs before the image."""
 PNG = b"\x89PNG\r\n\x1a\n"
+ANIMATION = (b"acTL", b"fcTL", b"fdAT")
+"""Chunks of an animated PNG that a still one does not have."""
 PNM = re.compile(rb"P[1-6](?:\s|#[^\r\n]*[\r\n])+(\d{1,9})\s(?:\s|#[^\r\n]*[\r\n])*(\d{1,9})\s")
 """As the decoder reads it. What stands between the numbers must match in one way, or this takes for ever."""
 
@@ -113,24 +115,28 @@ def check_size(width: int, height: int) -> None:
 
 
 def to_end(data: bytes) -> bytes:
-    """What a decoder may see: a PNG as far as its last chunk, all of any other file.
+    """What a decoder may see: a PNG up to its last chunk and without animation, all of any other file.
 
-    It takes as much memory as a chunk claims before it reads it, also of what stands behind the last one.
+    It takes as much memory as a chunk claims before it reads it, also of what stands behind the last one. Of
+    an animated PNG it takes 12 bytes a pixel, to show its first frame.
 
     Raises:
         InvalidValue: a chunk is longer than the file.
     """
     if not data.startswith(PNG):
         return data
-    at = len(PNG)
+    kept, begin, at = list[bytes](), 0, len(PNG)
     while at < len(data):
         kind, end = data[at + 4 : at + 8], at + 12 + int.from_bytes(data[at : at + 4], "big")
         if end > len(data):
             raise InvalidValue("the image is damaged")
+        if kind in ANIMATION:
+            kept.append(data[begin:at])
+            begin = end
         at = end
         if kind == b"IEND":
             break
-    return data[:at]
+    return b"".join([*kept, data[begin:at]])
 
 
 def image_size(data: bytes) -> tuple[int, int]:
