@@ -47,7 +47,7 @@ def recording(tmp_path_factory: pytest.TempPathFactory) -> Path:
 @pytest.fixture(scope="module")
 def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """The beginning of it."""
-    return recorded(tmp_path_factory.mktemp("recordings") / "office walk", 75)
+    return recorded(tmp_path_factory.mktemp("recordings") / "office walk", 24)
 
 
 def recorded(folder: Path, count: int) -> Path:

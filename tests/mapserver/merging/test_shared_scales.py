@@ -55,6 +55,7 @@ def test_a_corrected_map_is_adopted_bit_by_bit_and_named(tmp_path: Path) -> None
     assert_same(leader.restarted(log), merged)
 
 
+@pytest.mark.slow
 def test_a_map_file_of_a_corrected_map_has_its_poses(tmp_path: Path) -> None:
     fleet = draw_fleet(SEED, SCENES["room"], OdometryFault.NONE, stops=2)
     maps = {**fleet.maps, ODD: longer(fleet.maps[ODD], FACTOR, FACTOR)}
