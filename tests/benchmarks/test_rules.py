@@ -67,8 +67,8 @@ def test_fleets_are_merged_and_answered_without_a_rule(rule: str, caplog: pytest
 
 
 def test_one_link_joins_two_maps_only_if_it_is_strong() -> None:
-    found = by_rule(SINGLE_RULES, lambda: single_links(seed=4, count=15))
-    assert found["one strong link"]["joined_alone"] < found[ALL]["joined_alone"] < found[ALL]["fleets"] == 15
+    found = by_rule(SINGLE_RULES, lambda: single_links(seed=4, count=30))
+    assert found["one strong link"]["joined_alone"] < found[ALL]["joined_alone"] < found[ALL]["fleets"] == 30
 
 
 def test_own_loop_closures_are_drawn_as_they_are_called() -> None:

@@ -202,7 +202,7 @@ def compared_with_scipy(seed: int, pitch: float) -> tuple[np.ndarray, np.ndarray
     return kept, np.array([alone(n) for n in range(len(points))])
 
 
-@settings(max_examples=6, deadline=None, derandomize=True)
+@settings(max_examples=12, deadline=None, derandomize=True)
 @given(st.integers(0, 10**6), st.floats(-0.03, 0.03))
 def test_pitch_against_scipy_with_points_and_pitch_as_variables(seed: int, pitch: float) -> None:
     """The same draws each time: in one of 500 more than two lie outside their gates by chance."""
@@ -214,7 +214,7 @@ def test_pitch_against_scipy_with_points_and_pitch_as_variables(seed: int, pitch
 # other way around.
 @example(5727, 0.0)
 @example(18, 0.0)
-@settings(max_examples=5, deadline=None)
+@settings(max_examples=12, deadline=None)
 @given(st.integers(0, 10**6), st.floats(-0.03, 0.03))
 def test_inliers_are_those_that_fit_at_the_optimum_of_the_inliers(seed: int, pitch: float) -> None:
     """It is an optimum of the truncated cost: all sightings are on the same sides of their gates by SciPy."""

@@ -112,7 +112,7 @@ def expected_ratios(sightings: Sightings, pose_vector: np.ndarray, pitch_sigma: 
     return ratios
 
 
-@settings(max_examples=6, deadline=None)
+@settings(max_examples=15, deadline=None)
 @given(seeds, st.integers(3, 12))
 def test_likelihoods_are_those_of_a_gaussian(seed: int, n: int) -> None:
     """Of a right match, with the depth's beside it, over that of a wrong one; nothing outside the gates."""

@@ -6,7 +6,7 @@ import json
 import math
 
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 
 from mapweave.agent.drivers.arduino import parse_state
@@ -29,7 +29,6 @@ def test_numbers_of_a_koala(numbers: list[int]) -> None:
     assert parse_numbers(",".join(map(str, numbers))) == numbers
 
 
-@settings(max_examples=20)
 @given(noise)
 def test_noise_to_a_koala(text: str) -> None:
     numbers = parse_numbers(text)

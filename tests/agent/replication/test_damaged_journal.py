@@ -109,7 +109,7 @@ def check_damaged(path: Path, before: Contents, damaged: bytes, caplog: pytest.L
     return True
 
 
-@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_bytes_that_the_disk_has_changed_alter_nothing_without_a_line(
     sound: bytes,

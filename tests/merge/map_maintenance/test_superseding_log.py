@@ -139,7 +139,7 @@ def test_a_node_that_a_pruned_one_superseded_before_is_judged_again() -> None:
 
 
 @pytest.mark.parametrize("seed", first_quick(SEEDS, 1, 2))
-@settings(max_examples=3, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     order=st.permutations(HONEST),
     bounds=st.sets(st.integers(1, 10)),
