@@ -62,6 +62,11 @@ SETTLED = 0.5
 LASTING = 1.5
 """A parameter is wrong if all solutions say so while the pairs grow by this factor: what a few have in common
 by chance, more do not bear out. Without, one of nine simulated robots got three false names within 23 s."""
+SURE = 4.0
+"""It is wrong also if one solution says so by so many sigmas,"""
+MANY_PAIRS = 100
+"""once so many pairs were taken: these have little in common by chance, and a drive may be too short for half
+as many again. Both chosen; see docs/decisions/drive-geometry.md."""
 WORTH = np.full(COUNT, 2.0)
 """A change is put to use if it is larger than so many useful sigmas, and sure enough to be named."""
 WORTH[P.WHEEL_SCALE] = 1.0
@@ -301,7 +306,10 @@ class OnlineCalibration:
         known = {cause.parameter for cause in self.causes}
         wrong = {cause.parameter: cause for cause in causes(estimate) if settled[cause.parameter]}
         lasting = self._lasting(np.array([p in wrong for p in Parameter]), self._named_since)
-        found = [cause for p, cause in wrong.items() if lasting[p] and p not in known]
+        surely = SURE if self._taken >= MANY_PAIRS else math.inf
+        found = [
+            cause for p, cause in wrong.items() if (lasting[p] or cause.sigmas > surely) and p not in known
+        ]
         self.causes += found
         return found
 

@@ -277,6 +277,26 @@ def test_no_tick_does_two_of_the_costly_things(monkeypatch: pytest.MonkeyPatch):
     assert len({stamp for stamp, _ in done}) == len(done)
 
 
+@pytest.mark.parametrize(
+    ("pairs", "sigmas", "named"), [(100, 4.4, True), (100, 3.8, False), (96, 4.4, False)]
+)
+def test_a_curve_at_the_end_of_a_long_drive_names_a_delay_at_once(
+    pairs: int, sigmas: float, named: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not while pairs are few, nor where it is not sure: what lasts is named later."""
+    spread = np.full(COUNT, 10.0)
+    spread[Parameter.DELAY] = 0.05 / sigmas
+    vector = TRUE.vector
+    vector[Parameter.DELAY] = 0.05
+    estimate = Estimate(vector, np.diag(spread**2), TRUE.vector, pairs, 0)
+    monkeypatch.setattr(Estimator, "solve", lambda *_: estimate)
+    online = OnlineCalibration(declaring(RobotDescription(CAMERA), TRUE))
+    online._last, online._taken, online._parts_left = estimate, pairs, 1
+    found = online._solve()
+    assert [cause.parameter for cause in found] == [Parameter.DELAY] * named
+    assert online.geometry == TRUE
+
+
 @pytest.mark.parametrize("forward", [0.0, 0.02], ids=["standing", "driving in the dark"])
 def test_hours_without_pairs_take_no_memory(forward: float):
     online = OnlineCalibration(RobotDescription(CAMERA, geometry=TRUE))
