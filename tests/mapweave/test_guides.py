@@ -34,7 +34,7 @@ def blocks(page: Path) -> list[str]:
             if waiting.endswith("\\"):
                 waiting = waiting[:-1]
                 continue
-            found.append(re.split(r"\s(?:#|>|\||&)\s", f"{waiting} ")[0].strip())
+            found.append(re.split(r"\s(?:#|>>?|\||&)\s", f"{waiting} ")[0].strip())
             waiting = ""
     return found
 
