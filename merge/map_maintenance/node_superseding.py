@@ -328,9 +328,11 @@ class _Round:
             return None
         here = self._traversability.within(node, WAY * FARTHEST)
         later = [(neighbour, between) for neighbour, between in later if neighbour in here]
-        if len(later) < CROWD:
+        # What was refused with its successor is reinstated by the next merge: without the ways that are gone.
+        fit = [(other, between) for other, between in later if _ordered(node, other) not in self._refused]
+        if len(later) < CROWD or not fit:
             return None
-        successor, between = later[0]
+        successor, between = fit[0]
         return Superseded(successor, 0, between.distance(Pose2()), abs(between.heading))
 
     def _neighbours(self, node: NodeId) -> list[tuple[NodeId, Pose2]]:

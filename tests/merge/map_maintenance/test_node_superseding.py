@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import replace
 
 import networkx as nx
@@ -26,7 +27,7 @@ from mapweave.mapserver.roadmap import Roadmap
 from mapweave.mapserver.routes import Router
 from mapweave.merge.explanation.node_explanation import explain_nodes
 from mapweave.merge.map_maintenance import node_superseding as rules
-from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.links import Link, RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verification import verify
 from mapweave.storage.map_file import pack_map_file, unpack_map_file
@@ -180,6 +181,37 @@ def test_the_active_nodes_stay_few_over_many_drives(drives: Drives) -> None:
             merger.on_change(change)
         counts.append(len(active(merger.merged())))
     assert counts[0] == 4 and max(counts) <= 8, counts
+
+
+def test_a_node_among_later_views_is_left_to_one_that_it_was_not_refused_with(
+    drives: Drives, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Else it would be active again after the next merge, and the ways to it be gone."""
+    monkeypatch.setattr(rules, "superseded_by", lambda *_: None)
+    rng, day = np.random.default_rng(11), 86_400 * 10**9
+    tours = {
+        OLD: [Pose2(2.5 + 0.8 * k, 2.0, 0.3) for k in range(2)],
+        NEW: [Pose2(1.7 + 0.4 * k, 2.15, 0.25) for k in range(8)],
+    }
+    merger = Merger()
+    for map_id, changes in map_tours(drives.world, tours, rng, 0.01, 0.01).items():
+        for change in numbered(map_id, changes):
+            body = change.body
+            if map_id == NEW and isinstance(body, NodePut):
+                body = NodePut(replace(body.node, stamp_ns=body.node.stamp_ns + 20 * day))
+            merger.on_change(replace(change, body=body))
+    merged = replace(merger.merged(), superseded={})
+    before = rules.NodeSuperseder().renewed(merged)
+    crowded = min(before.superseded)
+    nearest = before.superseded[crowded].by
+    assert crowded.map == OLD and nearest.map == NEW
+    refused = replace(merged, refused=(*merged.refused, RefusedLink(crowded, nearest, "nothing in common")))
+    superseder = rules.NodeSuperseder()
+    after = superseder.renewed(refused).superseded
+    assert crowded in after and after[crowded].by != nearest
+    # As after the next merge: all of it was solved again.
+    again = replace(refused, graphs=tuple(map(copy, refused.graphs)))
+    assert superseder.renewed(again).superseded == after
 
 
 def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) -> None:
