@@ -115,9 +115,7 @@ def test_a_bomb_in_a_recording_is_not_decoded(tmp_path, monkeypatch):
     path = tmp_path / "1.png"
     path.write_bytes(png(20_000, 2_600))
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
-    with pytest.raises(
-        DeviceError, match="an image of 20000x2600 px is too large: at most 50 megapixels"
-    ):
+    with pytest.raises(DeviceError, match="an image of 20000x2600 px is too large: at most 50 megapixels"):
         read_grey(path, CAMERA)
 
 
