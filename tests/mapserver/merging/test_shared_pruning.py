@@ -132,6 +132,7 @@ def test_a_leader_of_before_writes_over_nothing(
     """One that stood still believes that it leads."""
     monkeypatch.setattr(PostgresStore, "leads", True)
     old, new = servers
+    assert not old.prune(DAYS - 1.0), "it looks each day, and stands still from now on"
     assert not new.prune(DAYS + 1.0), "it has not read yet since when nodes are superseded"
     new.record.adopt(new.merger)
     assert new.prune(DAYS + 2.0), "the days go on from those of the record"
