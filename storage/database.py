@@ -12,7 +12,7 @@ from mapweave.hybridmap.errors import InvalidFile
 from mapweave.storage.database_reader import reading
 from mapweave.storage.file_format import of_format
 from mapweave.storage.file_owner import owning
-from mapweave.storage.full_disks import FullDisk, written
+from mapweave.storage.full_disks import CALM, FullDisk, written
 from mapweave.storage.os_errors import DISK_FULL, READ_ONLY, no_permission
 from mapweave.storage.write_ahead_log import lost_commits
 
@@ -133,7 +133,7 @@ class Database:
                 if self.connection.in_transaction:
                     self.connection.execute("ROLLBACK")
                 raise
-        written(self.path)
+        written(self.path, CALM)
 
     def damaged(self, reason: str) -> InvalidFile:
         """The error of a damaged file, with what to do about it."""

@@ -95,9 +95,14 @@ def logged(error: Exception) -> bool:
     return True
 
 
-def written(place: str | Path) -> None:
-    """Take note that a file, or a database at an address, was written."""
-    where, calm = (str(place.absolute()), 0.0) if isinstance(place, Path) else (place, CALM)
+def written(place: str | Path, calm: float = 0.0) -> None:
+    """Take note that a file, or a database at an address, was written.
+
+    Args:
+        place: the file, or the address.
+        calm: s in which its disk must not have been full; of a database `CALM`.
+    """
+    where = str(place.absolute()) if isinstance(place, Path) else place
     if _full_disks.written(where, calm):
         log.warning("%s: the disk has room again; what waited is written", place)
 

@@ -21,7 +21,7 @@ from mapweave.mapserver.log.postgres_follower import CHANNEL, LOG, RECORD, Postg
 from mapweave.mapserver.log.postgres_name import ServerName
 from mapweave.mapserver.log.store import ANNOTATIONS, CONSTRAINTS, ID, LogChanges, News, Store, fresh_id
 from mapweave.storage.file_format import what_to_do
-from mapweave.storage.full_disks import written
+from mapweave.storage.full_disks import CALM, written
 from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
 from mapweave.storage.postgres_watchdog import PostgresWatchdog
 
@@ -286,7 +286,7 @@ class PostgresStore(Store):
             if self._warnings:
                 # Committed here, but not confirmed by the standby: the wait for it was cancelled.
                 raise InvalidFile(f"{self.address.words}: a commit is not confirmed ({self._warnings[0]})")
-        written(self.address.words)
+        written(self.address.words, CALM)
 
     def _notify(self, connection: psycopg.Connection) -> None:
         """Notify the other servers."""

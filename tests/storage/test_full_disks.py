@@ -63,10 +63,10 @@ def test_a_database_that_takes_a_little_now_and_then_has_no_room_yet(
     monkeypatch.setattr(full_disks, "_full_disks", full_disks._FullDisks(lambda: now[0]))
     for now[0] in (0.0, 0.9, 1.8):
         assert logged(FullDisk.of_database("postgresql://host/maps: no space", "postgresql://host/maps"))
-        written("postgresql://host/maps")
+        written("postgresql://host/maps", full_disks.CALM)
     now[0] += 1.1 * full_disks.CALM
     for _ in range(2):
-        written("postgresql://host/maps")
+        written("postgresql://host/maps", full_disks.CALM)
     assert caplog.messages == [
         "postgresql://host/maps: no space",
         "postgresql://host/maps: the disk has room again; what waited is written",
@@ -76,18 +76,24 @@ def test_a_database_that_takes_a_little_now_and_then_has_no_room_yet(
 def test_a_database_on_a_full_disk_says_so_and_that_it_is_written_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
+    """A change that fits into a page that it has is written in between, and says nothing of the disk."""
+    now = [0.0]
+    monkeypatch.setattr(full_disks, "_full_disks", full_disks._FullDisks(lambda: now[0]))
     path = tmp_path / "one" / "notes.sqlite"
     with closing(Database(path, "notebook", 77, 1, SCHEMA)) as notes:
         monkeypatch.setattr(database, "LEAST_FREE", 1 << 62)
         (pages,) = notes.connection.execute("PRAGMA page_count").fetchone()
         notes.connection.execute(f"PRAGMA max_page_count={pages}")
-        for _ in range(2):
+        for number in range(2):
             with (
                 pytest.raises(FullDisk, match=r"notebook: the disk is full") as error,
                 notes.transaction() as run,
             ):
                 run.execute("INSERT INTO line VALUES (1, zeroblob(100000))")
             assert logged(error.value)
+            with notes.transaction() as run:
+                run.execute("INSERT INTO line VALUES (?, 'small')", (10 + number,))
+        now[0] += 1.1 * full_disks.CALM
         notes.connection.execute("PRAGMA max_page_count=1000")
         for number in range(2):
             with notes.transaction() as run:
