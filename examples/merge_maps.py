@@ -14,7 +14,6 @@ from drive_in_simulator import FOLDER, drive
 paths = [Path(word) for word in sys.argv[1:]] or [drive("r0"), drive("r1")]
 office = mapweave.FileMap(mapweave.merge_map_files(paths))
 print(office)
-
 for pair in office.explain_maps():
     print(f"{pair.first} and {pair.second}: {'one map' if pair.joined else 'apart'}: {pair.reason}")
 for a, b, link in office.graph().edges(data=True):
@@ -22,7 +21,8 @@ for a, b, link in office.graph().edges(data=True):
         print(f"{a} and {b}: {link['inliers']:.0f} landmarks agree, p = {link['probability']:.3f}")
 
 first, *_, last = office.nodes.ids
-print(f"from {first} to {last}: {(route := office.route(first, last)).reason}")
+route = office.route(first, last)
+print(f"from {first} to {last}: {route.reason}")
 for hop in route.hops:
     print(f"  {hop.a} -> {hop.b}: {hop.distance:.2f} m, {hop.words}")
 
