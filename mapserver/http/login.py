@@ -24,7 +24,7 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.identities.logins import Login, Logins
 from mapweave.mapserver.http.body import JSON, read_body
 from mapweave.mapserver.http.reply import JsonLine
-from mapweave.mapserver.http.same_site import is_loopback
+from mapweave.mapserver.http.request_site import is_loopback
 from mapweave.mapserver.http.sessions import LIFE, Failures, Sessions
 from mapweave.wire.access_rules import COMMANDS, may_ask
 from mapweave.wire.conversion import json_value

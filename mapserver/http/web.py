@@ -72,7 +72,8 @@ from mapweave.mapserver.http.pages import page, static
 from mapweave.mapserver.http.plans import plan_answers
 from mapweave.mapserver.http.rates import LIMITED, Rates
 from mapweave.mapserver.http.reply import PATIENCE, JsonLine, busy, refusal
-from mapweave.mapserver.http.same_site import SameSite, is_loopback
+from mapweave.mapserver.http.request_site import is_loopback
+from mapweave.mapserver.http.same_site import SameSite
 from mapweave.mapserver.http.serving import ConnectionTimeouts, HttpThread
 from mapweave.mapserver.plan_answers import answer_on_plan, component_of, goal_on_plan, status_on_plan
 from mapweave.wire.each_robot import each_robot

@@ -72,7 +72,7 @@ class HttpAccess:
 
 def _name_of(hosts: Sequence[str]) -> str:
     """The one name by which other machines reach the fleet's server; its own of several or of none."""
-    from mapweave.mapserver.http.same_site import is_loopback
+    from mapweave.mapserver.http.request_site import is_loopback
 
     machine = (OWN, socket.gethostname())
     others = [host for host in hosts if host not in machine and not is_loopback(host)]

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from itertools import accumulate
 
-from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest, start_http_server
+from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.core import (
     GaugeMetricFamily,
     HistogramMetricFamily,
@@ -30,11 +30,10 @@ from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.hybridmap.mission_order import MissionKind, MissionState
 from mapweave.hybridmap.query import Certainty
 from mapweave.mapserver.metric_families import MetricFamilies
+from mapweave.processes.metrics_server import HOST, serve_metrics
 
 _FAMILIES = MetricFamilies("mapweave_agent_")
 _gauge, _counter = _FAMILIES.gauge, _FAMILIES.counter
-HOST = "127.0.0.1"
-"""This machine alone: there are no logins here, and no encryption."""
 TICK_BUCKETS = (0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0)
 """s; a tick that takes longer than 0.1 skips images."""
 SENSORS = ("clock", "camera", "encoders", "rangers")
@@ -117,17 +116,10 @@ class AgentMetrics(Collector):
         if not 0 < port < 65536:
             raise SettingsError(f"--metrics {port}: give a port, for example 9101")
         try:
-            server, thread = start_http_server(port, HOST, self._registry)
+            return serve_metrics(port, self._registry)
         except OSError as error:
             where = f"{HOST}:{port} ({error.strerror})"
             raise NotConnected(f"--metrics: cannot listen at {where}; choose another port") from error
-
-        def close() -> None:
-            server.shutdown()
-            server.server_close()
-            thread.join()
-
-        return close
 
     def collect(self) -> Iterator[Metric]:
         """All metrics; called by the registry."""

@@ -11,7 +11,7 @@ from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
-from mapweave.mapserver.http.same_site import is_loopback
+from mapweave.mapserver.http.request_site import is_loopback
 from mapweave.mapserver.http.web import Web
 from mapweave.storage.map_file import unpack_map_file
 from tests.mapserver.house import House, ask

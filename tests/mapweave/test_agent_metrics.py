@@ -164,7 +164,7 @@ def test_a_running_agent_is_scraped_and_waits_for_no_one(tmp_path: Path) -> None
             socket.create_connection(("127.0.0.1", port)),
             socket.create_connection(("127.0.0.1", port)) as deaf,
         ):
-            deaf.sendall(b"GET /metrics HTTP/1.0\r\n\r\n")
+            deaf.sendall(b"GET /metrics HTTP/1.0\r\nHost: localhost\r\n\r\n")
             before = scraped(port)("ticks_total")
             eventually(lambda: scraped(port)("ticks_total") > before + 20)
         scrape = scraped(port)
@@ -175,6 +175,30 @@ def test_a_running_agent_is_scraped_and_waits_for_no_one(tmp_path: Path) -> None
         assert scrape("mission_kind", "explore") == scrape("server_in_reach") == 0
     with pytest.raises(ConnectionRefusedError):
         scraped(port)
+
+
+@pytest.mark.parametrize(
+    ("headers", "status"),
+    [
+        ({}, 200),
+        ({"Host": "localhost:9101"}, 200),
+        ({"Host": "rebound.example:9101"}, 403),
+        ({"Origin": "http://evil.example"}, 403),
+        ({"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "image"}, 403),
+    ],
+)
+def test_pages_of_other_sites_are_refused(headers: dict[str, str], status: int) -> None:
+    """Also one whose name an attacker points at this machine (DNS rebinding)."""
+    close = AgentMetrics("r0").serve(port := free_port())
+    connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
+    try:
+        connection.request("GET", "/metrics", headers=headers)
+        answer = connection.getresponse()
+        assert answer.status == status
+        assert (b"mapweave_agent_info" in answer.read()) == (status == 200)
+    finally:
+        connection.close()
+        close()
 
 
 def test_a_port_that_cannot_be_had(port: int) -> None:
