@@ -96,6 +96,25 @@ def test_a_message_that_is_too_large_unpacked_ends_its_topic(
     ]
 
 
+@pytest.mark.parametrize("plugin", StoragePlugin)
+def test_a_file_that_is_packed_as_a_whole_and_is_too_large_is_not_unpacked(
+    plugin: StoragePlugin, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A bag of 86 kB filled 100 MB of the disk."""
+    path = ros2(tmp_path, plugin, CompressionMode.FILE)
+    ((_, message),) = Bag(path).messages(TOPIC)
+    assert len(message.data) == ZEROS
+    kept = tmp_path / "kept"
+    kept.mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(kept))
+    monkeypatch.setattr(bounded_decompression, "MOST_BYTES", TOO_SMALL)
+    with pytest.raises(DeviceError, match="a file is larger than 0 MiB when it is unpacked"):
+        Bag(path)
+    assert not list(kept.iterdir())
+    monkeypatch.setattr(bounded_decompression, "MOST_RATIO", ZEROS)
+    assert len(list(Bag(path).messages(TOPIC))) == 1
+
+
 @pytest.mark.parametrize("kind", ["bz2", "lz4", "mcap"])
 def test_a_damaged_bag_is_unpacked_with_the_limit(
     kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
