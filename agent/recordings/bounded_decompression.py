@@ -15,8 +15,8 @@ from typing import Any, BinaryIO, cast
 MOST_BYTES = 1 << 28
 """Of one record, as it is read and as it is unpacked. Recorders write chunks of about 1 to 4 MiB."""
 MOST_RATIO = 100
-"""A file that is packed as a whole may unpack to this many times its size, and `MOST_BYTES` more. Raw images pack
-2 to 10 times; zeros pack 1200 times."""
+"""A file that is packed as a whole may unpack to this many times its size, and `MOST_BYTES` more. Raw images
+pack 2 to 10 times; zeros pack 1200 times."""
 
 
 def bounded(make: Callable[[], Any], data: bytes) -> bytes:
@@ -80,7 +80,7 @@ class _BoundedZstd:
 
 
 class _BoundedFile(io.RawIOBase):
-    """A file that is unpacked while it is read: `rosbags` writes it to the disk, where robots keep their maps."""
+    """A file that is unpacked while it is read: `rosbags` writes it to the disk, where robots keep maps."""
 
     def __init__(self, unpacked: BinaryIO, packed: int) -> None:
         """Begin.
