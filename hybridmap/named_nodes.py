@@ -79,7 +79,7 @@ def ids_of(words: Iterable[str], resolve: Resolve, near: str = "") -> list[str]:
         InvalidValue: a word is neither an id, nor the name of a place, nor a position.
     """
     written = [word.strip() for word in words]
-    asked = tuple(dict.fromkeys(word for word in written if not _is_id(word)))
+    asked = tuple(dict.fromkeys(word for word in written if not is_id(word)))
     found = resolve(ResolveRequest(asked, near)).found if asked else ()
     ids = {word: str(one.node) for word, one in zip(asked, found, strict=True)}
     return [ids.get(word, word) for word in written]
@@ -122,7 +122,7 @@ def retired_of(
 def _places(words: Iterable[str], annotations: Record) -> list[tuple[str, Place | None]]:
     """Each word, and the place of which it is the name."""
     written = [word.strip() for word in words]
-    known = Annotations() if all(map(_is_id, written)) else annotations()
+    known = Annotations() if all(map(is_id, written)) else annotations()
     entries = [known.last("place", word) for word in written]
     bodies = [entry.body if entry is not None else None for entry in entries]
     return [
@@ -130,7 +130,8 @@ def _places(words: Iterable[str], annotations: Record) -> list[tuple[str, Place 
     ]
 
 
-def _is_id(word: str) -> bool:
+def is_id(word: str) -> bool:
+    """Whether it is the id of a node or of a map, and so is not looked up."""
     try:
         read_end(word)
     except InvalidValue:

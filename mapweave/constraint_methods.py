@@ -19,7 +19,12 @@ from mapweave.hybridmap.constraint_subject import (
 )
 from mapweave.hybridmap.errors import InvalidValue, Refused
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.manual_constraint import ManualConstraint, event_words, to_take_back
+from mapweave.hybridmap.manual_constraint import (
+    ConstraintRequest,
+    ManualConstraint,
+    event_words,
+    to_take_back,
+)
 from mapweave.hybridmap.named_nodes import NodeWord, own_ids_of, retired_of, word_of
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
@@ -28,6 +33,9 @@ from mapweave.refusals import refusals
 
 class ConstraintMethods(ABC):
     """How people correct the merge. Each correction can be taken back by `undo`; the record keeps both."""
+
+    _by: str
+    """Who decides."""
 
     @abstractmethod
     def annotations(self) -> Annotations:
@@ -42,8 +50,22 @@ class ConstraintMethods(ABC):
         """What people have linked, unmerged, retired and taken back, in order; the first is number 1."""
 
     @abstractmethod
+    def keep(self, request: ConstraintRequest) -> str:
+        """Keep what `request` returns, unless it is only to be checked; see `link`."""
+
+    def request(
+        self, about: Subject, holds: bool, because: str = "", check: bool = False
+    ) -> ConstraintRequest:
+        """A manual constraint of now, or that it holds no more, for `keep`.
+
+        Raises:
+            InvalidValue: a person cannot mean it.
+        """
+        return ConstraintRequest(ManualConstraint(about, holds, self._by, time.time_ns(), because), check)
+
     def constrain(self, about: Subject, holds: bool, because: str = "", *, check: bool = False) -> str:
         """Set a manual constraint of any kind, or take it back; see `link`."""
+        return self.keep(self.request(about, holds, because, check))
 
     def link(
         self, a: NodeWord, b: NodeWord, pose: Pose2 | None = None, because: str = "", *, check: bool = False

@@ -13,11 +13,10 @@ from mapweave.annotation_methods import AnnotationMethods
 from mapweave.constraint_methods import ConstraintMethods
 from mapweave.extras import need
 from mapweave.hybridmap.annotation import Annotation, Annotations
-from mapweave.hybridmap.constraint_subject import Subject
 from mapweave.hybridmap.errors import Refused
 from mapweave.hybridmap.explanation import Explanation
 from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
-from mapweave.hybridmap.manual_constraint import ManualConstraint
+from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.named_nodes import NodeWord, asked_of
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
@@ -56,13 +55,15 @@ class FileMap(Map, ConstraintMethods, AnnotationMethods):
     def _reading(self) -> MapReading:
         return self._read
 
-    def _answer(self, view: View) -> RelocalizeAnswer:
+    def locate(self, view: View) -> RelocalizeAnswer:
+        """Where a view was taken."""
         router = self._router()
         from mapweave.mapserver.places import PlaceResolver
 
         return PlaceResolver(router, router.annotations).named(self._read.relocalizer.answer(view))
 
-    def _explained(self, request: ExplainRequest) -> Explanation:
+    def explained(self, request: ExplainRequest) -> Explanation:
+        """An explanation of the kind that the request asks for, by what is closed now."""
         router = self._router()
         from mapweave.mapserver.explanations import explained
 
@@ -73,20 +74,20 @@ class FileMap(Map, ConstraintMethods, AnnotationMethods):
         """What people have linked, unmerged, retired and taken back, in order; the first is number 1."""
         return tuple(self.content.constraints)
 
-    def constrain(self, about: Subject, holds: bool, because: str = "", *, check: bool = False) -> str:
-        """Set a manual constraint of any kind, or take it back; see `link`. The map is merged again.
+    def keep(self, request: ConstraintRequest) -> str:
+        """Keep a manual constraint, unless it is only to be checked; see `link`. The map is merged again.
 
         Raises:
             Refused: the map contradicts it, or it has no effect: the evidence, and what to do.
             MissingExtra: that needs the extra "server".
         """
         before, settings = self._read.merged, self._read.settings
-        from mapweave.offline_constraints import CHECKED, checked_constraint, with_constraint
+        from mapweave.mapserver.annotator import CHECKED
+        from mapweave.offline_constraints import checked_constraint, with_constraint
         from mapweave.opened_map import MapSource, OpenedMap
 
-        asked = ManualConstraint(about, holds, self._by, time.time_ns(), because)
-        constraint, words = checked_constraint(self.content, before, asked, settings)
-        if check:
+        constraint, words = checked_constraint(self.content, before, request.constraint, settings)
+        if request.check:
             return CHECKED + words
         one = OpenedMap("the map", MapSource.FILE, self.content, tuple(before.maps), {})
         _, content = with_constraint(one, before, constraint, settings)

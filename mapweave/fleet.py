@@ -16,7 +16,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
-from mapweave.connection import ANSWERED, reach, server_statuses
+from mapweave.connection import ANSWERED, reach
 from mapweave.fleet_constraints import FleetConstraints
 from mapweave.fleet_map import FleetMap
 from mapweave.hybridmap.agent_status import SILENT, AgentStatus, FleetStatus, RobotEntry
@@ -43,7 +43,7 @@ from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.credentials import Credentials, Role
 from mapweave.wire.each_robot import alive_robots, each_robot, in_parallel
 from mapweave.wire.keys import Keys
-from mapweave.wire.log_messages import Scalar, decode_record
+from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
 from mapweave.wire.senders import sent_by
 from mapweave.wire.zenoh_bus import ZenohBus
@@ -222,10 +222,6 @@ class Fleet(FleetMap, FleetConstraints):
         if not robots:
             raise self._no_answer()
         return FleetStatus(tuple(sorted(robots, key=lambda entry: entry.robot)))
-
-    def servers(self) -> list[dict[str, Scalar]]:
-        """What the map servers say of themselves, those that answer."""
-        return server_statuses(self._bus, self._keys, ANSWERED)
 
     def missions(self, robot: str = "") -> tuple[MissionReport, ...]:
         """The missions that the map server knows of, or those of one robot, oldest first; none is in an older

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import time
-
-from mapweave.connection import ANSWERED
 from mapweave.constraint_methods import ConstraintMethods
-from mapweave.fleet_annotations import FleetAnnotations
-from mapweave.hybridmap.constraint_subject import Subject
+from mapweave.fleet_annotations import ANSWER, FleetAnnotations
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, encode
@@ -26,12 +22,12 @@ class FleetConstraints(FleetAnnotations, ConstraintMethods):
         Raises:
             NotConnected: no map server answers.
         """
-        return decode(self._question(self._keys.any_constraints(), b"", ANSWERED), ConstraintList).made
+        return decode(self._question(self._keys.any_constraints(), b"", ANSWER), ConstraintList).made
 
-    def constrain(self, about: Subject, holds: bool, because: str = "", *, check: bool = False) -> str:
-        """Set a manual constraint of any kind, or take it back; see `link`."""
+    def keep(self, request: ConstraintRequest) -> str:
+        """Have every map server keep a manual constraint; where some refuse it, the words say why."""
         self._check_role()
-        constraint = ManualConstraint(about, holds, self._by, time.time_ns(), because)
-        request = encode(ConstraintRequest(constraint, check))
-        answer = self._question(sent_by(self._keys.any_constrain(), self._sender), request, CHECKING)
-        return str(decode_record(answer)["said"])
+        key = sent_by(self._keys.any_constrain(), self._sender)
+        answers, refused = self._answers(key, encode(request), CHECKING)
+        said = [str(decode_record(answer)["said"]) for answer in answers]
+        return "\n".join([*said, *(f"another map server refused: {reason}" for reason in refused)])

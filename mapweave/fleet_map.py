@@ -111,10 +111,12 @@ class FleetMap(FleetQuestions, Map):
     def _packed(self) -> bytes:
         return self._question(self._keys.any_server_map(), b"", PACKING)
 
-    def _answer(self, view: View) -> RelocalizeAnswer:
+    def locate(self, view: View) -> RelocalizeAnswer:
+        """Where a view was taken, by the newest map."""
         payload = self._question(self._keys.any_relocalize(), encode_view(view), THINKING)
         return decode(payload, RelocalizeAnswer)
 
-    def _explained(self, request: ExplainRequest) -> Explanation:
+    def explained(self, request: ExplainRequest) -> Explanation:
+        """An explanation of the kind that the request asks for, by the newest map."""
         payload = self._question(self._keys.any_explain(), encode(request), THINKING)
         return decode_explanation(payload, request)

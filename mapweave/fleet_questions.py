@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from mapweave.connection import no_server, router_gone
+from mapweave.connection import ANSWERED, no_server, router_gone, server_statuses
 from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
 from mapweave.wire.bus import Bus, Reply
 from mapweave.wire.credentials import Credentials, Role
 from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import Scalar
 from mapweave.wire.patience import ask_patiently
 
 
@@ -18,21 +19,29 @@ class FleetQuestions:
     _by: str
     _key_holder: Credentials | None
 
+    def servers(self) -> list[dict[str, Scalar]]:
+        """What the map servers say of themselves, those that answer."""
+        return server_statuses(self._bus, self._keys, ANSWERED)
+
     def _question(self, key: str, payload: bytes, timeout: float) -> bytes:
-        """The answer of a map server; one that is busy is asked again at its time.
+        """The answer of a map server; see `_answers`."""
+        return self._answers(key, payload, timeout)[0][0]
+
+    def _answers(self, key: str, payload: bytes, timeout: float) -> tuple[list[bytes], list[str]]:
+        """The answers of map servers, at least one, and why others refuse; busy ones are asked again.
 
         Raises:
             NotConnected: no map server answers, or all stay busy.
-            Refused: it refuses the question.
+            Refused: all refuse the question.
         """
         replies = ask_patiently(self._bus, key, payload, timeout)
-        for reply in replies:
-            if not reply.error:
-                return reply.payload
         if not replies:
             raise self._no_answer()
-        reason = replies[0].error.removeprefix("refused: ")
-        raise NotConnected(f"the map server is {reason}") if replies[0].retry_after else Refused(reason)
+        reasons = [reply.error.removeprefix("refused: ") for reply in replies if reply.error]
+        if len(reasons) < len(replies):
+            return [reply.payload for reply in replies if not reply.error], reasons
+        busy = next((reply.error for reply in replies if reply.retry_after), "")
+        raise NotConnected(f"the map server is {busy}") if busy else Refused(reasons[0])
 
     def _no_answer(self) -> NotConnected:
         """The error that nothing answers."""

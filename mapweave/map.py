@@ -66,11 +66,11 @@ class Map(ABC):
         """The map as it was read last."""
 
     @abstractmethod
-    def _answer(self, view: View) -> RelocalizeAnswer:
+    def locate(self, view: View) -> RelocalizeAnswer:
         """Where a view was taken."""
 
     @abstractmethod
-    def _explained(self, request: ExplainRequest) -> Explanation:
+    def explained(self, request: ExplainRequest) -> Explanation:
         """An explanation of the kind that the request asks for."""
 
     @abstractmethod
@@ -240,7 +240,7 @@ class Map(ABC):
             wanted = f"({camera.height}, {camera.width}) of uint8, grey, by {source}"
             raise InvalidValue(f"an image of shape {image.shape} of {image.dtype}: give {wanted}")
         placed = None if plan is None else self.plans().plan(plan)
-        answer = self._answer(view_of(image, camera, lens))
+        answer = self.locate(view_of(image, camera, lens))
         if placed is None:
             return answer
         from mapweave.mapserver.plan_answers import answer_on_plan
@@ -285,7 +285,7 @@ class Map(ABC):
         pairs = tuple(zip(closed[::2], closed[1::2], strict=True))
         legs = []
         for ends in pairwise(stopping):
-            explanation = self._explained(ExplainRequest(ends, True, pairs))
+            explanation = self.explained(ExplainRequest(ends, True, pairs))
             assert isinstance(explanation, RouteExplanation), "a route was asked for"
             legs.append(explanation)
         return route_over(legs)
@@ -301,7 +301,7 @@ class Map(ABC):
             if _is_map(name):
                 raise InvalidValue(f"{name} is a map: `explain_maps` is for two maps")
         first, second = self._named(a, b)
-        explanation = self._explained(ExplainRequest((first, second)))
+        explanation = self.explained(ExplainRequest((first, second)))
         assert isinstance(explanation, PairExplanation), "two nodes were asked for"
         return explanation
 
@@ -317,7 +317,7 @@ class Map(ABC):
         pair = read_ends(str(ends[0]), str(ends[1])) if ends else None
         if pair is not None and isinstance(pair[0], NodeId):
             raise InvalidValue(f"{ends[0]} is a node: `explain` is for two nodes")
-        explanation = self._explained(ExplainRequest(pair))
+        explanation = self.explained(ExplainRequest(pair))
         assert isinstance(explanation, FleetExplanation), "maps were asked for"
         return explanation.maps
 

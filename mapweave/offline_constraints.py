@@ -17,8 +17,6 @@ from mapweave.opened_map import OpenedMap
 from mapweave.refusals import refusals
 from mapweave.storage.map_file import MapFile
 
-CHECKED = "only checked, nothing is changed: "
-
 
 def checked_constraint(
     content: MapFile, merged: MergedMap, constraint: ManualConstraint, settings: MergeSettings

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.answer import add_json, print_said
-from mapweave.commands.map_input import SOURCES, map_source, merge_progress
+from mapweave.commands.map_input import SOURCES, map_source, merge_progress, opened
 from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_network, add_reason, settings_of
 from mapweave.commands.usage import UsageError
@@ -20,7 +20,7 @@ from mapweave.hybridmap.errors import InvalidValue
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
     from mapweave.hybridmap.annotation import Body
-    from mapweave.offline_annotations import OfflineAnnotations
+    from mapweave.offline_record import OfflineRecord
 
 
 def add_record_options(parser: argparse.ArgumentParser, changes: bool) -> None:
@@ -133,8 +133,8 @@ def two_numbers(word: str) -> tuple[float, float] | None:
 
 
 @contextmanager
-def record_of(arguments: argparse.Namespace) -> Iterator[Fleet | OfflineAnnotations]:
-    """The record of annotations that the command line names.
+def record_of(arguments: argparse.Namespace) -> Iterator[Fleet | OfflineRecord]:
+    """The fleet that the command line names, or the map of `--map`: both answer the same questions.
 
     Raises:
         MapweaveError: no server answers, or the file cannot be read.
@@ -147,11 +147,8 @@ def record_of(arguments: argparse.Namespace) -> Iterator[Fleet | OfflineAnnotati
         with fleet_of(arguments) as fleet:
             yield fleet
     else:
-        from mapweave.offline_annotations import OfflineAnnotations
-        from mapweave.terminal import working
+        from mapweave.offline_record import OfflineRecord
 
         by, out = getattr(arguments, "by", "") or login(), getattr(arguments, "out", None)
         settings = settings_of(arguments).merge
-        with working("reading the map"):
-            record = OfflineAnnotations(arguments.map, out, by, settings, merge_progress)
-        yield record
+        yield OfflineRecord(opened(arguments.map), out, by, settings, merge_progress)

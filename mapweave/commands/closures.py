@@ -26,7 +26,7 @@ from mapweave.hybridmap.errors import InvalidValue
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
     from mapweave.hybridmap.annotation import Annotation
-    from mapweave.offline_annotations import OfflineAnnotations
+    from mapweave.offline_record import OfflineRecord
 
 WHERE = (
     "WHERE is two nodes with an edge between them (r0.1.17 r0.1.19), a named place, or a node or position "
@@ -157,7 +157,7 @@ def run_list(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _without_effect(record: Fleet | OfflineAnnotations, entry: Annotation) -> str:
+def _without_effect(record: Fleet | OfflineRecord, entry: Annotation) -> str:
     """That something has no effect while a node of it takes no part in the map, and why; or nothing."""
     from mapweave.hybridmap.annotation import Closure, Preference
     from mapweave.hybridmap.query import ResolveRequest
@@ -179,7 +179,7 @@ def _withdraw(arguments: argparse.Namespace, kind: str) -> int:
     return 0
 
 
-def _names(arguments: argparse.Namespace, kind: str, record: Fleet | OfflineAnnotations) -> list[str]:
+def _names(arguments: argparse.Namespace, kind: str, record: Fleet | OfflineRecord) -> list[str]:
     """The name that is given, or those of what is meant: an edge may have one for each direction."""
     if getattr(arguments, "name", None):
         return [arguments.name]
@@ -203,7 +203,7 @@ def _name(where: Sequence[str]) -> str:
 
 
 def _meant(
-    arguments: argparse.Namespace, kind: str, record: Fleet | OfflineAnnotations
+    arguments: argparse.Namespace, kind: str, record: Fleet | OfflineRecord
 ) -> tuple[str, dict[str, Any]]:
     """Name and fields of what WHERE means; the name is that of the entry which it replaces, if there is one.
 

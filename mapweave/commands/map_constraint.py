@@ -11,24 +11,19 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_plan_option
+from mapweave.commands.annotating import add_plan_option, record_of
 from mapweave.commands.answer import add_json, print_said
-from mapweave.commands.map_input import SOURCES, map_source, merge_progress, merged_with_progress, opened
-from mapweave.commands.network import (
-    add_network,
-    add_reason,
-    add_timeout,
-    key_holder,
-    network_of,
-    settings_of,
-)
+from mapweave.commands.map_input import SOURCES, map_source
+from mapweave.commands.network import add_network, add_reason, add_timeout
 from mapweave.commands.plan import plan_of
 from mapweave.commands.usage import UsageError, arguments_read
-from mapweave.hybridmap.errors import InvalidFile, MapweaveError
+from mapweave.hybridmap.errors import MapweaveError
 
 if TYPE_CHECKING:
-    from mapweave.hybridmap.constraint_subject import Subject
-    from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint, ManualConstraints
+    from mapweave.fleet import Fleet
+    from mapweave.fleet_questions import FleetQuestions
+    from mapweave.hybridmap.constraint_subject import RetiredArea, RetiredWindow, Subject
+    from mapweave.offline_record import OfflineRecord
 
 PATIENT = 2.0
 """s; who waits longer hears what for."""
@@ -54,127 +49,56 @@ def add_constraint_options(parser: argparse.ArgumentParser, undo: bool = True) -
     parser.add_argument(
         "-o", "--out", type=Path, metavar="OUT", help="with --map: write a map file there instead"
     )
-    add_timeout(parser)
+    add_timeout(parser, of="a merge with it")
     add_network(parser)
 
 
 def constrain(
-    arguments: argparse.Namespace, about: Subject, more: Callable[[], Sequence[str]] = tuple
+    arguments: argparse.Namespace,
+    record: Fleet | OfflineRecord,
+    about: Subject,
+    more: Callable[[], Sequence[str]] = tuple,
 ) -> None:
     """Set the constraint, and print its effect and its number, by which `mapweave map undo` takes it back.
 
-    Afterwards `arguments.map` is the file that holds it. With `--check` only print.
+    With `--check` only print.
 
     Args:
         arguments: of the command.
+        record: of the map.
         about: what the constraint is about.
         more: further lines, asked for when it is set.
 
     Raises:
         MapweaveError: the constraint has no effect, or there is no place to keep it.
     """
-    from mapweave.fleet import author
-    from mapweave.fleet_questions import check_role
-    from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
+    from mapweave.fleet_questions import FleetQuestions
 
-    if arguments.out is not None and arguments.map is None:
-        raise UsageError("--out goes with --map: a server keeps its own record")
-    holder = None if arguments.map is not None else key_holder(network_of(arguments, settings_of(arguments)))
-    check_role(holder)
-    by = author(holder, arguments.by)
     with arguments_read():
-        constraint = ManualConstraint(about, not arguments.undo, by, time.time_ns(), arguments.because)
-        request = ConstraintRequest(constraint, arguments.check)
-    if arguments.map is None:
-        said = _send_to_server(arguments, request, "" if holder is None else holder.name)
-    else:
-        said = _rewrite(arguments, constraint)
-        arguments.map = arguments.map if arguments.check else arguments.out or arguments.map
-    number = None if arguments.check else _number(arguments, constraint)
-    if number is not None and constraint.holds:
+        request = record.request(about, not arguments.undo, arguments.because, arguments.check)
+    said, number = record.keep(request).splitlines(), None
+    if not arguments.check:
+        key = request.constraint.stamp_ns, request.constraint.holds
+        made = enumerate(record.constraints(), 1)
+        number = next((k for k, one in made if (one.stamp_ns, one.holds) == key), None)
+        if isinstance(record, FleetQuestions):
+            said += _settled(record, arguments.timeout)
+    if number is not None and not arguments.undo:
         said[0] += f" (number {number})"
     print_said(arguments, *said, *more(), number=number)
 
 
-def _number(arguments: argparse.Namespace, constraint: ManualConstraint) -> int | None:
-    """Which of the record it is, from 1."""
-    made = constraints_of(arguments).made
-    key = constraint.stamp_ns, constraint.holds
-    return next((k for k, one in enumerate(made, 1) if (one.stamp_ns, one.holds) == key), None)
-
-
-def constraints_of(arguments: argparse.Namespace) -> ManualConstraints:
-    """The record of a map file or of a server; the first is number 1."""
-    from mapweave.commands.map_ends import ask
-    from mapweave.hybridmap.manual_constraint import ConstraintList, ManualConstraints
-    from mapweave.wire.keys import Keys
-    from mapweave.wire.messages import decode
-
-    if arguments.map is not None:
-        return ManualConstraints(opened(arguments.map).content.constraints)
-    return ManualConstraints(
-        decode(ask(arguments, Keys.any_constraints, b"")[0].payload, ConstraintList).made
-    )
-
-
-def _send_to_server(arguments: argparse.Namespace, request: ConstraintRequest, sender: str) -> list[str]:
-    from mapweave.commands.map_ends import ask
-    from mapweave.wire.log_messages import decode_record
-    from mapweave.wire.messages import encode
-    from mapweave.wire.senders import sent_by
-
-    replies = ask(arguments, lambda keys: sent_by(keys.any_constrain(), sender), encode(request))
-    said = [str(decode_record(reply.payload)["said"]) for reply in replies]
-    return said if arguments.check else said + _settled(arguments)
-
-
-def _settled(arguments: argparse.Namespace) -> list[str]:
-    """Wait until the server has merged with it; what is to be said if the time is over."""
-    from mapweave.commands.map_ends import ask
-    from mapweave.wire.keys import Keys
-    from mapweave.wire.log_messages import decode_record
-
+def _settled(fleet: FleetQuestions, timeout: float) -> list[str]:
+    """Wait until the servers have merged with it; what is to be said if the time is over."""
     begin, heard = time.monotonic(), False
-    while (waited := time.monotonic() - begin) < arguments.timeout:
+    while (waited := time.monotonic() - begin) < timeout:
         if waited > PATIENT and not heard:
             heard = True
             print("waiting until the server has merged with it ...", file=sys.stderr, flush=True)
-        if all(
-            decode_record(reply.payload)["settled"] for reply in ask(arguments, Keys.server_statuses, b"")
-        ):
+        if all(server["settled"] for server in fleet.servers()):
             return []
         time.sleep(0.1)
     return ["it is kept; the server is still merging, ask `mapweave map explain` later"]
-
-
-def _rewrite(arguments: argparse.Namespace, constraint: ManualConstraint) -> list[str]:
-    from mapweave.offline_constraints import CHECKED, checked_constraint, with_constraint
-    from mapweave.opened_map import MapSource
-    from mapweave.storage.atomic_file import check_place
-
-    settings = settings_of(arguments).merge
-    one = opened(arguments.map)
-    content, of_file = one.content, one.source is MapSource.FILE
-    out = arguments.out
-    if content.kind == "merged":
-        out = out or Path(arguments.map)
-    elif out is None and not arguments.check:
-        kind = "a map file of kind agent, not merged," if of_file else one.source.words
-        raise InvalidFile(
-            f"{one.path}: is {kind} and is not changed: give -o FILE for a merged map with the constraint"
-            f"{'' if of_file else ', or ask the running server without --map'}"
-        )
-    if out is not None:
-        check_place(out)
-    before = merged_with_progress(one, settings)
-    constraint, words = checked_constraint(content, before, constraint, settings)
-    if arguments.check:
-        return [CHECKED + words]
-    assert out is not None
-    with merge_progress() as report:
-        merged, file = with_constraint(one, before, constraint, settings, report)
-    one.written(out, file)
-    return [words, f"{out}: {merged.summary()}"]
 
 
 def _add_link(actions: Any) -> None:
@@ -198,7 +122,7 @@ def _add_link(actions: Any) -> None:
 
 def run_link(arguments: argparse.Namespace) -> int:
     """Link two nodes."""
-    from mapweave.commands.map_ends import names_of, node_of
+    from mapweave.commands.map_ends import check_ids, nodes_of, noted
     from mapweave.hybridmap.constraint_subject import Linked, read_pose
     from mapweave.hybridmap.named_nodes import own_ids_of
 
@@ -210,11 +134,13 @@ def run_link(arguments: argparse.Namespace) -> int:
             raise UsageError(f"--pose {arguments.pose!r}: give X,Y,DEGREES, for example 1.5,0,90") from None
         with arguments_read():
             pose = read_pose(numbers)
-    a, b = map(node_of, own_ids_of(arguments.nodes, *names_of(arguments)))
-    with arguments_read():
-        about = Linked(a, b, pose)
+    check_ids(arguments.nodes, nodes_of)
     try:
-        constrain(arguments, about)
+        with record_of(arguments) as record:
+            a, b = nodes_of(own_ids_of(arguments.nodes, record.annotations, noted(record.resolve)))
+            with arguments_read():
+                about = Linked(a, b, pose)
+            constrain(arguments, record, about)
     except MapweaveError as error:
         from mapweave.merge.link_checks import GIVE_POSE
 
@@ -243,22 +169,24 @@ def _add_unmerge(actions: Any) -> None:
 
 def run_unmerge(arguments: argparse.Namespace) -> int:
     """Undo a link, or all links between two maps."""
-    from mapweave.commands.map_ends import different_ends_of, explanation_of, names_of
+    from mapweave.commands.map_ends import check_ids, different_ends_of, noted
     from mapweave.hybridmap.constraint_subject import Apart
     from mapweave.hybridmap.explanation import FleetExplanation
     from mapweave.hybridmap.ids import MapId
     from mapweave.hybridmap.named_nodes import own_ids_of
     from mapweave.hybridmap.query import ExplainRequest
 
-    ends = different_ends_of(own_ids_of(arguments.ends, *names_of(arguments)))
-    first, second = (MapId(end[0], end[1]) for end in ends)
+    check_ids(arguments.ends, different_ends_of)
+    with record_of(arguments) as record:
+        ends = different_ends_of(own_ids_of(arguments.ends, record.annotations, noted(record.resolve)))
+        first, second = (MapId(end[0], end[1]) for end in ends)
 
-    def reasons() -> list[str]:
-        found = explanation_of(arguments, ExplainRequest((first, second)))
-        assert isinstance(found, FleetExplanation), "maps were asked about"
-        return [explanation.reason for explanation in found.maps]
+        def reasons() -> list[str]:
+            found = record.explained(ExplainRequest((first, second)))
+            assert isinstance(found, FleetExplanation), "maps were asked about"
+            return [explanation.reason for explanation in found.maps]
 
-    constrain(arguments, Apart(ends), reasons if first != second else list)
+        constrain(arguments, record, Apart(ends), reasons if first != second else list)
     return 0
 
 
@@ -294,44 +222,67 @@ def _add_retire(actions: Any) -> None:
 
 def run_retire(arguments: argparse.Namespace) -> int:
     """Retire maps, nodes, areas or times."""
-    constrain(arguments, _subject(arguments))
-    return 0
-
-
-def _subject(arguments: argparse.Namespace) -> Subject:
-    from mapweave.commands.map_ends import map_of, names_of, node_of
-    from mapweave.hybridmap.area import Area, read_corner
-    from mapweave.hybridmap.constraint_subject import RetiredArea, read_window
-    from mapweave.hybridmap.named_nodes import own_ids_of, retired_of
-    from mapweave.hybridmap.query import ResolveRequest
-    from mapweave.mapserver.plan_answers import in_merged
-
     in_time = bool(arguments.begin or arguments.end)
     if (arguments.area is not None) == bool(arguments.which) or (in_time and len(arguments.which) != 1):
         raise UsageError("give a map or nodes, or --area; --from and --until go with one map")
     if arguments.plan is not None and arguments.area is None:
         raise UsageError("--plan goes with --area")
+    from mapweave.commands.map_ends import check_ids, noted
+    from mapweave.hybridmap.area import read_corner
+    from mapweave.hybridmap.constraint_subject import read_retired
+    from mapweave.hybridmap.named_nodes import retired_of
+
+    about: Subject | None = None
     with arguments_read():
-        if arguments.area is not None:
-            anchor, corners = arguments.area[0], list(map(read_corner, arguments.area[1].split()))
-            record, resolve = names_of(arguments)
-            (node,) = map(node_of, own_ids_of([anchor], record, resolve))
-            placed = plan_of(arguments)
-            if placed is None:
-                return RetiredArea(Area(node, tuple(corners)))
-            (found,) = resolve(ResolveRequest((str(node),))).found
-            part = placed.part(found.component)
-            merged = [in_merged(corner, part) for corner in corners]
-            return RetiredArea(Area.of_merged(found.node, found.merged_from_node, merged))
+        corners = [] if arguments.area is None else list(map(read_corner, arguments.area[1].split()))
         if in_time:
-            which, now = map_of(arguments.which[0]), time.time_ns()
-            if arguments.begin and arguments.end:
-                begin = read_window(which, arguments.begin, "", now, None).begin_ns
-                end = read_window(which, "", arguments.end, now, None).end_ns
-                if begin > end:
-                    raise UsageError(f"--until {arguments.end} is before --from {arguments.begin}")
-            return read_window(which, arguments.begin or "", arguments.end or "", now, None)
-        return retired_of(arguments.which, *names_of(arguments))
+            about = _window(arguments)
+    if arguments.which:
+        check_ids(arguments.which, read_retired)
+    with record_of(arguments) as record:
+        if about is None:
+            with arguments_read():
+                about = (
+                    retired_of(arguments.which, record.annotations, noted(record.resolve))
+                    if arguments.area is None
+                    else _area(arguments, record, corners)
+                )
+        constrain(arguments, record, about)
+    return 0
+
+
+def _window(arguments: argparse.Namespace) -> RetiredWindow:
+    from mapweave.commands.map_ends import map_of
+    from mapweave.hybridmap.constraint_subject import read_window
+
+    which, now = map_of(arguments.which[0]), time.time_ns()
+    if arguments.begin and arguments.end:
+        begin = read_window(which, arguments.begin, "", now, None).begin_ns
+        end = read_window(which, "", arguments.end, now, None).end_ns
+        if begin > end:
+            raise UsageError(f"--until {arguments.end} is before --from {arguments.begin}")
+    return read_window(which, arguments.begin or "", arguments.end or "", now, None)
+
+
+def _area(
+    arguments: argparse.Namespace, record: Fleet | OfflineRecord, corners: list[tuple[float, float]]
+) -> RetiredArea:
+    from mapweave.commands.map_ends import node_of, noted
+    from mapweave.hybridmap.area import Area
+    from mapweave.hybridmap.constraint_subject import RetiredArea
+    from mapweave.hybridmap.named_nodes import own_ids_of
+    from mapweave.hybridmap.query import ResolveRequest
+    from mapweave.mapserver.plan_answers import in_merged
+
+    resolve = noted(record.resolve)
+    (node,) = map(node_of, own_ids_of([arguments.area[0]], record.annotations, resolve))
+    placed = plan_of(arguments, record)
+    if placed is None:
+        return RetiredArea(Area(node, tuple(corners)))
+    (found,) = resolve(ResolveRequest((str(node),))).found
+    part = placed.part(found.component)
+    merged = [in_merged(corner, part) for corner in corners]
+    return RetiredArea(Area.of_merged(found.node, found.merged_from_node, merged))
 
 
 def _add_undo(actions: Any) -> None:
@@ -348,20 +299,22 @@ def _add_undo(actions: Any) -> None:
 
 def run_undo(arguments: argparse.Namespace) -> int:
     """List the constraints that hold, or take one back."""
-    from mapweave.hybridmap.manual_constraint import event_words, to_take_back
+    from mapweave.hybridmap.manual_constraint import ManualConstraints, event_words, to_take_back
     from mapweave.mapserver.http.json_values import constraint_values
     from mapweave.refusals import refusals
 
-    record = constraints_of(arguments)
-    if arguments.number is not None:
-        with refusals():
-            about = to_take_back(record.made, arguments.number)
-        constrain(arguments, about)
-        return 0
+    with record_of(arguments) as record:
+        made = record.constraints()
+        if arguments.number is not None:
+            with refusals():
+                about = to_take_back(made, arguments.number)
+            constrain(arguments, record, about)
+            return 0
+    known = ManualConstraints(made)
     if arguments.json:
-        print(json.dumps(constraint_values(record)))
+        print(json.dumps(constraint_values(known)))
         return 0
-    holding = record.in_force
-    lines = [f"{k:4}  {event_words(c)}" for k, c in enumerate(record.made, 1) if c in holding]
+    holding = known.in_force
+    lines = [f"{k:4}  {event_words(c)}" for k, c in enumerate(made, 1) if c in holding]
     print("\n".join(lines) or "no manual constraint holds")
     return 0

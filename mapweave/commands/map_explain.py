@@ -7,9 +7,10 @@ import json
 from typing import Any
 
 from mapweave.commands import values
+from mapweave.commands.annotating import record_of
 from mapweave.commands.answer import add_json
 from mapweave.commands.map_input import SOURCES, map_source
-from mapweave.commands.network import add_network, add_timeout
+from mapweave.commands.network import add_network
 from mapweave.commands.usage import UsageError
 
 
@@ -28,28 +29,32 @@ def add_to(actions: Any) -> None:
     )
     parser.add_argument("--draw", type=values.png, metavar="PNG", help="draw the landmarks of the two nodes")
     add_json(parser)
-    add_timeout(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask, print, draw."""
-    from mapweave.commands.map_ends import different_ends_of, explanation_of, resolved
+    from mapweave.commands.map_ends import check_ids, different_ends_of, noted
     from mapweave.explanation_text import maps_words, pair_words
     from mapweave.extras import need
     from mapweave.hybridmap.constraint_subject import EXAMPLE
     from mapweave.hybridmap.explanation import FleetExplanation, PairExplanation
     from mapweave.hybridmap.ids import NodeId
+    from mapweave.hybridmap.named_nodes import ids_of
     from mapweave.hybridmap.query import ExplainRequest
     from mapweave.mapserver.http.json_values import json_values
 
     if arguments.draw is not None:
         need("viz")
-    ends = different_ends_of(resolved(arguments, arguments.ends)) if arguments.ends else None
-    if arguments.draw is not None and not (ends and all(isinstance(end, NodeId) for end in ends)):
-        raise UsageError(f"--draw needs two nodes: {EXAMPLE}")
-    explanation = explanation_of(arguments, ExplainRequest(ends))
+    if arguments.ends:
+        check_ids(arguments.ends, different_ends_of)
+    with record_of(arguments) as record:
+        words = ids_of(arguments.ends, noted(record.resolve))
+        ends = different_ends_of(words) if words else None
+        if arguments.draw is not None and not (ends and all(isinstance(end, NodeId) for end in ends)):
+            raise UsageError(f"--draw needs two nodes: {EXAMPLE}")
+        explanation = record.explained(ExplainRequest(ends))
     values = json_values(explanation)
     if isinstance(explanation, PairExplanation):
         lines = pair_words(explanation)

@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import argparse
 import json
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from mapweave.commands.map_input import SOURCES, map_source, opened
-from mapweave.commands.network import add_network, add_timeout
+from mapweave.commands.annotating import record_of
+from mapweave.commands.map_input import SOURCES, map_source
+from mapweave.commands.network import add_network
 from mapweave.commands.usage import UsageError
-
-if TYPE_CHECKING:
-    from mapweave.hybridmap.map_event import History
 
 
 def add_to(actions: Any) -> None:
@@ -28,18 +26,19 @@ def add_to(actions: Any) -> None:
     parser.add_argument("--map", type=map_source, metavar="FILE", help=f"of {SOURCES}; no server is asked")
     parser.add_argument("--most", type=int, default=40, metavar="N", help="the newest so many (default: 40)")
     parser.add_argument("--json", action="store_true", help="print one JSON object, with all")
-    add_timeout(parser)
     add_network(parser)
     parser.set_defaults(run=run)
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
+    from mapweave.hybridmap.map_event import History
     from mapweave.mapserver.http.json_values import json_values, time_of
 
     if arguments.most < 1:
         raise UsageError(f"--most {arguments.most}: give 1 or more")
-    events = _history(arguments)
+    with record_of(arguments) as record:
+        events = History(tuple(record.history()))
     if arguments.json:
         print(json.dumps(json_values(events)))
         return 0
@@ -49,22 +48,3 @@ def run(arguments: argparse.Namespace) -> int:
     lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:11}  {h.words}" for h in listed[-arguments.most :]]
     print("\n".join(lines) if lines else "no joins, splits, manual constraints, annotations or commands yet")
     return 0
-
-
-def _history(arguments: argparse.Namespace) -> History:
-    from mapweave.commands.map_ends import ask
-    from mapweave.hybridmap.annotation import Annotations
-    from mapweave.hybridmap.manual_constraint import ManualConstraints
-    from mapweave.hybridmap.map_event import History
-    from mapweave.mapserver.constraint_history import with_constraints
-    from mapweave.wire.keys import Keys
-    from mapweave.wire.messages import decode
-
-    if arguments.map is None:
-        return decode(ask(arguments, Keys.any_history, b"")[0].payload, History)
-    content = opened(arguments.map).content
-    return History(
-        with_constraints(
-            content.history, ManualConstraints(content.constraints), Annotations(content.annotations)
-        )
-    )

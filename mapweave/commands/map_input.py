@@ -2,18 +2,13 @@
 
 from __future__ import annotations
 
-import argparse
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from mapweave.commands.network import settings_of
-
 if TYPE_CHECKING:
-    from mapweave.mapserver.routes import Router
     from mapweave.merge.pose_graph.merged_map import MergedMap
     from mapweave.merge.settings import MergeSettings
     from mapweave.offline_merge import Progress
@@ -52,20 +47,6 @@ def merged_with_progress(one: OpenedMap, settings: MergeSettings | None = None) 
     """The merged map of a file, store or journal."""
     with merge_progress() as report:
         return one.merged(settings, report)
-
-
-def router_of(arguments: argparse.Namespace) -> Router:
-    """Routes over the map of `--map`, by what is closed now.
-
-    Raises:
-        InvalidFile: it is none, or cannot be read.
-    """
-    from mapweave.hybridmap.annotation import Annotations
-    from mapweave.mapserver.routes import Router
-
-    one = opened(arguments.map)
-    merged = merged_with_progress(one, settings_of(arguments).merge)
-    return Router(merged).at(Annotations(one.content.annotations), time.time_ns())
 
 
 @contextmanager

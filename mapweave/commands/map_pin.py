@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from mapweave.hybridmap.floor_plan import PlacedPlan
     from mapweave.hybridmap.ids import NodeId
     from mapweave.hybridmap.pose import Pose2
-    from mapweave.offline_annotations import OfflineAnnotations
+    from mapweave.offline_record import OfflineRecord
 
 
 def add_to(actions: Any) -> None:
@@ -91,7 +91,7 @@ def _list(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _on_plan(record: Fleet | OfflineAnnotations, node: NodeId, placed: PlacedPlan) -> Pose2 | None:
+def _on_plan(record: Fleet | OfflineRecord, node: NodeId, placed: PlacedPlan) -> Pose2 | None:
     """Where a node is on a plan; None if it is on neither the plan nor the merged map now."""
     from mapweave.mapserver.plan_answers import nodes_on_plan
 

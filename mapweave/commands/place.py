@@ -21,7 +21,7 @@ from mapweave.hybridmap.errors import InvalidValue
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
     from mapweave.hybridmap.annotation import Annotation
-    from mapweave.offline_annotations import OfflineAnnotations
+    from mapweave.offline_record import OfflineRecord
 
 EXAMPLES = "Examples: `mapweave place add kitchen r0.1.17`, `mapweave go r0 kitchen`."
 
@@ -107,7 +107,7 @@ def run_list(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def _where(record: Fleet | OfflineAnnotations, entry: Annotation) -> tuple[str | None, str]:
+def _where(record: Fleet | OfflineRecord, entry: Annotation) -> tuple[str | None, str]:
     """The node to which robots go, and what is to be said about it; None if there is none."""
     from mapweave.hybridmap.query import ResolveRequest
 

@@ -26,9 +26,8 @@ if TYPE_CHECKING:
     from mapweave.fleet import Fleet
     from mapweave.hybridmap.floor_plan import PlacedPlan
     from mapweave.hybridmap.pose import Pose2
-    from mapweave.mapserver.routes import Router
     from mapweave.merge.pose_graph.merged_map import MergedMap
-    from mapweave.offline_annotations import OfflineAnnotations
+    from mapweave.offline_record import OfflineRecord
 
 FORMATS = ("rmf", "nav2", "tf", "json")
 PAIR = "r0.1.17=412,230, kitchen=412,230 or 3.1,-2.0=412,230"
@@ -183,24 +182,13 @@ def run_export(arguments: argparse.Namespace) -> int:
     return 0
 
 
-def plan_of(arguments: argparse.Namespace, router: Router | None = None) -> PlacedPlan | None:
-    """The plan that `--plan` names, of a server or of the map of `--map`; None if it is not given.
-
-    Args:
-        arguments: of the command line.
-        router: of the map of `map`, if it is there already.
+def plan_of(arguments: argparse.Namespace, record: Fleet | OfflineRecord) -> PlacedPlan | None:
+    """The plan that `--plan` names; None if it is not given.
 
     Raises:
         MapweaveError: there is none of this name, no server answers, or the map cannot be read.
     """
-    if arguments.plan is None:
-        return None
-    if router is not None:
-        from mapweave.mapserver.floor_plans import placed_plans
-
-        return placed_plans(router.annotations, router.merged).plan(arguments.plan)
-    with record_of(arguments) as record:
-        return record.plans().plan(arguments.plan)
+    return None if arguments.plan is None else record.plans().plan(arguments.plan)
 
 
 def plan_place(placed: PlacedPlan, pose: Pose2 | None) -> str:
@@ -227,7 +215,7 @@ def _pair(word: str) -> dict[str, Any]:
     return {"at": place.strip(), "u": position[0], "v": position[1]}
 
 
-def _draw(record: Fleet | OfflineAnnotations, placed: PlacedPlan, arguments: argparse.Namespace) -> None:
+def _draw(record: Fleet | OfflineRecord, placed: PlacedPlan, arguments: argparse.Namespace) -> None:
     from mapweave.drawing.plan_picture import draw_plan
     from mapweave.extras import need
     from mapweave.storage.atomic_file import check_place
@@ -241,7 +229,7 @@ def _draw(record: Fleet | OfflineAnnotations, placed: PlacedPlan, arguments: arg
     print(arguments.picture, file=sys.stderr if arguments.json else sys.stdout)
 
 
-def _merged(record: Fleet | OfflineAnnotations, arguments: argparse.Namespace) -> MergedMap:
+def _merged(record: Fleet | OfflineRecord, arguments: argparse.Namespace) -> MergedMap:
     from mapweave.fleet import Fleet
     from mapweave.mapserver.map_files import merged_of
     from mapweave.terminal import working

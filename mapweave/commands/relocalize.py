@@ -6,38 +6,22 @@ import argparse
 import json
 import math
 import sys
-from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.annotating import add_plan_option
+from mapweave.commands.annotating import add_plan_option, record_of
 from mapweave.commands.answer import add_json
-from mapweave.commands.map_input import SOURCES, map_source, router_of
-from mapweave.commands.network import (
-    add_network,
-    add_timeout,
-    key_holder,
-    network_of,
-    reach,
-    settings_of,
-)
+from mapweave.commands.map_input import SOURCES, map_source
+from mapweave.commands.network import add_network
 from mapweave.commands.plan import plan_of, plan_place
 from mapweave.commands.usage import UsageError
 from mapweave.exit_status import DONE, NO
-from mapweave.hybridmap.errors import DeviceError, NotConnected
+from mapweave.hybridmap.errors import DeviceError
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from mapweave.hybridmap.floor_plan import PlacedPlan
-    from mapweave.hybridmap.ids import NodeId
-    from mapweave.hybridmap.node import Node
-    from mapweave.hybridmap.query import RelocalizeAnswer, View
-    from mapweave.mapserver.routes import Router
-    from mapweave.settings import NetworkSettings
-    from mapweave.wire.keys import Keys
-    from mapweave.wire.zenoh_bus import ZenohBus
+    from mapweave.hybridmap.query import RelocalizeAnswer
 
 
 def add_to(commands: Any) -> None:
@@ -62,7 +46,6 @@ def add_to(commands: Any) -> None:
         help="draw the best candidate's landmarks next to the image, joined where they match",
     )  # fmt: skip
     add_plan_option(parser)
-    add_timeout(parser, 5.0)
     add_json(parser)
     add_network(parser)
     parser.set_defaults(run=run)
@@ -88,74 +71,24 @@ def run(arguments: argparse.Namespace) -> int:
     grey = read_grey(arguments.image, camera, str(camera_file))
 
     lens = Lens(camera, distortion)
-    router = None if arguments.map is None else router_of(arguments)
-    plan = plan_of(arguments, router)
-
-    @cache
-    def view() -> View:
-        return Sift(lens).extract(grey).view(camera)
-
-    with working("looking for the place"):
-        answer, node = _by_server(arguments, view) if router is None else _by_map(router, view())
+    with record_of(arguments) as record:
+        record.annotations()  # where no server answers, that is said before the work
+        plan = plan_of(arguments, record)
+        with working("looking for the place"):
+            view = Sift(lens).extract(grey).view(camera)
+            answer = record.locate(view)
+            drawn = arguments.draw is not None and answer.candidates
+            node = record.node(answer.candidates[0].node) if drawn else None
     if arguments.json:
         print(json.dumps(_json(answer, plan)))
     else:
         _print(answer, plan)
     if arguments.draw is not None and node is not None:
         best = answer.candidates[0].node_from_robot.mean
-        draw_matches(arguments.draw, grey, lens, node, view(), best)
+        draw_matches(arguments.draw, grey, lens, node, view, best)
     elif arguments.draw is not None:
         print(f"{arguments.draw} is not drawn: no place was recognised", file=sys.stderr)
     return DONE if answer.certainty is Certainty.FOUND else NO
-
-
-def _by_server(
-    arguments: argparse.Namespace, view: Callable[[], View]
-) -> tuple[RelocalizeAnswer, Node | None]:
-    """The answer of a running server, and the best candidate's node if it is to be drawn."""
-    from mapweave.commands.map_ends import answers
-    from mapweave.connection import no_server, server_statuses, waits_for
-    from mapweave.hybridmap.query import RelocalizeAnswer
-    from mapweave.wire.messages import decode, encode_view
-
-    network = network_of(arguments, settings_of(arguments))
-    bus, keys = reach(network)
-    try:
-        if all(map(waits_for, server_statuses(bus, keys, arguments.timeout))):
-            raise no_server(bus, keys, key_holder(network))  # said before the work
-        (reply, *_) = answers(bus, network, keys.any_relocalize(), encode_view(view()), arguments.timeout)
-        answer = decode(reply.payload, RelocalizeAnswer)
-        if arguments.draw is None or not answer.candidates:
-            return answer, None
-        return answer, _node(bus, keys, network, answer.candidates[0].node, arguments.timeout)
-    finally:
-        bus.close()
-
-
-def _by_map(router: Router, view: View) -> tuple[RelocalizeAnswer, Node | None]:
-    """The answer of a map, and the best candidate's node."""
-    from mapweave.mapserver.places import PlaceResolver
-    from mapweave.offline_relocalization import relocalizer_in
-
-    merged = router.merged
-    answer = PlaceResolver(router, router.annotations).named(relocalizer_in(merged).answer(view))
-    if not answer.candidates:
-        return answer, None
-    best = answer.candidates[0].node
-    return answer, merged.maps[best.map].nodes[best]
-
-
-def _node(bus: ZenohBus, keys: Keys, network: NetworkSettings, node_id: NodeId, patience: float) -> Node:
-    """A node of the merged map: the beginning of the way from itself to itself."""
-    from mapweave.commands.map_ends import answers
-    from mapweave.hybridmap.query import RouteAnswer, RouteRequest
-    from mapweave.wire.messages import decode, encode
-
-    request = encode(RouteRequest(node_id, node_id))
-    way = decode(answers(bus, network, keys.any_route(), request, patience)[0].payload, RouteAnswer)
-    if not way.legs or way.legs[0].node.id != node_id:
-        raise NotConnected(f"the map server did not give node {node_id}: {way.reason}")
-    return way.legs[0].node
 
 
 def _json(answer: RelocalizeAnswer, plan: PlacedPlan | None) -> dict[str, Any]:

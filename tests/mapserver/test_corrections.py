@@ -6,7 +6,7 @@ import http.client
 import json
 import re
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapweave import Fleet
+from mapweave import Fleet, connection
+from mapweave import fleet as fleet_module
 from mapweave.cli import main
 from mapweave.commands import map_constraint
 from mapweave.exit_status import NO, USAGE
@@ -32,6 +33,7 @@ from mapweave.mapserver.server import MapServer
 from mapweave.storage.map_file import MapFile
 from mapweave.wire.keys import Keys
 from mapweave.wire.messages import encode
+from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.maps import LOG_ID, entries_of, map_tours, write_store
 from synthetic.world import room
 from tests.waiting import eventually
@@ -183,6 +185,59 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
         assert asking.merged().poses.keys() == content.poses.keys()
         kinds = [type(one.about) for one in asking.fleet.constraints()]
         assert kinds == [Linked, RetiredNodes, RetiredNodes, Linked, RetiredArea, RetiredArea]
+
+
+def test_the_shell_asks_as_python_does(
+    path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Each of its questions had a connection of its own, other words, and a limit of its own."""
+    reached, reach = [], connection.reach
+
+    def counted(*arguments: Any) -> ZenohBus:
+        reached.append(arguments)
+        return reach(*arguments)
+
+    with serving(path) as asking:
+        for module in (connection, fleet_module):
+            monkeypatch.setattr(module, "reach", counted)
+        python = asking.fleet
+        refused: dict[tuple[str, ...], Callable[[], object]] = {
+            ("undo", "9"): lambda: python.undo(9),
+            ("retire", "z.1"): lambda: python.retire("z.1"),
+            ("unmerge", "a.1", "b.1"): lambda: python.unlink("a.1", "b.1"),
+            ("link", "a.1.1", "nowhere"): lambda: python.link("a.1.1", "nowhere"),
+            ("explain", "a.1.1", "z.1.1"): lambda: python.explain("a.1.1", "z.1.1"),
+            ("route", "a.1.1", "z.1.1"): lambda: python.route("a.1.1", "z.1.1"),
+        }
+        for words, by_python in refused.items():
+            with pytest.raises(Refused) as why:
+                by_python()
+            reached.clear()
+            capfd.readouterr()
+            assert main(["map", *words, *asking.at[:4]]) == NO
+            assert capfd.readouterr().err == f"mapweave: {why.value}\n"
+            assert len(reached) == 1, words
+        reached.clear()
+        assert main(["map", "retire", "b.1.5", *asking.at]) == 0 and len(reached) == 1
+
+
+def test_python_hears_of_every_server_what_it_keeps_and_refuses(path: Path, tmp_path: Path) -> None:
+    """Of several the first to answer was all that it heard of."""
+    other = write_store(tmp_path / "s1.sqlite", {B: logs()[B]})
+    router = ZenohFleet()
+    try:
+        with (
+            MapServer(router.join(), Keys("demo"), path, "s0") as first,
+            MapServer(router.join(), Keys("demo"), other, "s1") as second,
+            Fleet(router.endpoints[0], by="anna") as fleet,
+        ):
+            assert first.settle(60) and second.settle(60)
+            eventually(lambda: len(fleet.servers()) == 2)
+            said = fleet.retire("a.1").splitlines()
+            assert sorted(line.partition(" ")[0] for line in said) == ["another", "map"], said
+            assert any(line.startswith("another map server refused: there is no map a.1") for line in said)
+    finally:
+        router.close()
 
 
 def test_of_two_links_before_a_merge_the_second_must_fit_the_first(

@@ -15,22 +15,23 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.portal import Portal, PortalMeans
 from mapweave.hybridmap.pose import Pose2
-from mapweave.offline_annotations import OfflineAnnotations
+from mapweave.offline_record import OfflineRecord
+from mapweave.opened_map import open_map
 from mapweave.storage.plan_image import plan_file
 
 FIRST, THIRD = NodeId("r0", 1, 1), NodeId("r1", 1, 3)
 
 
 @pytest.fixture
-def record(joined: Path, tmp_path: Path) -> OfflineAnnotations:
-    return OfflineAnnotations(joined, tmp_path / "out.mapweave", "anna")
+def record(joined: Path, tmp_path: Path) -> OfflineRecord:
+    return OfflineRecord(open_map(joined), tmp_path / "out.mapweave", "anna")
 
 
-def last(record: OfflineAnnotations) -> Annotation:
+def last(record: OfflineRecord) -> Annotation:
     return record.annotations().made[-1]
 
 
-def test_each_kind_has_a_method(record: OfflineAnnotations) -> None:
+def test_each_kind_has_a_method(record: OfflineRecord) -> None:
     record.place("kitchen", THIRD, because="the sink")
     assert last(record).body == Place(THIRD) and last(record).because == "the sink"
     record.place("hall", corners=[(0, 0), (1, 0), (1, 1)], near="kitchen")
@@ -60,7 +61,7 @@ def test_each_kind_has_a_method(record: OfflineAnnotations) -> None:
     assert record.plans().plan("flat").part().rms < 1e-6
 
 
-def test_a_check_keeps_nothing_and_a_field_that_there_is_not_is_found(record: OfflineAnnotations) -> None:
+def test_a_check_keeps_nothing_and_a_field_that_there_is_not_is_found(record: OfflineRecord) -> None:
     """The type checker finds it, too: an ignored error that there is not would be one."""
     assert record.place("kitchen", THIRD, check=True).startswith("only checked, nothing is changed: place")
     with pytest.raises(TypeError, match="nodee"):
@@ -70,7 +71,7 @@ def test_a_check_keeps_nothing_and_a_field_that_there_is_not_is_found(record: Of
     assert record.annotations().made == ()
 
 
-def test_words_are_nodes_and_what_is_none_is_refused(joined: Path, record: OfflineAnnotations) -> None:
+def test_words_are_nodes_and_what_is_none_is_refused(joined: Path, record: OfflineRecord) -> None:
     room = mapweave.open(joined)
     for one in (room, record):
         assert one.resolve("r1.1.3").found[0].node == THIRD
@@ -81,7 +82,7 @@ def test_words_are_nodes_and_what_is_none_is_refused(joined: Path, record: Offli
             one.resolve(3)  # type: ignore[arg-type]
 
 
-def test_a_position_is_two_numbers_wherever_a_node_stands(joined: Path, record: OfflineAnnotations) -> None:
+def test_a_position_is_two_numbers_wherever_a_node_stands(joined: Path, record: OfflineRecord) -> None:
     """Only text was taken: `(1.0, 2.0)` was asked for as the word "(1.0, 2.0)", or refused."""
     room = mapweave.open(joined)
     at = room.pose(THIRD).mean
@@ -118,7 +119,7 @@ def test_a_position_is_two_numbers_wherever_a_node_stands(joined: Path, record: 
         room.node((500.0, 2.0))
 
 
-def test_a_refusal_says_what_this_annotation_takes(record: OfflineAnnotations) -> None:
+def test_a_refusal_says_what_this_annotation_takes(record: OfflineRecord) -> None:
     """A place was said to be an edge, a closure a node, and a time that is read as UTC local time."""
     edge = (FIRST, THIRD)
     with pytest.raises(Refused, match=r"^a place is a node or an area: give one of them$"):

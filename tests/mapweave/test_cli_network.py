@@ -87,8 +87,16 @@ def test_an_address_of_another_machine(capfd, tmp_path):
 
 def test_asking_without_a_server(capfd, recording, closed):
     picture = recording / "images" / "0.png"
-    output = complaint(capfd, "relocalize", picture, "--connect", closed, "--timeout", "0.3")
+    output = complaint(capfd, "relocalize", picture, "--connect", closed)
     assert f"no router at {closed}: start" in output
+
+
+@pytest.mark.parametrize(
+    "words",
+    ["link r0.1 r1.1", "unmerge r0.1 r1.1.1", "retire r0.1 r0.1.1", "explain r0.1 r0.1", "route r0.1 r0.1.1"],
+)
+def test_wrong_ids_are_a_wrong_command_line_also_without_a_server(capfd, closed, words):
+    complaint(capfd, "map", *words.split(), "--connect", closed, status=USAGE)
 
 
 def test_where_nothing_listens_no_command_waits_for_a_router(capfd, closed, port, monkeypatch):
@@ -151,7 +159,7 @@ def test_a_router_that_was_looked_for_long_enough_is_reported_at_once(closed, ca
 
 
 def test_asking_about_an_image(capfd, recording, tmp_path, closed):
-    rest = ["--connect", closed, "--timeout", "0.1"]
+    rest = ["--connect", closed]
     lonely = tmp_path / "a.png"
     lonely.write_bytes((recording / "images" / "0.png").read_bytes())
     assert "give the intrinsics with --camera" in complaint(capfd, "relocalize", lonely, *rest, status=USAGE)
@@ -161,7 +169,7 @@ def test_asking_about_an_image(capfd, recording, tmp_path, closed):
     for known in (camera, []):
         assert "b.png: no such file" in complaint(capfd, "relocalize", tmp_path / "b.png", *known)
     for seconds in ("0", "-1", "nan", "inf"):
-        output = complaint(capfd, "relocalize", lonely, *camera, f"--timeout={seconds}", status=USAGE)
+        output = complaint(capfd, "map", "retire", "r0.1", f"--timeout={seconds}", status=USAGE)
         assert f"--timeout {seconds}: give seconds" in output
     lonely.write_text("no image")
     assert "not an image" in complaint(capfd, "relocalize", lonely, *camera, *rest)

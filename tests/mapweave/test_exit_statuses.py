@@ -152,7 +152,7 @@ CASES: dict[str, list[tuple[int, str]]] = {
     ],
     "map fetch": [(USAGE, ""), (USAGE, "{out} --connect nowhere"), (FAILED, "{out} --connect {at}")],
     "map explain": [
-        (USAGE, "r0.1"), (USAGE, "r0.1.1 r1.1.1 --map {map} --draw x.gif"), (USAGE, "r0.1 r1.1 --timeout 0"),
+        (USAGE, "r0.1"), (USAGE, "r0.1.1 r1.1.1 --map {map} --draw x.gif"), (USAGE, "r0.1 r1.1 --timeout 9"),
         (USAGE, "r0.1 r0.1 --map {map}"), (USAGE, "r0.1.1 r0.1.1 --map {map}"),
         (NO, "r0.1.1 r9.1.1 --map {map}"), (FAILED, "--connect {at}"),
     ],
@@ -216,7 +216,7 @@ CASES: dict[str, list[tuple[int, str]]] = {
     ],
     "info": [(USAGE, ""), (FAILED, "{tmp}/none")],
     "relocalize": [
-        (USAGE, "{images}/0.png --timeout 0"), (USAGE, "{map}"), (USAGE, "{images}/0.png --draw x.gif"),
+        (USAGE, "{map}"), (USAGE, "{images}/0.png --draw x.gif"),
         (NO, "{images}/0.png --map {map}"), (FAILED, "{tmp}/none.png"),
         (FAILED, "{images}/0.png --connect {at}"),
     ],

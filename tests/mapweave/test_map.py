@@ -179,7 +179,7 @@ def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path: Path) -> No
             asked.explain("r0.1", "r1.1")
 
     view, _ = take_view(WORLD, TOUR[2] @ mapweave.Pose2(0.1, 0.05, 0.05), np.random.default_rng(5))
-    here, there = (asked._answer(view) for asked in (fleet, file))
+    here, there = (asked.locate(view) for asked in (fleet, file))
     assert here.certainty is there.certainty is mapweave.Certainty.FOUND
     assert [place.node for place in here.candidates] == [place.node for place in there.candidates]
 

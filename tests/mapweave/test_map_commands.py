@@ -400,7 +400,7 @@ def serving(folder: Path, port: int) -> Iterator[None]:
 def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Said, tmp_path: Path) -> None:
     write_store(tmp_path / "s0.sqlite", logs())
     port = free_port()
-    at = ["--fleet", "why", "--connect", f"tcp/127.0.0.1:{port}", "--timeout", "60"]
+    at = ["--fleet", "why", "--connect", f"tcp/127.0.0.1:{port}"]
     with serving(tmp_path, port):
         end = time.monotonic() + 90
         while "r0.1 and r1.1 are one map: " not in said_or_refused(said, "map", "explain", *at):

@@ -127,7 +127,7 @@ def test_a_merge_that_loses_its_support_is_undone_and_reported(
         return lambda: wanted.items() <= status().items()
 
     def said(*words: object) -> str:
-        at = ["--fleet", "twins", "--connect", serve[4], "--timeout", "60"]
+        at = ["--fleet", "twins", "--connect", serve[4]]
         capfd.readouterr()
         assert main(["map", *map(str, words), *at]) in (DONE, NO)
         return capfd.readouterr().out
