@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
+import zlib
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -12,10 +13,11 @@ from typing import Any
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.entry import Position
-from mapweave.mapserver.log.integrity import SCHEMA, Gap, insert, repair
+from mapweave.mapserver.log.integrity import SCHEMA, Gap, checksum, insert, repair
 from mapweave.mapserver.log.store import ID, LogChanges, News, Store, fresh_id
 from mapweave.storage.database import Database
 from mapweave.storage.full_disks import logged
+from mapweave.wire.log_messages import StoredChange
 
 log = logging.getLogger(__name__)
 
@@ -63,6 +65,20 @@ class SqliteStore(Store):
 
     def follow(self, changed: Callable[[News], None]) -> None:
         """Nothing: no other server writes to the file."""
+
+    def newest_change(self, map_id: MapId, watermark: int) -> StoredChange | None:
+        """See `Store`; None for one that the disk has damaged since the store was opened.
+
+        Its checksum would tell the robot that the robot's own disk was put back, which ends that log.
+        """
+        query = (
+            "SELECT * FROM change WHERE agent = ? AND epoch = ? AND sequence <= ? "
+            "ORDER BY sequence DESC LIMIT 1"
+        )
+        for *values, crc in self._read(query, (*map_id, watermark)):
+            if checksum(values) == crc:
+                return StoredChange(values[2], zlib.crc32(values[-1]))
+        return None
 
     def landmarks(self, node: NodeId) -> int | None:
         """How many landmarks a node has; None if there is no such node."""

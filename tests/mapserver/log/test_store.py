@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -97,6 +98,15 @@ def test_the_newest_change_is_known_by_its_body(store: Store) -> None:
         "what was refused is not here"
     )
     assert store.newest_change(MAP, 1) != second and store.newest_change(MAP, 0) is None
+
+
+def test_a_change_that_the_disk_damages_later_contradicts_no_robot(tmp_path: Path) -> None:
+    with closing(SqliteStore(tmp_path / "s0.sqlite")) as store:
+        store.apply(MAP, 5, [entry(1), entry(2)])
+        assert store.newest_change(MAP, 2) is not None
+        with closing(sqlite3.connect(tmp_path / "s0.sqlite")) as disk, disk:
+            disk.execute("UPDATE change SET body = zeroblob(length(body)) WHERE sequence = 2")
+        assert store.newest_change(MAP, 2) is None and store.newest_change(MAP, 1) is not None
 
 
 def test_an_unknown_map_is_empty(store: Store) -> None:
