@@ -9,6 +9,13 @@ from collections.abc import Callable
 
 from mapweave.wire.bus import Bus, Reply
 
+SHORTEST_PAUSE = 0.05
+"""s between two of the same question, also where a server names less."""
+MOST_OPEN = 8
+"""Of the same question at once."""
+MOST_REPLIES, MOST_BYTES = 1000, 2**25
+"""To one question; more than any fleet's servers send. Then no more is waited for."""
+
 
 def ask_patiently(bus: Bus, key: str, payload: bytes, timeout: float) -> list[Reply]:
     """Ask, and ask busy servers again at their time, until the patience is over.
@@ -32,7 +39,8 @@ class BusyServers:
     """One question to several servers, of which one may be busy while another says nothing.
 
     A server that is stopped, or behind a bad network, keeps the question open until its time is over. While
-    it is waited for, a server that was busy is asked again at its time.
+    it is waited for, a server that was busy is asked again at its time. One that lies about that, or replies
+    without end, fills neither memory nor network.
     """
 
     def __init__(self, bus: Bus, key: str, payload: bytes, enough: Callable[[Reply], bool]) -> None:
@@ -49,6 +57,7 @@ class BusyServers:
         self._settled = False
         self._open = 0
         self._replies: list[Reply] = []
+        self._bytes = 0
         self._again_at = math.inf
 
     def ask(self, timeout: float) -> list[Reply]:
@@ -65,8 +74,8 @@ class BusyServers:
             self._begin(timeout)
             while self._open and not self._settled:
                 pause = self._again_at - time.monotonic()
-                if pause > 0.0:
-                    self._changed.wait(pause if self._again_at < end else None)
+                if pause > 0.0 or self._open == MOST_OPEN:
+                    self._changed.wait(pause if pause > 0.0 and self._again_at < end else None)
                 else:
                     self._again_at = math.inf
                     if (left := end - time.monotonic()) > 0.0:
@@ -89,8 +98,11 @@ class BusyServers:
         with self._changed:
             if not self._settled:
                 self._replies.append(reply)
-                self._settled = self._enough(reply)
+                self._bytes += len(reply.payload)
+                most = len(self._replies) >= MOST_REPLIES or self._bytes >= MOST_BYTES
+                self._settled = self._enough(reply) or most
                 if reply.retry_after > 0.0:
-                    self._again_at = min(self._again_at, time.monotonic() + reply.retry_after)
+                    pause = max(reply.retry_after, SHORTEST_PAUSE)
+                    self._again_at = min(self._again_at, time.monotonic() + pause)
                 self._changed.notify()
             return self._settled

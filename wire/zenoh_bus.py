@@ -44,6 +44,9 @@ _D = TypeVar("_D", bound=Declared)
 SILENT, UNANSWERED = 20.0, 10.0
 """After so long without any message a client asks its router for a sign of life, and connects again if none
 comes for so long, s. A router that is gone is noticed earlier, by Zenoh."""
+MOST_REPLIES, MOST_REPLY_BYTES = 16_384, 2**27
+"""To one question; then no further one is waited for: one of each client that a router takes, and four of the
+largest size. Zenoh lets each client send any number of them."""
 FIRST_LOOK = 0.05
 """When a client first looks for that sign, s; later ones each take twice the time of the one before."""
 
@@ -118,6 +121,7 @@ class ZenohBus:
         """Ask everyone who serves the key (or a key that the pattern matches)."""
         check_pattern(key)
         replies: list[Reply] = []
+        size = 0
         with self.using_session() as session:
             if session is None:
                 return []
@@ -134,7 +138,11 @@ class ZenohBus:
                     if (reply := read_reply(one)) is not None:
                         self.owner.heard()
                         replies.append(reply)
+                        size += len(reply.payload)
                         if enough(reply):
+                            break
+                        if len(replies) >= MOST_REPLIES or size >= MOST_REPLY_BYTES:
+                            log.warning("%s: too many replies (%d, %d bytes)", key, len(replies), size)
                             break
             except zenoh.ZError as error:
                 log.debug("asking %s failed: %s", key, error)

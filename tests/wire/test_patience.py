@@ -10,9 +10,9 @@ from unittest.mock import ANY
 
 import pytest
 
-from mapweave.wire.bus import Reply, Request
+from mapweave.wire.bus import Reply, Request, never
 from mapweave.wire.memory import MemoryBus, MemoryHub
-from mapweave.wire.patience import BusyServers, ask_patiently
+from mapweave.wire.patience import MOST_BYTES, MOST_OPEN, MOST_REPLIES, BusyServers, ask_patiently
 
 
 def busy_twice(asked: list[float], answer: bytes) -> Callable[[Request], None]:
@@ -121,4 +121,44 @@ def test_the_wait_ends_with_its_time(hub: MemoryHub, silent: MemoryBus, timeout:
     assert timeout <= time.monotonic() - began < timeout + 2.0
     assert replies and all(one.error == "busy" for one in replies)
     server.close()
+    robot.close()
+
+
+def test_a_server_that_is_always_busy_for_a_moment_is_asked_seldom(hub: MemoryHub, silent: MemoryBus) -> None:
+    """One that lied so was asked 370 times a second, by up to 380 threads."""
+    liar, robot = MemoryBus(hub), MemoryBus(hub)
+    asked: list[str] = []
+
+    def refuse(request: Request) -> None:
+        asked.append(request.key)
+        request.refuse("busy", 1e-3)
+
+    liar.serve("where", refuse)
+    BusyServers(robot, "where", b"", answered).ask(1.0)
+    assert 2 <= len(asked) <= MOST_OPEN
+    liar.close()
+    robot.close()
+
+
+class Endless(MemoryBus):
+    """Its question is replied to without end."""
+
+    def __init__(self, hub: MemoryHub, payload: bytes) -> None:
+        super().__init__(hub)
+        self._payload = payload
+
+    def ask(
+        self, key: str, payload: bytes, timeout: float, enough: Callable[[Reply], bool] = never
+    ) -> list[Reply]:
+        for count in range(1, 10**6):
+            if enough(Reply(self._payload)):
+                return [Reply(self._payload)] * count
+        raise AssertionError("without end")
+
+
+@pytest.mark.parametrize(("size", "most"), [(1, MOST_REPLIES), (2**20, MOST_BYTES // 2**20)])
+def test_replies_without_end_are_enough_at_some_time(hub: MemoryHub, size: int, most: int) -> None:
+    """A robot's memory grew by 1 GB within its patience."""
+    robot = Endless(hub, bytes(size))
+    assert len(BusyServers(robot, "where", b"", lambda reply: False).ask(5.0)) == most
     robot.close()

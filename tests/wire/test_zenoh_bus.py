@@ -14,6 +14,7 @@ import pytest
 import zenoh
 
 from mapweave.hybridmap.errors import NotConnected
+from mapweave.wire import zenoh_bus
 from mapweave.wire.bus import Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.zenoh_bus import ZenohBus
@@ -173,6 +174,27 @@ def router_fleet() -> Iterator[ZenohFleet]:
     fleet = ZenohFleet()
     yield fleet
     fleet.close()
+
+
+@pytest.mark.parametrize(("limit", "most"), [("MOST_REPLIES", 20), ("MOST_REPLY_BYTES", 20_000)])
+def test_replies_without_end_fill_no_memory(
+    limit: str, most: int, router_fleet: ZenohFleet, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A client that answers a question again and again filled 1 GB of who had asked."""
+
+    def answer(request: Any) -> None:
+        for _ in range(200):
+            request._question.query.reply(request.key, bytes(1000))
+        request.abandon()
+
+    monkeypatch.setattr(zenoh_bus, limit, most)
+    server, client = router_fleet.join(), router_fleet.join()
+    server.serve("a", answer)
+    server.serve("b", lambda request: request.reply(b"b"))
+    eventually(lambda: client.ask("b", b"", 5.0))
+    assert len(client.ask("a", b"", 5.0)) == 20
+    # What still comes of it is no answer to the next question.
+    assert [reply.payload for reply in client.ask("b", b"", 5.0)] == [b"b"]
 
 
 def test_a_router_drops_what_is_too_large(router_fleet: ZenohFleet) -> None:
