@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Annotated
 
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.agent.observation import Command, Odometry, RobotDescription
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.sim import surface
-from mapweave.sim.camera import check_range
 from mapweave.sim.floorplan import Rectangle
 from mapweave.sim.texture import Texture
 from mapweave.sim.world import Block, PanelSet, block_panels
@@ -48,23 +48,13 @@ class BodySettings:
         mass: kg.
     """
 
-    radius_error: float = 0.003
-    axle_error: float = 0.005
-    slip: float = 0.01
-    ticks_per_turn: int = 4096
-    motor_lag: float = 0.12
-    motor_force: float = 1.5
-    mass: float = 4.0
-
-    def __post_init__(self) -> None:
-        """Refuse a number out of range (InvalidValue)."""
-        within = {
-            "radius_error": (0.0, 0.1), "axle_error": (0.0, 0.2), "slip": (0.0, 0.3),
-            "ticks_per_turn": (8, 10**7), "motor_lag": (0.01, 2.0), "motor_force": (0.1, 20.0),
-            "mass": (1.0, 30.0),
-        }  # fmt: skip
-        for name, (low, high) in within.items():
-            check_range(f"body: {name}", getattr(self, name), low, high)
+    radius_error: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.003
+    axle_error: Annotated[float, Meta(ge=0.0, le=0.2)] = 0.005
+    slip: Annotated[float, Meta(ge=0.0, le=0.3)] = 0.01
+    ticks_per_turn: Annotated[int, Meta(ge=8, le=10**7)] = 4096
+    motor_lag: Annotated[float, Meta(ge=0.01, le=2.0)] = 0.12
+    motor_force: Annotated[float, Meta(ge=0.1, le=20.0)] = 1.5
+    mass: Annotated[float, Meta(ge=1.0, le=30.0)] = 4.0
 
     def wheel_noise(self, tick: float) -> float:
         """A wheel's noise, as a calibration drive would measure it, as a share of the way of a tick (s).

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Annotated, Any
 
 import cv2
 import numpy as np
+from msgspec import Meta
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.limits import Share
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.equidistant import Equidistant
 from mapweave.vision.lens import NO_DISTORTION, Distortion, RadialTangential
@@ -20,6 +22,9 @@ WEBCAM = Camera(width=320, height=240, fx=277.0, fy=277.0, cx=159.5, cy=119.5, m
 """60 degrees across, on a mast above the axle."""
 
 
+Noise = Annotated[float, Meta(ge=0.0, le=60.0)]
+MOST_DISTORTION = 10.0
+"""Of a coefficient; those of lenses are below 1."""
 LEAST_GROWTH = 0.02
 """How much of an area at the axis an area anywhere else in the picture takes at least."""
 
@@ -44,23 +49,14 @@ class Exposure:
     """
 
     automatic: bool = True
-    wanted: float = 130.0
-    band: float = 0.5
-    lag: float = 0.4
-    lowest: float = 0.25
-    highest: float = 8.0
-    gain_error: float = 0.0
-    vignetting: float = 0.0
-    seconds: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Refuse a number out of range (InvalidValue)."""
-        within = {
-            "wanted": (1.0, 254.0), "band": (0.0, 10.0), "lag": (0.0, 60.0), "lowest": (1e-3, 1.0),
-            "highest": (1.0, 1e3), "gain_error": (0.0, 0.3), "vignetting": (0.0, 0.95), "seconds": (0.0, 0.1),
-        }  # fmt: skip
-        for name, (low, high) in within.items():
-            check_range(f"exposure: {name}", getattr(self, name), low, high)
+    wanted: Annotated[float, Meta(ge=1.0, le=254.0)] = 130.0
+    band: Annotated[float, Meta(ge=0.0, le=10.0)] = 0.5
+    lag: Annotated[float, Meta(ge=0.0, le=60.0)] = 0.4
+    lowest: Annotated[float, Meta(ge=1e-3, le=1.0)] = 0.25
+    highest: Annotated[float, Meta(ge=1.0, le=1e3)] = 8.0
+    gain_error: Annotated[float, Meta(ge=0.0, le=0.3)] = 0.0
+    vignetting: Annotated[float, Meta(ge=0.0, le=0.95)] = 0.0
+    seconds: Annotated[float, Meta(ge=0.0, le=0.1)] = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,23 +75,19 @@ class CameraSetup:
 
     intrinsics: Camera = WEBCAM
     distortion: Distortion = NO_DISTORTION
-    read_noise: float = 2.0
-    shot_noise: float = 0.0
+    read_noise: Noise = 2.0
+    shot_noise: Noise = 0.0
     exposure: Exposure = field(default_factory=Exposure)
-    dropped: float = 0.0
+    dropped: Share = 0.0
 
     def __post_init__(self) -> None:
-        """Refuse a number out of range, and a lens that shows one point in two places (InvalidValue)."""
-        check_range("camera: read_noise", self.read_noise, 0.0, 60.0)
-        check_range("camera: shot_noise", self.shot_noise, 0.0, 60.0)
-        check_range("camera: dropped", self.dropped, 0.0, 1.0)
+        """Refuse too large an image, and a lens that shows one point in two places (InvalidValue)."""
         if max(self.intrinsics.width, self.intrinsics.height) > 2048:
             raise InvalidValue("camera: the simulator draws at most 2048 pixels across and down")
         if isinstance(self.distortion, Equidistant):
             return
-        for value in self.distortion:
-            check_range("camera: distortion", value, -10.0, 10.0)
-        if not self._lens_is_single(self.distortion):
+        within = all(abs(value) <= MOST_DISTORTION for value in self.distortion)
+        if not (within and self._lens_is_single(self.distortion)):
             raise InvalidValue(
                 f"camera: with distortion {list(self.distortion)} the lens folds the image's corners over: "
                 "use smaller coefficients or a longer focal length"
@@ -158,16 +150,6 @@ def _jacobian(rays: Array, lens: NDArray[Any]) -> tuple[Array, Array, Array, Arr
     xy = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
     yy = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
     return xx, xy, yy, xx * yy - xy * xy
-
-
-def check_range(name: str, value: float, low: float, high: float) -> None:
-    """Refuse a number.
-
-    Raises:
-        InvalidValue: it is not finite or not between the limits.
-    """
-    if not (math.isfinite(value) and low <= value <= high):
-        raise InvalidValue(f"{name} is {value:g}, must be between {low:g} and {high:g}")
 
 
 FISHEYE = Equidistant(fx=115.0, fy=115.4, cx=158.6, cy=120.9, k=(-0.02, 0.004, -0.003, 0.0005))

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.sim.camera import check_range
+from mapweave.hybridmap.limits import Coordinate
 from mapweave.storage.settings_file import build
 
 LONGEST = 1e6
 """No event takes longer, s."""
+Duration = Annotated[float, Meta(ge=0.1, le=LONGEST)]
+"""s."""
 
 
 @dataclass(frozen=True)
@@ -31,9 +35,9 @@ class Kidnap:
     """
 
     robot: str
-    x: float | None = None
-    y: float | None = None
-    heading: float | None = None
+    x: Coordinate | None = None
+    y: Coordinate | None = None
+    heading: Coordinate | None = None
     near: str = ""
     room: str = ""
 
@@ -43,10 +47,6 @@ class Kidnap:
         half = (self.x is None) != (self.y is None)
         if half or point + bool(self.near) + bool(self.room) != 1:
             raise InvalidValue("kidnap: say where, by x and y, or near = a robot, or room = its name")
-        for name in ("x", "y", "heading"):
-            value = getattr(self, name)
-            if value is not None:
-                check_range(f"kidnap: {name}", value, -1e4, 1e4)
 
 
 @dataclass(frozen=True)
@@ -58,13 +58,8 @@ class Light:
         seconds: how long the change takes, s.
     """
 
-    factor: float
-    seconds: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Refuse a number out of range (InvalidValue)."""
-        check_range("light: factor", self.factor, 0.0, 20.0)
-        check_range("light: seconds", self.seconds, 0.0, LONGEST)
+    factor: Annotated[float, Meta(ge=0.0, le=20.0)]
+    seconds: Annotated[float, Meta(ge=0.0, le=LONGEST)] = 0.0
 
 
 @dataclass(frozen=True)
@@ -81,23 +76,18 @@ class Walk:
 
     what: str = "person"
     near: str = ""
-    path: tuple[tuple[float, float], ...] = ()
-    speed: float = 0.7
-    seconds: float = 15.0
+    path: tuple[tuple[Coordinate, Coordinate], ...] = ()
+    speed: Annotated[float, Meta(ge=0.01, le=2.0)] = 0.7
+    seconds: Duration = 15.0
 
     def __post_init__(self) -> None:
-        """Refuse an unknown kind, no path or two, and a number out of range (InvalidValue)."""
+        """Refuse an unknown kind, no path or two, and too short or long a path (InvalidValue)."""
         if self.what not in ("person", "box"):
             raise InvalidValue(f"walk: what = {self.what!r}; known are person, box")
         if bool(self.near) == bool(self.path):
             raise InvalidValue("walk: say where, by near = a robot or by path = [[x, y], ...]")
         if self.path and not 2 <= len(self.path) <= 1000:
             raise InvalidValue("walk: a path has 2 to 1000 points")
-        for x, y in self.path:
-            check_range("walk: path", x, -1e4, 1e4)
-            check_range("walk: path", y, -1e4, 1e4)
-        check_range("walk: speed", self.speed, 0.01, 2.0)
-        check_range("walk: seconds", self.seconds, 0.1, LONGEST)
 
 
 @dataclass(frozen=True)
@@ -108,11 +98,7 @@ class MoveFurniture:
         share: of the pieces, more than 0.
     """
 
-    share: float = 0.3
-
-    def __post_init__(self) -> None:
-        """Refuse what is not above 0 and at most 1 (InvalidValue)."""
-        check_range("move_furniture: share", self.share, 1e-3, 1.0)
+    share: Annotated[float, Meta(ge=1e-3, le=1.0)] = 0.3
 
 
 WAYS_TO_FAIL: dict[str, dict[str, tuple[float, float, float]]] = {
@@ -149,11 +135,11 @@ class Fail:
     robot: str
     sensor: str
     how: str
-    seconds: float = 5.0
+    seconds: Duration = 5.0
     amount: float | None = None
 
     def __post_init__(self) -> None:
-        """Refuse an unknown sensor or way to fail, and a number out of range (InvalidValue)."""
+        """Refuse an unknown sensor or way to fail, and an amount out of range (InvalidValue)."""
         if self.sensor not in WAYS_TO_FAIL:
             raise InvalidValue(f"fail: no sensor {self.sensor!r}; there are {', '.join(WAYS_TO_FAIL)}")
         ways = WAYS_TO_FAIL[self.sensor]
@@ -161,9 +147,9 @@ class Fail:
             raise InvalidValue(
                 f"fail: {self.sensor} cannot fail by how = {self.how!r}; known are {', '.join(ways)}"
             )
-        check_range("fail: seconds", self.seconds, 0.1, LONGEST)
-        if self.amount is not None:
-            check_range("fail: amount", self.amount, *ways[self.how][1:])
+        least, most = ways[self.how][1:]
+        if self.amount is not None and not least <= self.amount <= most:
+            raise InvalidValue(f"fail: amount is {self.amount:g}, must be between {least:g} and {most:g}")
 
     @property
     def size(self) -> float:

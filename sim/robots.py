@@ -6,14 +6,17 @@ import dataclasses
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.hybridmap.ids import check_name
+from mapweave.hybridmap.limits import Coordinate
 from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.body import BodySettings
-from mapweave.sim.camera import CAMERAS, CameraSetup, check_range
+from mapweave.sim.camera import CAMERAS, CameraSetup
 from mapweave.storage.settings_file import build
 
 MOST_ROBOTS = 16
@@ -39,24 +42,16 @@ class RobotSetup:
     name: str
     camera: CameraSetup = field(default_factory=CameraSetup)
     body: BodySettings = field(default_factory=BodySettings)
-    start: tuple[float, float, float] | None = None
-    rangers: int = 16
-    ranger_reach: float = 3.0
-    range_noise: float = 0.01
-    max_forward: float = 0.3
-    max_turn: float = 0.8
+    start: tuple[Coordinate, Coordinate, Coordinate] | None = None
+    rangers: Annotated[int, Meta(ge=0, le=256)] = 16
+    ranger_reach: Annotated[float, Meta(ge=0.1, le=50.0)] = 3.0
+    range_noise: Annotated[float, Meta(ge=0.0, le=0.5)] = 0.01
+    max_forward: Annotated[float, Meta(ge=0.01, le=1.0)] = 0.3
+    max_turn: Annotated[float, Meta(ge=0.01, le=3.0)] = 0.8
 
     def __post_init__(self) -> None:
-        """Refuse a name that cannot be one, and a number out of range (InvalidValue)."""
+        """Refuse a name that cannot be one (InvalidValue)."""
         check_name(self.name)
-        where = f"robot {self.name}"
-        check_range(f"{where}: rangers", self.rangers, 0, 256)
-        check_range(f"{where}: ranger_reach", self.ranger_reach, 0.1, 50.0)
-        check_range(f"{where}: range_noise", self.range_noise, 0.0, 0.5)
-        check_range(f"{where}: max_forward", self.max_forward, 0.01, 1.0)
-        check_range(f"{where}: max_turn", self.max_turn, 0.01, 3.0)
-        for value in self.start or ():
-            check_range(f"{where}: start", value, -1e4, 1e4)
 
     @property
     def pose(self) -> Pose2 | None:
@@ -85,8 +80,8 @@ def robot_from_table(table: Mapping[str, Any], where: str = "robot") -> RobotSet
     names (`camera = { like = "wide", read_noise = 4.0 }`), from the webcam if none is named.
 
     Raises:
-        SettingsError: an unknown name, or a value of the wrong kind.
-        InvalidValue: a value out of range.
+        SettingsError: an unknown name, or a value of the wrong kind or out of range.
+        InvalidValue: a name of a robot that cannot be one.
     """
     values = dict(table)
     if "camera" in values:
@@ -98,8 +93,8 @@ def camera_from_table(value: Any, where: str = "camera") -> CameraSetup:
     """Make a camera from its name, or from a table of what differs from a camera with a name.
 
     Raises:
-        SettingsError: an unknown name, or a value of the wrong kind.
-        InvalidValue: a value out of range.
+        SettingsError: an unknown name, or a value of the wrong kind or out of range.
+        InvalidValue: a lens that shows one point in two places, or too large an image.
     """
     if isinstance(value, CameraSetup):
         return value

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.hybridmap.ids import NodeId, check_name
@@ -87,16 +89,14 @@ class MapByPhotographs:
     """
 
     robot: str
-    count: int = 9
-    spacing: float = 0.5
-    said_spacing: float = 0.0
+    count: Annotated[int, Meta(ge=3, le=100)] = 9
+    spacing: Annotated[float, Meta(ge=0.1, le=2.0)] = 0.5
+    said_spacing: Annotated[float, Meta(ge=0.0, le=4.0)] = 0.0
     camera: str = "phone"
     name: str = "photos"
 
     def __post_init__(self) -> None:
-        """Refuse what is no walk (InvalidValue)."""
-        if not (3 <= self.count <= 100 and 0.1 <= self.spacing <= 2.0 and 0.0 <= self.said_spacing <= 4.0):
-            raise InvalidValue("photograph: count must be 3 to 100, spacing 0.1 to 2 m")
+        """Refuse a camera that does not exist, and a name that cannot be one (MapweaveError)."""
         check_name(self.name)
         camera_from_table(self.camera, "photograph: camera")
 
@@ -123,15 +123,13 @@ class TryLies:
 
     robot: str
     ways: tuple[str, ...] = ()
-    queries: int = 12
+    queries: Annotated[int, Meta(ge=1, le=1000)] = 12
 
     def __post_init__(self) -> None:
         """Refuse an unknown way (InvalidValue)."""
         for way in self.ways:
             if way not in EVERY:
                 raise InvalidValue(f"lie: no way {way!r}; known are {', '.join(EVERY)}")
-        if not 1 <= self.queries <= 1000:
-            raise InvalidValue(f"lie: queries must be 1 to 1000, not {self.queries}")
 
 
 @dataclass(frozen=True)
@@ -176,15 +174,8 @@ class Worsen:
     """
 
     robot: str
-    loss: float = 0.2
-    delay: float = 0.05
-
-    def __post_init__(self) -> None:
-        """Refuse what is no share or no time (InvalidValue)."""
-        if not 0.0 <= self.loss < 1.0:
-            raise InvalidValue(f"worsen: loss must be 0 to 1 (not included), not {self.loss}")
-        if not 0.0 <= self.delay <= 5.0:
-            raise InvalidValue(f"worsen: delay must be 0 to 5 s, not {self.delay}")
+    loss: Annotated[float, Meta(ge=0.0, lt=1.0)] = 0.2
+    delay: Annotated[float, Meta(ge=0.0, le=5.0)] = 0.05
 
 
 @dataclass(frozen=True)
