@@ -14,7 +14,9 @@ LATE = 30.0
 """How long a message may be on its way, s: on each of three connections (server, two routers, agent) until
 the longest lease is over, which ends the connection with all that waits in it."""
 
-
+MOST_SERVERS = 64
+"""Of which the state is kept, and stores that they have left. No fleet has more; a client without keys, or a
+server that lies, may acknowledge in any number of names."""
 PUT_BACK = "{} has changes of {} that this disk has lost: begin a fresh map (--fresh)"
 """Of a disk that was put back to an older state, as by a backup."""
 
@@ -104,6 +106,10 @@ class LogState:
         """The beacon."""
         return Head(self.log_id, self.newest, dict(self.acknowledged))
 
+    def admits(self, server: str) -> bool:
+        """Whether there is room for what a server acknowledges."""
+        return server in self.status_periods or len(self.status_periods) < MOST_SERVERS
+
     def outdated(self, server: str, ack: Ack) -> bool:
         """Whether an acknowledgement comes late, of a store that the server no longer has.
 
@@ -119,7 +125,8 @@ class LogState:
             return False
         self.stores[server] = ack.store
         if before is not None:
-            self.left = {one: at for one, at in self.left.items() if now < at + LATE}
+            newest = [*self.left.items()][1 - MOST_SERVERS :]
+            self.left = {one: at for one, at in newest if now < at + LATE}
             self.left[server, before] = now
         return ack.watermark < self.acknowledged.get(server, 0)
 
@@ -139,7 +146,7 @@ class LogState:
         self.status_periods[server] = ack.status_period
         news = []
         for refusal in ack.refusals:
-            if (server, refusal.sequence) not in self.refusals:
+            if refusal.sequence <= self.newest and (server, refusal.sequence) not in self.refusals:
                 self.refusals[server, refusal.sequence] = refusal.reason
                 news.append(f"{server} refuses {self.map} {refusal.sequence}: {refusal.reason}")
             if refusal.sequence == 0:

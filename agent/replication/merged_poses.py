@@ -13,6 +13,7 @@ import threading
 from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.wire.bus import Bus, BusClient, Sample
+from mapweave.wire.dispatch import Failures
 from mapweave.wire.keys import Keys
 from mapweave.wire.pose_messages import MAX_POSTURES, MergedPose, PoseNews
 
@@ -41,7 +42,7 @@ class MergedPoses(BusClient):
         self._key = keys.poses(server, agent)
         self._places: dict[NodeId, MergedPose] = {}
         self._run: int | None = None
-        self._sequence, self._complaint = 0, ""
+        self._sequence, self._failures = 0, Failures()
         self._work: queue.SimpleQueue[Sample | bool | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._listen, name=f"poses-{agent}", daemon=True)
         self._thread.start()
@@ -77,9 +78,7 @@ class MergedPoses(BusClient):
             try:
                 self._take(PoseNews.decode(item.payload, self._agent))
             except InvalidMessage as error:
-                if str(error) != self._complaint:
-                    self._complaint = str(error)
-                    log.warning("%s", error)
+                self._complain(error)
                 self._ask()
 
     def _take(self, news: PoseNews) -> None:
@@ -103,6 +102,11 @@ class MergedPoses(BusClient):
             try:
                 whole = PoseNews.decode(reply.payload, self._agent)
             except InvalidMessage as error:
-                log.warning("%s", error)
+                self._complain(error)
                 continue
             self._places, self._run, self._sequence = dict(whole.placed), whole.run, whole.sequence
+
+    def _complain(self, error: InvalidMessage) -> None:
+        """One line a minute: a server that lies may send something else that is wrong each time."""
+        if (also := self._failures.count(self._key)) is not None:
+            log.warning("%s%s", error, also)

@@ -26,6 +26,7 @@ from mapweave.hybridmap.ids import MapId, NodeId, check_name
 from mapweave.storage.full_disks import logged
 from mapweave.wire.bus import Bus, Request, Sample
 from mapweave.wire.codec import wrap_body
+from mapweave.wire.dispatch import Failures
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import MAX_ROWS, Ack, LogAnswer, LogRequest, Mark, StoredChange
 
@@ -145,6 +146,7 @@ class Replicator:
         self._work: queue.SimpleQueue[list[Draft] | _Retirement | Sample | Request | bool | None] = (
             queue.SimpleQueue()
         )
+        self._failures = Failures()
         self._thread = threading.Thread(target=self._run, name=f"replicate-{map_id}", daemon=True)
         self._thread.start()
         self._declared = [
@@ -400,10 +402,13 @@ class Replicator:
             server, _ = self._keys.parse_ack(sample.key)
             ack = Ack.decode(sample.payload)
         except InvalidMessage as error:
-            log.warning("%s", error)
+            if (also := self._failures.count(sample.key)) is not None:
+                log.warning("%s%s", error, also)
             return
         state = self._logs.get(ack.map)
         if state is None or ack.log_id != state.log_id or state.outdated(server, ack):
+            return
+        if server not in self._servers and not state.admits(server):
             return
         try:
             contradicted = self._contradicts(state, ack.stored)
@@ -425,9 +430,9 @@ class Replicator:
         if lost:
             # It is to know how much it had: what was retired meanwhile may have been dropped here.
             self._bus.publish(self._keys.head(state.map), state.head().encode())
-            log.warning(
-                "%s has lost what it had of %s after %d: it gets it again", server, state.map, ack.watermark
-            )
+            if (also := self._failures.count_of(server)) is not None:
+                words = "%s has lost what it had of %s after %d: it gets it again%s"
+                log.warning(words, server, state.map, ack.watermark, also)
         elif not state.acknowledged.get(server, 0) < ack.watermark <= state.newest:
             return
         servers = [server, *self._sharing(server, ack)]

@@ -68,8 +68,8 @@ def test_a_flood_fills_neither_memory_nor_log(
     """Each message may have 8 MB, and a question to a server that says nothing takes 3 s."""
     server.may_answer.clear()
     with caplog.at_level(logging.WARNING):
-        for _ in range(1000):
-            server.send(b"x")
+        for k in range(1000):
+            server.send(bytes([k % 256, k // 256]))
         assert poses._work.qsize() <= merged_poses.MOST_WAITING
         server.may_answer.set()
         eventually(lambda: poses._work.qsize() == 0)

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 
 from mapweave.agent.replication import replicator
 from mapweave.agent.replication.journal import Draft, Journal
-from mapweave.agent.replication.log_state import Ranges
+from mapweave.agent.replication.log_state import MOST_SERVERS, Ranges
 from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
 from mapweave.hybridmap.agent_status import FIRST_STATUS_PERIOD
 from mapweave.hybridmap.change import ChangeBody, NodeRetired
@@ -194,6 +194,30 @@ def test_a_flood_of_acknowledgements_holds_up_no_change_and_fills_no_memory(
         over.set()
         thread.join()
     assert most[0] <= 18, "and what was submitted"
+
+
+def test_a_server_that_lies_fills_no_log_and_no_memory(
+    agent: Agent, hub: MemoryHub, caplog: pytest.LogCaptureFixture
+) -> None:
+    """Garbage, refusals of changes that there are not, a new store each time, and any number of names."""
+    agent.replicator.submit(bodies(1, 3), 0)
+    assert agent.replicator.flush(30)
+    liar, state = MemoryBus(hub), agent.replicator._logs[MAP]
+    refusals = tuple(Refusal(sequence, "no") for sequence in range(4, 12))
+    with caplog.at_level(logging.WARNING):
+        for k in range(300):
+            liar.publish(KEYS.ack("s0", "r0"), bytes([k % 256, k % 7]))
+            for watermark in (3, 0):
+                ack = Ack(MAP, agent.log_id, watermark, refusals, store=2 * k + watermark + 1)
+                liar.publish(KEYS.ack("s0", "r0"), ack.encode())
+            liar.publish(KEYS.ack(f"x{k}", "r0"), Ack(MAP, agent.log_id, 1).encode())
+        eventually(lambda: agent.replicator._work.qsize() == 0)
+    assert len(caplog.records) <= 2, [record.message for record in caplog.records]
+    assert not state.refusals and len(state.acknowledged) <= MOST_SERVERS and len(state.left) <= MOST_SERVERS
+    # The server that is to have everything is heard as before.
+    liar.publish(KEYS.ack("s0", "r0"), Ack(MAP, agent.log_id, 3, store=10**6).encode())
+    eventually(lambda: agent.replicator.status().unacknowledged == 0)
+    liar.close()
 
 
 def test_a_question_for_which_there_is_no_room_is_refused(
