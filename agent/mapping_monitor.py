@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.agent.sensor_health.clock_monitor import AHEAD
 from mapweave.agent.vision.image_quality import ImageQuality
 from mapweave.hybridmap.agent_status import Status
 
@@ -85,8 +86,9 @@ class MappingMonitor:
             A line for the log when there has been no node for long; else nothing.
         """
         now = observation.stamp_ns
-        if now < self._last_node_ns:
-            # The clock has jumped back.
+        step = now - self._moments[-1].stamp_ns if self._moments else 0
+        if not 0 <= step <= max(AHEAD, 10.0 * self._tick) * 1e9:
+            # The clock has jumped.
             self._last_look_ns = self._last_node_ns = self._reported_ns = 0
         if not self._last_node_ns or status.nodes != self._nodes or status.finished:
             self._nodes, self._last_node_ns, self._reported, self._fault = status.nodes, now, "", ""

@@ -132,6 +132,19 @@ def test_a_robot_that_maps_or_navigates_reports_nothing(drive, description) -> N
     assert lines(drive, description, covered, PATIENCE + 5.0, mission="goto") == []
 
 
+@pytest.mark.parametrize("jump", [3600.0, -0.5])
+def test_a_clock_that_jumps_is_no_time_without_a_node(drive, description, jump: float) -> None:
+    """There was no new node for 2522887204 s once its clock was set."""
+
+    def set_once(seen: Observation) -> Observation:
+        later = seen.stamp_ns + (int(jump * 1e9) if seen.stamp_ns > 12e9 else 10**9)
+        return replace(seen, stamp_ns=later)
+
+    assert lines(drive, description, set_once, 12.0 + PATIENCE - 1.0) == []
+    (line,) = lines(drive, description, set_once, 12.0 + PATIENCE + 5.0)
+    assert line.startswith(f"no new node for {PATIENCE:.0f} s: ")
+
+
 def test_another_cause_is_reported_later(drive, description) -> None:
     """The lens is covered, and then the camera unplugged."""
 
