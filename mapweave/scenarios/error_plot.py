@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from mapweave.drawing.map_picture import colours_of
 from mapweave.hybridmap.ids import MapId
 from mapweave.scenarios.recording import Lost, TrialEvent
 from mapweave.scenarios.trajectories import TrajectoryScore
+from mapweave.storage.atomic_file import write_whole
 
 NEAR = 0.02
 """Moments that are nearer than this share of the time of all share one label."""
@@ -70,7 +72,9 @@ def draw_errors(
         figure.legend(loc="outside right upper", frameon=False, fontsize=9, title="map: ATE")
     # Else matplotlib draws all of it twice.
     ConstrainedLayoutEngine().execute(figure)
-    figure.savefig(path, format="png")
+    image = io.BytesIO()
+    figure.savefig(image, format="png")
+    write_whole(path, image.getvalue())
 
 
 def _labels(moments: Sequence[TrialEvent]) -> list[tuple[float, str]]:

@@ -55,7 +55,6 @@ class Lost:
         goal: node to which it shall go, if any.
         fix: the first after the kidnapping.
         arrived_ns: when it reported that it had arrived.
-        gave_up_ns: when the scenario stopped waiting.
         legs: nodes of its route.
     """
 
@@ -66,7 +65,6 @@ class Lost:
     goal: NodeId | None = None
     fix: RecordedLocalization | None = None
     arrived_ns: int | None = None
-    gave_up_ns: int | None = None
     legs: int = 0
 
 

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import json
-import os
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 
@@ -25,6 +23,7 @@ from mapweave.scenarios.recording import Lost, TrialRecording, TrialTrajectory
 from mapweave.scenarios.report_page import report_page
 from mapweave.scenarios.score import node_truth
 from mapweave.scenarios.trajectories import score_trajectory
+from mapweave.storage.atomic_file import write_whole
 from mapweave.storage.map_file import write_map_file
 
 FIGURES = "figures.json"
@@ -94,14 +93,12 @@ def _write_all(
                 _write_tum(out / _estimate_name(map_id), estimate)
                 scores[map_id] = score_trajectory(record.truth, estimate)
     write_map_file(out / "merged.mapweave", recording.merged)
-    _write(out / "scenario.toml", scenario_text)
-    with _beside(out / "map.png") as part:
-        draw_map(_map_picture(recording, figures, whole, places, truth, merged), part)
-    with _beside(out / "errors.png") as part:
-        draw_errors(scores, recording.moments, recording.lost, part)
+    write_whole(out / "scenario.toml", scenario_text.encode())
+    draw_map(_map_picture(recording, figures, whole, places, truth, merged), out / "map.png")
+    draw_errors(scores, recording.moments, recording.lost, out / "errors.png")
     files = {m: (f"{m.agent}.truth.tum", _estimate_name(m)) for m in scores}
     page = report_page(recording, figures, verdicts, files, (out / "film.webm").exists())
-    _write(out / "report.md", page)
+    write_whole(out / "report.md", page.encode())
     content = {
         "scenario": recording.scenario,
         "seed": recording.seed,
@@ -109,7 +106,7 @@ def _write_all(
         "figures": figures.as_dict(),
         "verdicts": [asdict(verdict) for verdict in verdicts],
     }
-    _write(out / FIGURES, json.dumps(content, indent=2, allow_nan=False) + "\n")
+    write_whole(out / FIGURES, f"{json.dumps(content, indent=2, allow_nan=False)}\n".encode())
 
 
 def _map_picture(
@@ -145,9 +142,8 @@ def _map_picture(
 
 
 def _drive(lost: Lost, truth: TrialTrajectory, nodes: dict[NodeId, Pose2]) -> DrawnDrive:
-    """Where a robot went from where it was put down, until it arrived or was given up."""
-    ends = [t for t in (lost.arrived_ns, lost.gave_up_ns) if t is not None]
-    last = min(ends) if ends else int(truth.stamps_ns[-1])
+    """Where a robot went from where it was put down, until it arrived."""
+    last = int(truth.stamps_ns[-1]) if lost.arrived_ns is None else lost.arrived_ns
     # At the stamp itself it may still have been where it came from.
     during = (truth.stamps_ns > lost.stamp_ns) & (truth.stamps_ns <= last)
     goal = nodes.get(lost.goal) if lost.goal is not None else None
@@ -170,21 +166,4 @@ def _estimate_name(map_id: MapId) -> str:
 def _write_tum(path: Path, trajectory: TrialTrajectory) -> None:
     """No file for an empty one: others' tools do not take it."""
     if len(trajectory.stamps_ns):
-        with _beside(path) as part:
-            write_tum(part, trajectory.stamps_ns, trajectory.poses)
-
-
-def _write(path: Path, text: str) -> None:
-    with _beside(path) as part:
-        part.write_text(text, encoding="utf-8")
-
-
-@contextmanager
-def _beside(path: Path) -> Iterator[Path]:
-    """A file to write that takes its place only once it is whole."""
-    part = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        yield part
-        part.replace(path)
-    finally:
-        part.unlink(missing_ok=True)
+        write_tum(path, trajectory.stamps_ns, trajectory.poses)

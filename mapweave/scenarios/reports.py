@@ -9,10 +9,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from mapweave.hybridmap.agent_status import AgentStatus
-from mapweave.hybridmap.errors import InvalidMessage, NotConnected
+from mapweave.hybridmap.errors import NotConnected
 from mapweave.hybridmap.ids import MapId
 from mapweave.scenarios.recording import TrialTrajectory
 from mapweave.wire.bus import Bus, Sample
+from mapweave.wire.conversion import convert
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode
@@ -29,30 +30,11 @@ class ServerReport:
         nodes: in the merged map.
         maps: that have come.
         components: of the merged map.
-        links: between maps.
-        summary: in words.
     """
 
-    nodes: int = 0
-    maps: int = 0
-    components: int = 0
-    links: int = 0
-    summary: str = "nothing yet"
-
-    @staticmethod
-    def decode(payload: bytes) -> ServerReport:
-        """Read a server's status; raises InvalidMessage."""
-        values = decode_record(payload)
-        try:
-            return ServerReport(
-                nodes=int(values["nodes"]),
-                maps=int(values["maps"]),
-                components=int(values["components"]),
-                links=int(values["links"]),
-                summary=str(values["summary"]),
-            )
-        except (KeyError, ValueError) as error:
-            raise InvalidMessage(f"server status: {error}") from None
+    nodes: int
+    maps: int
+    components: int
 
 
 class Reports:
@@ -91,7 +73,8 @@ class Reports:
         replies = self._bus.ask(self._keys.server_status(name), b"", PATIENCE)
         for reply in replies:
             if not reply.error:
-                return ServerReport.decode(reply.payload)
+                report: ServerReport = convert(decode_record(reply.payload), ServerReport)
+                return report
         raise NotConnected(f"map server {name}: {replies[0].error if replies else 'no answer'}")
 
     def estimates(self, robot: str) -> dict[MapId, TrialTrajectory]:

@@ -31,13 +31,15 @@ from __future__ import annotations
 
 import tomllib
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
+
+from msgspec import Meta
 
 from mapweave.hybridmap.errors import MapweaveError, SettingsError
-from mapweave.scenarios.actions import Action, parse_action
+from mapweave.scenarios.actions import MISSION_KINDS, Action, parse_action
 from mapweave.scenarios.expectations import Expectation, parse_expectations
 from mapweave.sim.robots import MOST_ROBOTS, RobotSetup, robot_from_table
 from mapweave.sim.world import World
@@ -55,8 +57,9 @@ CONDITIONS = {
 
 LONGEST = 86_400.0
 """No event waits longer, s."""
-
-MISSIONS = ("idle", "explore", "carried")
+Wait = Annotated[float, Meta(ge=0.0, le=LONGEST)]
+"""s."""
+Table = dict[str, Any]
 
 
 @dataclass(frozen=True)
@@ -71,10 +74,10 @@ class When:
             and the trial notes what had not come true.
     """
 
-    at: float = 0.0
+    at: Wait = 0.0
     after: str = ""
-    plus: float = 0.0
-    within: float = LONGEST
+    plus: Wait = 0.0
+    within: Wait = LONGEST
 
     def __post_init__(self) -> None:
         """Refuse what cannot be waited for (ValueError)."""
@@ -82,9 +85,6 @@ class When:
             raise ValueError(f"after = {self.after!r}; known are {', '.join(CONDITIONS)}")
         if self.after and self.within == LONGEST:
             raise ValueError(f"after = {self.after!r} needs within = seconds: it may never come true")
-        for name in ("at", "plus", "within"):
-            if not 0.0 <= getattr(self, name) <= LONGEST:
-                raise ValueError(f"{name} must be 0 to {LONGEST:.0f} s")
 
 
 @dataclass(frozen=True)
@@ -146,6 +146,20 @@ class Scenario:
             raise SettingsError(f"{self.name}: world: {error}") from None
 
 
+@dataclass(frozen=True)
+class ScenarioFile:
+    """The tables of a file, see above."""
+
+    name: str = ""
+    summary: str = ""
+    seed: Annotated[int, Meta(ge=0)] = 0
+    robots: Annotated[int, Meta(ge=1, le=MOST_ROBOTS)] | None = None
+    robot: Annotated[list[Table], Meta(max_length=MOST_ROBOTS)] = field(default_factory=list)
+    world: Table = field(default_factory=lambda: {"kind": "office"})
+    events: list[Table] = field(default_factory=list)
+    expect: Table = field(default_factory=dict)
+
+
 def scenario_names() -> list[str]:
     """Those that come with Mapweave."""
     return sorted(p.name.removesuffix(".toml") for p in _shipped().iterdir() if p.name.endswith(".toml"))
@@ -181,35 +195,22 @@ def load_scenario(path: Path, overrides: Sequence[str] = ()) -> Scenario:
     for override in overrides:
         _override(table, override)
     where = " with ".join([str(path), *(f"--set {override}" for override in overrides)])
-    keys = ("name", "summary", "seed", "robots", "robot", "world", "events", "expect")
-    for name in table:
-        if name not in keys:
-            raise SettingsError(f"{where}: no setting {name!r}; known are {', '.join(keys)}")
-    seed = table.get("seed", 0)
-    if type(seed) is not int or seed < 0:
-        raise SettingsError(f"{where}: seed must be a whole number, 0 or more")
-    robots, missions = _robots(table, where)
-    world = table.get("world", {"kind": "office"})
-    if not isinstance(world, dict):
-        raise SettingsError(f"{where}: [world] must be a table")
-    events = table.get("events", [])
-    if not isinstance(events, list) or not events:
+    file = build(ScenarioFile, table, where)
+    if not file.events:
         raise SettingsError(f"{where}: give at least one [[events]] table; the last one ends the trial")
-    expect = table.get("expect", {})
-    if not isinstance(expect, dict):
-        raise SettingsError(f"{where}: [expect] must be a table")
+    robots, missions = _robots(file, where)
     noted = "".join(f"# --set {override}\n" for override in overrides)
     scenario = Scenario(
-        name=str(table.get("name", path.stem)),
-        summary=str(table.get("summary", "")),
+        name=file.name or path.stem,
+        summary=file.summary,
         robots=robots,
         missions=missions,
-        events=tuple(_event(e, f"{where}: event {k}") for k, e in enumerate(events, start=1)),
-        expectations=parse_expectations(expect, f"{where}: expect"),
-        world_table=world,
+        events=tuple(_event(e, f"{where}: event {k}") for k, e in enumerate(file.events, start=1)),
+        expectations=parse_expectations(file.expect, f"{where}: expect"),
+        world_table=file.world,
         path=path,
         overrides=tuple(overrides),
-        seed=seed,
+        seed=file.seed,
         text=noted + path.read_text(encoding="utf-8"),
     )
     _check_names(scenario, where)
@@ -238,25 +239,16 @@ def _override(table: dict[str, Any], override: str) -> None:
     place[names[-1]] = value
 
 
-def _robots(table: Mapping[str, Any], where: str) -> tuple[tuple[RobotSetup, ...], dict[str, str]]:
-    tables = table.get("robot")
-    if tables is not None and "robots" in table:
+def _robots(file: ScenarioFile, where: str) -> tuple[tuple[RobotSetup, ...], dict[str, str]]:
+    if file.robot and file.robots is not None:
         raise SettingsError(f"{where}: give robots = a number, or [[robot]] tables, not both")
-    if tables is None:
-        count = table.get("robots", 1)
-        if type(count) is not int or not 1 <= count <= MOST_ROBOTS:
-            raise SettingsError(f"{where}: robots must be a whole number, 1 to {MOST_ROBOTS}")
-        tables = [{} for _ in range(count)]
-    if not isinstance(tables, list) or not 1 <= len(tables) <= MOST_ROBOTS:
-        raise SettingsError(f"{where}: give 1 to {MOST_ROBOTS} [[robot]] tables")
+    known = tuple(MISSION_KINDS)
     setups, missions = [], {}
-    for k, given in enumerate(tables):
-        if not isinstance(given, dict):
-            raise SettingsError(f"{where}: robot {k} must be a table")
+    for k, given in enumerate(file.robot or [{}] * (file.robots or 1)):
         values = {"name": f"r{k}", **given}
         mission = values.pop("mission", "explore")
-        if mission not in MISSIONS:
-            raise SettingsError(f"{where}: robot {k}: mission = {mission!r}; known are {', '.join(MISSIONS)}")
+        if mission not in known:
+            raise SettingsError(f"{where}: robot {k}: mission = {mission!r}; known are {', '.join(known)}")
         try:
             setup = robot_from_table(values, f"{where}: robot {k}")
         except SettingsError:
@@ -270,10 +262,8 @@ def _robots(table: Mapping[str, Any], where: str) -> tuple[tuple[RobotSetup, ...
     return tuple(setups), missions
 
 
-def _event(given: Any, where: str) -> ScenarioEvent:
-    if not isinstance(given, dict):
-        raise SettingsError(f"{where}: must be a table")
-    times = {name: given[name] for name in ("at", "after", "plus", "within") if name in given}
+def _event(given: Table, where: str) -> ScenarioEvent:
+    times: Table = {name: given[name] for name in ("at", "after", "plus", "within") if name in given}
     rest = {name: value for name, value in given.items() if name not in times}
     do = rest.pop("do", None)
     if not isinstance(do, str):

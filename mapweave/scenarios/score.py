@@ -162,8 +162,7 @@ def _score_lost(lost: Lost, truth: TrialTrajectory, nodes: Mapping[NodeId, Pose2
             error_m, error_deg = _error(answered, pose_at(truth, lost.fix.stamp_ns))
     goal_m = goal_deg = goal_s = None
     if lost.goal is not None and lost.goal in nodes:
-        last_ns = int(truth.stamps_ns[-1])
-        end_ns = next((t for t in (lost.arrived_ns, lost.gave_up_ns) if t is not None), last_ns)
+        end_ns = int(truth.stamps_ns[-1]) if lost.arrived_ns is None else lost.arrived_ns
         goal_m, goal_deg = _error(pose_at(truth, end_ns), nodes[lost.goal])
     if lost.arrived_ns is not None:
         goal_s = (lost.arrived_ns - lost.stamp_ns) / 1e9

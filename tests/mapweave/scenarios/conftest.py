@@ -159,7 +159,6 @@ def stage_events(staged: Staged) -> Staged:
             goal,
             RecordedLocalization(450 * TICK_NS, known, answer),
             580 * TICK_NS,
-            None,
             4,
         )
     )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import re
@@ -13,10 +14,10 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.scenarios import report_folder
 from mapweave.scenarios.error_plot import _labels
 from mapweave.scenarios.expectations import check, parse_expectations
 from mapweave.scenarios.recording import TrialEvent
@@ -147,11 +148,13 @@ def test_files_of_an_earlier_trial_are_removed_and_others_are_kept(written):
 def test_a_crash_leaves_no_figures_and_no_halves(written, monkeypatch):
     out, recording, figures = written
 
-    def crash(*arguments: object) -> None:
-        arguments[-1].write_bytes(b"half a picture")
+    def crash(figure: Figure, file: io.BytesIO | Path, **options: object) -> None:
+        if figure.get_size_inches()[1] != 4.5:  # the map is drawn
+            return
+        (file.write if isinstance(file, io.BytesIO) else file.write_bytes)(b"half a picture")
         raise RuntimeError("crashed")
 
-    monkeypatch.setattr(report_folder, "draw_errors", crash)
+    monkeypatch.setattr(Figure, "savefig", crash)
     with pytest.raises(RuntimeError, match="crashed"):
         write_folder(out, recording, figures, (), SCENARIO)
     left = {path.name for path in out.iterdir()}
