@@ -62,6 +62,8 @@ class LogState:
         stores: by which id each server's store was known last, see mapweave.wire.log_messages.Ack.
         status_periods: that each server wants, s, likewise.
         sent: changes that others may have: those that were there when this began, and what left since.
+        compared: whether a server has shown which change it has before those that follow now, or there were
+            none when this began.
         put_back: whether a server has changes that have not left, or others than are here: the disk was put
             back to an older state, and what is there instead has the same numbers.
         left: when which server was first heard of with another store than this one, in the last `LATE`; s of
@@ -78,11 +80,13 @@ class LogState:
     status_periods: dict[str, float] = field(default_factory=dict)
     left: dict[tuple[str, int], float] = field(default_factory=dict)
     sent: Ranges = field(init=False)
+    compared: bool = field(init=False)
     put_back: bool = False
 
     def __post_init__(self) -> None:
         """What is on the disk may have left before."""
         self.sent = Ranges(self.newest)
+        self.compared = self.newest == 0
 
     @staticmethod
     def of(journal: Journal, map_id: MapId) -> LogState:

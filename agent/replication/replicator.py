@@ -353,8 +353,6 @@ class Replicator:
             self._disk_failure = ""
             self._changed.notify_all()
         self._publish(self._current, first, drafts)
-        self._ack_timer.sent(first, time.monotonic())
-        self._beacon_after(self._ack_timer.timeout)
 
     def _retire(self, retirement: _Retirement) -> None:
         state = self._logs[retirement.map]
@@ -368,9 +366,16 @@ class Replicator:
         with self._changed:
             state.newest = first + len(retirement.drafts) - 1
         self._publish(state, first, retirement.drafts)
-        self._beacon_after(self._ack_timer.timeout)
 
     def _publish(self, state: LogState, first: int, drafts: Sequence[Draft]) -> None:
+        if not state.compared:
+            # Published, they might follow others of the same numbers unnoticed. Who asks for them shows which
+            # change it has before them.
+            self._beacon_after(0.0)
+            return
+        if state is self._current:
+            self._ack_timer.sent(first, time.monotonic())
+        self._beacon_after(self._ack_timer.timeout)
         if state.put_back:
             return
         leaves = self._bus.connected()
@@ -427,6 +432,7 @@ class Replicator:
             self._note_put_back(state, server)
         if state.put_back:
             return
+        state.compared |= ack.stored is not None
         if lost:
             # It is to know how much it had: what was retired meanwhile may have been dropped here.
             self._bus.publish(self._keys.head(state.map), state.head().encode())
@@ -524,6 +530,7 @@ class Replicator:
         except MapweaveError as error:
             question.refuse(str(error))
             return
+        state.compared = True
         if state is self._current:
             self._ack_timer.asked_for(asked.first, last)
         total = 0

@@ -543,8 +543,12 @@ def test_a_restarted_agent_goes_on_and_prunes_what_all_have(
     assert agent.replicator.status().newest == 3
     assert agent.replicator.status().unacknowledged == 0
     agent.replicator.submit(bodies(3, 3), 0)
-    eventually(lambda: Mark.decode(server.changes[-1].attachment) == Mark(4, agent.log_id))
-    assert [change.sequence for change in agent.journal.changes(MAP, 1, 9)] == [3, 4]
+    eventually(lambda: server.heads[-1].newest == 4)
+    assert len(server.changes) == 3, "a server shows first which change it has before that"
+    assert [sequence for sequence, _ in server.ask(4, 4).changes] == [4]
+    agent.replicator.submit(bodies(4, 4), 0)
+    eventually(lambda: Mark.decode(server.changes[-1].attachment) == Mark(5, agent.log_id))
+    assert [change.sequence for change in agent.journal.changes(MAP, 1, 9)] == [3, 4, 5]
     agent.close()
 
 

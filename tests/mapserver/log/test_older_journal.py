@@ -13,6 +13,8 @@ import pytest
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.ids import MapId, NodeId
+from mapweave.mapserver.log.acknowledgements import Acknowledgements
+from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.keys import Keys
@@ -97,6 +99,30 @@ def test_so_is_what_was_mapped_without_a_network_before_the_last_start(
         with closing(Robot(hub, put_back)) as robot:
             eventually(lambda: "begin a fresh map" in robot.replicator.status().failure, PATIENCE)
             assert not robot.replicator.wait_acknowledged(1.0)
+        assert contents(change.body for change in store.replay(MAP)) == had and store.watermark(MAP) == 9
+
+
+def test_so_is_what_follows_while_acknowledgements_that_compare_are_lost(
+    put_back: Path, hub: MemoryHub, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As many changes are there as were lost: the next number is the server's next one, too."""
+    acknowledge = Acknowledgements.acknowledge
+
+    def lose(acks: Acknowledgements, agent_log: AgentLog, compared: bool = False) -> None:
+        if not compared:
+            acknowledge(acks, agent_log)
+
+    monkeypatch.setattr(Acknowledgements, "acknowledge", lose)
+    with closing(Robot(MemoryHub(), put_back)) as robot:
+        robot.replicator.submit([node_put(number) for number in range(20, 24)], 1)
+        assert robot.replicator.flush(PATIENCE) and robot.journal.head(MAP) == 9
+    store = SqliteStore(put_back / "s0.sqlite")
+    had = contents(change.body for change in store.replay(MAP))
+    with closing(MemoryBus(hub)) as bus, closing(store), closing(serving(bus, store)):
+        with closing(Robot(hub, put_back)) as robot:
+            robot.replicator.submit([node_put(24)], 1)
+            eventually(lambda: "begin a fresh map" in robot.replicator.status().failure, PATIENCE)
+            assert robot.replicator.status().unacknowledged == 5
         assert contents(change.body for change in store.replay(MAP)) == had and store.watermark(MAP) == 9
 
 
