@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 from mapweave.agent.mapping.way_correction import WayCorrection
 from mapweave.hybridmap.pose import Pose2
-from mapweave.storage.atomic_file import read_whole, write_whole
+from mapweave.storage.atomic_file import read_whole, unwritable, write_whole
+from mapweave.storage.os_errors import reason_of
 
 BY_WHEELS = "# not localized: by the wheels alone from here\n"
 LOCALIZED = "# localized from here\n"
@@ -52,14 +55,18 @@ class TrajectoryFile:
             stamp_ns: of it.
             motion: by the wheels, since the frame before.
             pose: in the map; None if the robot is not localized.
+
+        Raises:
+            InvalidFile: the disk does not take it.
         """
         carried = self._pose @ motion
         if self._localized is None and pose is None:
             self._waiting.append((stamp_ns, carried))
         else:
-            if pose is not None:
-                self._write_waiting(pose @ carried.inverse())
-            self._write(stamp_ns, carried if pose is None else pose, pose is not None)
+            with self._writing():
+                if pose is not None:
+                    self._write_waiting(pose @ carried.inverse())
+                self._write(stamp_ns, carried if pose is None else pose, pose is not None)
         self._pose = carried if pose is None else pose
 
     def move(self, moved: WayCorrection) -> None:
@@ -71,13 +78,21 @@ class TrajectoryFile:
         """Finish the file.
 
         Raises:
-            InvalidFile: it cannot be written again with the poses moved; it stays as it was.
+            InvalidFile: the disk does not take it; where poses are moved, the file stays as it was.
         """
-        self._write_waiting(Pose2())
-        self._file.close()
+        with self._writing():
+            self._write_waiting(Pose2())
+            self._file.close()
         moves, self._moves = self._moves, []
         if moves:
             self._rewrite(moves)
+
+    @contextmanager
+    def _writing(self) -> Iterator[None]:
+        try:
+            yield
+        except OSError as error:
+            raise unwritable(self._path, reason_of(error)) from None
 
     def _rewrite(self, moves: list[tuple[int, WayCorrection]]) -> None:
         at, out = 0, list[bytes]()

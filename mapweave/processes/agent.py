@@ -447,7 +447,7 @@ class Agent:
         if self._trajectory is not None:
             try:
                 self._trajectory.close()
-            except (InvalidFile, OSError) as error:
+            except InvalidFile as error:
                 self._say(str(error))
         self._fleet.close()
         self._left_maps.close()

@@ -22,6 +22,7 @@ from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.processes.agent_progress import AgentProgress
 from mapweave.processes.ros2_publisher import Ros2Publisher
 from mapweave.processes.service_manager import ServiceManager
+from mapweave.storage.os_errors import DISK_FULL, NO_ROOM
 from mapweave.terminal import EventLog, plain_or_terminal
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus
@@ -101,7 +102,10 @@ def run_agent(
         status = agent.replicator.status()
         if status.waiting:
             lost = f"{counted(status.waiting, 'change')} {'is' if status.waiting == 1 else 'are'} lost"
-            raise InvalidFile(f"{options.name}: {lost}: {status.failure}")
+            # The process has ended: room that is made now lets nothing be written.
+            why = status.failure.replace(DISK_FULL, NO_ROOM)
+            again = ", and replay the recording again" if options.recorded else ""
+            raise InvalidFile(f"{options.name}: {lost}: {why}{again}")
 
 
 def _metrics(robot: str) -> AgentMetrics:

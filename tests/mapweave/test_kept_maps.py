@@ -35,6 +35,7 @@ from mapweave.processes.agent_files import epochs_of_files
 from mapweave.processes.agent_process import run_agent
 from mapweave.scenarios.children import Children, free_port
 from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
+from mapweave.storage.os_errors import DISK_FULL, NO_ROOM
 from mapweave.wire.bus import Request
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.codec import encode_body
@@ -305,19 +306,25 @@ def test_a_process_that_ends_after_an_episode_keeps_what_follows_from_it(tmp_pat
     assert HybridMap(file.changes).edges.keys() == edges
 
 
-def test_changes_that_no_disk_took_are_no_success(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Before, a line of the log said so, and the exit status was that of success."""
+@pytest.mark.parametrize("recorded", [False, True])
+def test_changes_that_no_disk_took_are_no_success(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recorded: bool
+) -> None:
+    """Nor does who has ended say that they are written once there is room."""
 
     def full(*_: object) -> int:
-        raise InvalidFile("the disk is full")
+        raise InvalidFile(f"r0.sqlite: {DISK_FULL}")
 
     monkeypatch.setattr(Journal, "write", full)
     monkeypatch.setattr(Replicator, "flush", lambda *_: False)
     bus = MemoryBus(MemoryHub())
-    options = AgentOptions("r0", tmp_path, epoch=1, mission=MissionKind.CARRIED, patience=0.0)
+    options = AgentOptions(
+        "r0", tmp_path, epoch=1, mission=MissionKind.CARRIED, patience=0.0, recorded=recorded
+    )
     # Until a first node.
     robot = Carried(60)
-    with pytest.raises(InvalidFile, match=r"^r0: \d+ changes are lost: the disk is full$"):
+    again = ", and replay the recording again" if recorded else ""
+    with pytest.raises(InvalidFile, match=rf"^r0: \d+ changes are lost: r0\.sqlite: {NO_ROOM}{again}$"):
         run_agent(robot, bus, KEYS, AgentSettings(), options, threading.Event())
     bus.close()
 

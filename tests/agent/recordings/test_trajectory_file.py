@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import re
+from contextlib import suppress
 from pathlib import Path
 
 import numpy as np
@@ -11,7 +13,9 @@ from evo.tools import file_interface
 
 from mapweave.agent.mapping.way_correction import WayCorrection
 from mapweave.agent.recordings.trajectory_file import BY_WHEELS, LOCALIZED, TrajectoryFile
+from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.pose import Pose2
+from mapweave.storage.os_errors import NO_ROOM
 
 STEP = Pose2(0.1, 0.0, 0.0)
 
@@ -72,3 +76,15 @@ def test_a_way_that_is_moved_is_moved_to_the_place_where_it_was(tmp_path: Path) 
 
 def test_a_drive_that_is_always_localized_needs_no_comment(tmp_path: Path) -> None:
     assert len(written(tmp_path / "c.tum", [Pose2(), STEP])) == 2
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_full_disk_is_named_with_the_file_and_what_to_do() -> None:
+    """An error of the system without a file was all that a person read."""
+    words = re.escape(f"/dev/full: cannot be written ({NO_ROOM})")
+    file = TrajectoryFile(Path("/dev/full"))
+    with pytest.raises(InvalidFile, match=words):
+        for stamp_ns in range(1000):
+            file.add(stamp_ns, Pose2(), Pose2())
+    with suppress(InvalidFile):
+        file.close()
