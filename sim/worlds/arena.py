@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
-from mapweave.sim.worlds.design import THICKNESS, Design, Room, Wall, within
+from mapweave.sim.worlds.design import THICKNESS, Design, Room, Wall
 from mapweave.sim.worlds.furniture import STOCK, furnish
 from mapweave.sim.worlds.layout import plan_of
 
@@ -23,15 +25,9 @@ class ArenaParameters:
         boxes: that are wanted in it.
     """
 
-    length: float = 8.0
-    width: float = 6.0
-    boxes: int = 0
-
-    def __post_init__(self) -> None:
-        """Refuse a size out of range (InvalidValue)."""
-        within("an arena's length", self.length, 2.0, 60.0)
-        within("an arena's width", self.width, 2.0, 60.0)
-        within("an arena's number of boxes", self.boxes, 0, 100)
+    length: Annotated[float, Meta(ge=2.0, le=60.0)] = 8.0
+    width: Annotated[float, Meta(ge=2.0, le=60.0)] = 6.0
+    boxes: Annotated[int, Meta(ge=0, le=100)] = 0
 
 
 def arena(parameters: ArenaParameters, seed: int) -> Design:

@@ -53,8 +53,8 @@ def make_design(kind: str, seed: int, **parameters: Any) -> Design:
         parameters: fields of `KINDS[kind].parameters`.
 
     Raises:
-        InvalidValue: no such kind or seed, or a parameter out of range.
-        SettingsError: no such parameter, or one of another type.
+        InvalidValue: no such kind or seed, or sizes that do not fit each other.
+        SettingsError: no such parameter, or one of another type or out of range.
     """
     if kind not in KINDS:
         raise InvalidValue(f"no kind of world {kind!r}; there are {', '.join(KINDS)}")

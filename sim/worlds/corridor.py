@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.sim.worlds.design import THICKNESS, Design, Point, Poster, Room, Wall, within
+from mapweave.sim.worlds.design import THICKNESS, Design, Point, Poster, Room, Wall
 
 HALF = THICKNESS / 2
 CORNER = 0.25
@@ -28,17 +30,13 @@ class CorridorParameters:
         spacing: from the middle of one print on a wall to the next, m; on the average.
     """
 
-    length: float = 12.0
-    width: float = 8.0
-    breadth: float = 1.8
-    spacing: float = 2.2
+    length: Annotated[float, Meta(ge=4.0, le=100.0)] = 12.0
+    width: Annotated[float, Meta(ge=4.0, le=100.0)] = 8.0
+    breadth: Annotated[float, Meta(ge=1.2, le=5.0)] = 1.8
+    spacing: Annotated[float, Meta(ge=1.2, le=20.0)] = 2.2
 
     def __post_init__(self) -> None:
-        """Refuse a size out of range (InvalidValue)."""
-        within("a corridor's breadth", self.breadth, 1.2, 5.0)
-        within("a corridor's length", self.length, 4.0, 100.0)
-        within("a corridor's width", self.width, 4.0, 100.0)
-        within("a corridor's spacing", self.spacing, 1.2, 20.0)
+        """Refuse sizes that do not fit each other (InvalidValue)."""
         if min(self.length, self.width) < 2 * self.breadth + 1.0:
             raise InvalidValue(
                 f"a ring of {self.length:g} x {self.width:g} m has no middle if its corridor is "

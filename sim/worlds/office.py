@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
-from mapweave.sim.worlds.design import THICKNESS, Design, Furniture, Room, Wall, within
+from mapweave.sim.worlds.design import THICKNESS, Design, Furniture, Room, Wall
 from mapweave.sim.worlds.furniture import STOCK, furnish
 from mapweave.sim.worlds.layout import plan_of
 
@@ -24,12 +26,8 @@ class OfficeParameters:
         furniture: whether there is any.
     """
 
-    rooms: int = 3
+    rooms: Annotated[int, Meta(ge=1, le=32)] = 3
     furniture: bool = True
-
-    def __post_init__(self) -> None:
-        """Refuse a number of rooms out of range (InvalidValue)."""
-        within("an office's number of rooms", self.rooms, 1, 32)
 
 
 def office(parameters: OfficeParameters, seed: int) -> Design:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
+
+from msgspec import Meta
 
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.sim.worlds.design import THICKNESS, Design, Room, Wall, within
+from mapweave.sim.worlds.design import THICKNESS, Design, Room, Wall
 
 HALF = THICKNESS / 2
 END = 1.5
@@ -23,17 +26,13 @@ class PassageParameters:
         depth: of the niche, m.
     """
 
-    length: float = 8.0
-    breadth: float = 1.0
-    niche: float = 1.6
-    depth: float = 1.4
+    length: Annotated[float, Meta(ge=5.0, le=60.0)] = 8.0
+    breadth: Annotated[float, Meta(ge=1.0, le=5.0)] = 1.0
+    niche: Annotated[float, Meta(ge=0.7, le=20.0)] = 1.6
+    depth: Annotated[float, Meta(ge=0.5, le=5.0)] = 1.4
 
     def __post_init__(self) -> None:
-        """Refuse a size out of range (InvalidValue)."""
-        within("a passage's length", self.length, 5.0, 60.0)
-        within("a passage's breadth", self.breadth, 1.0, 5.0)
-        within("a passage's niche", self.niche, 0.7, 20.0)
-        within("a niche's depth", self.depth, 0.5, 5.0)
+        """Refuse sizes that do not fit each other (InvalidValue)."""
         if self.niche > self.length - 2 * END:
             raise InvalidValue(
                 f"a niche of {self.niche:g} m does not fit between the ends of a passage of {self.length:g} m"

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
-from mapweave.sim.worlds.design import THICKNESS, Design, Point, Room, Wall, within
+from mapweave.sim.worlds.design import THICKNESS, Design, Point, Room, Wall
 from mapweave.sim.worlds.furniture import STOCK, furnish
 from mapweave.sim.worlds.layout import plan_of
 
@@ -31,13 +33,8 @@ class TwinsParameters:
     """
 
     joined: bool = False
-    length: float = 4.8
-    width: float = 4.4
-
-    def __post_init__(self) -> None:
-        """Refuse a size out of range (InvalidValue)."""
-        within("a twin room's length", self.length, 2.5, 30.0)
-        within("a twin room's width", self.width, 2.5, 30.0)
+    length: Annotated[float, Meta(ge=2.5, le=30.0)] = 4.8
+    width: Annotated[float, Meta(ge=2.5, le=30.0)] = 4.4
 
 
 def twins(parameters: TwinsParameters, seed: int) -> Design:

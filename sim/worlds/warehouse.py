@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import string
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
+from msgspec import Meta
 
-from mapweave.sim.worlds.design import THICKNESS, Design, Furniture, Poster, Room, Wall, within
+from mapweave.sim.worlds.design import THICKNESS, Design, Furniture, Poster, Room, Wall
 from mapweave.sim.worlds.furniture import furnish
 from mapweave.sim.worlds.layout import plan_of
 
@@ -46,15 +48,9 @@ class WarehouseParameters:
         stacks: of cartons that are wanted in each of the two cross aisles.
     """
 
-    rows: int = 3
-    bays: int = 5
-    stacks: int = 3
-
-    def __post_init__(self) -> None:
-        """Refuse a number out of range (InvalidValue)."""
-        within("a warehouse's number of rows", self.rows, 1, 20)
-        within("a warehouse's number of bays", self.bays, 1, 30)
-        within("a warehouse's number of stacks", self.stacks, 0, 20)
+    rows: Annotated[int, Meta(ge=1, le=20)] = 3
+    bays: Annotated[int, Meta(ge=1, le=30)] = 5
+    stacks: Annotated[int, Meta(ge=0, le=20)] = 3
 
 
 def warehouse(parameters: WarehouseParameters, seed: int) -> Design:

@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.errors import SettingsError
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World
 from mapweave.sim.worlds.catalog import make_world
@@ -136,5 +136,5 @@ def test_there_is_enough_to_see(offices: list[World]) -> None:
 @pytest.mark.parametrize("rooms", [0, 33])
 def test_offices_that_cannot_be_built_are_refused(rooms: int) -> None:
     """One line says why."""
-    with pytest.raises(InvalidValue, match="1 to 32"):
+    with pytest.raises(SettingsError, match=f"rooms: expected int ([<>]=) (1|32); it is {rooms}"):
         make_world("office", 1, rooms=rooms)
