@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Mapping
 from typing import Any
 
-import cv2
 import numpy as np
 
 from mapweave.agent.ros_messages import making
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.processes.edge_colours import COLOURS
+from mapweave.processes.tick_log import EDGE_COLOURS
 from mapweave.wire.ros2.messages import make
 
 MAP = "map"
@@ -29,7 +28,7 @@ def map_markers(places: Mapping[NodeId, Pose2], edges: Iterable[Edge]) -> Any:
     points = {node: _point(np.array([at.x, at.y, 0.0])) for node, at in places.items()}
     markers = [_marker(MAP, "nodes", 0, SPHERES, (0.08,) * 3, (0.9, 0.9, 0.9), list(points.values()))]
     known = [edge for edge in edges if edge.a in points and edge.b in points]
-    for number, (kind, colour) in enumerate(COLOURS.items(), 1):
+    for number, (kind, colour) in enumerate(EDGE_COLOURS.items(), 1):
         ends = [points[end] for edge in known if edge.kind is kind for end in (edge.a, edge.b)]
         markers.append(_marker(MAP, kind.name.lower(), number, LINES, (0.03,) * 3, colour, ends))
     return make("visualization_msgs/msg/MarkerArray", markers=markers)
@@ -47,11 +46,9 @@ def landmark_markers(stamp_ns: int, frame: str, points: Array, drawn: tuple[Arra
     nothing = _marker(frame, "", 0, SPHERES, (0.0,) * 3, ORANGE, [], action=DELETE_ALL)
     dots = [_point(point) for point in points[np.isfinite(points).all(axis=1)]]
     markers = [nothing, _marker(frame, "landmarks", 0, SPHERES, (0.02,) * 3, ORANGE, dots, stamp_ns)]
-    for number, (centre, half, axes) in enumerate(zip(*drawn, strict=True)):
-        vector = cv2.Rodrigues(axes)[0].ravel()
-        angle = float(np.linalg.norm(vector))
-        x, y, z = vector / max(angle, 1e-12) * np.sin(angle / 2.0)
-        turn = make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=float(np.cos(angle / 2.0)))
+    for number, (centre, half, quaternion) in enumerate(zip(*drawn, strict=True)):
+        x, y, z, w = quaternion.tolist()
+        turn = make("geometry_msgs/msg/Quaternion", x=x, y=y, z=z, w=w)
         pose = make("geometry_msgs/msg/Pose", position=_point(centre), orientation=turn)
         size = tuple(np.maximum(2.0 * half, 1e-3).tolist())
         marker = _marker(

@@ -90,16 +90,11 @@ class McapLog(TickLog):
             ):
                 send(f"/bearings/outermost_{side}", _number(math.degrees(outermost)))
                 send(f"/bearings/limit_{side}", _number(sign * math.degrees(moment.camera.semi_aperture)))
-        if moment.map is not None:
-            self._write_map(moment.stamp_ns, *moment.map)
         if moment.floor is not None:
             send("/floor", _floor(moment.floor, moment.stamp_ns))
         status = moment.status
         doing = f"{status.doing}: {status.detail}" if status.detail else status.doing
         send("/status", make("std_msgs/msg/String", data=f"{status.mission}; {doing}"))
-
-    def _write_last(self, stamp_ns: int, nodes: tuple[Node, ...], edges: tuple[Edge, ...]) -> None:
-        self._write_map(stamp_ns, nodes, edges)
 
     def _end(self, ended: bool) -> str:
         if not ended:

@@ -20,7 +20,6 @@ import socket
 from pathlib import Path
 from urllib.parse import urlsplit
 
-import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
@@ -30,9 +29,16 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import NotConnected, SettingsError
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, Node
-from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.processes.edge_colours import COLOURS
-from mapweave.processes.tick_log import PATIENCE, QUALITY, STEP, LoggedTick, TickLog, ellipsoids
+from mapweave.hybridmap.pose import Array
+from mapweave.processes.tick_log import (
+    EDGE_COLOURS,
+    PATIENCE,
+    QUALITY,
+    STEP,
+    LoggedTick,
+    TickLog,
+    ellipsoids,
+)
 
 CONNECT = "connect"
 """Instead of a file: to the viewer on this computer."""
@@ -84,12 +90,9 @@ class RerunLog(TickLog):
         self._recording.set_time("stamp", timestamp=np.datetime64(moment.stamp_ns, "ns"))
         self._write_camera(moment)
         self._write_pose(moment)
-        self._write_map(moment)
         self._write_words(moment)
-
-    def _write_last(self, stamp_ns: int, nodes: tuple[Node, ...], edges: tuple[Edge, ...]) -> None:
-        self._recording.set_time("stamp", timestamp=np.datetime64(stamp_ns, "ns"))
-        self._write_nodes(nodes, edges)
+        if moment.floor is not None:
+            self._log("map/floor", _floor(moment.floor))
 
     def _end(self, ended: bool) -> str:
         missing = ""
@@ -149,14 +152,10 @@ class RerunLog(TickLog):
         if not self._path or np.linalg.norm(here - self._path[-1]) > STEP:
             self._path.append(here)
 
-    def _write_map(self, moment: LoggedTick) -> None:
-        if moment.map is not None:
-            self._write_nodes(*moment.map)
-        if moment.floor is not None:
-            self._log("map/floor", _floor(moment.floor))
-
-    def _write_nodes(self, nodes: tuple[Node, ...], edges: tuple[Edge, ...]) -> None:
-        places = {node.id: _raised(node.map_from_robot.mean) for node in nodes}
+    def _write_map(self, stamp_ns: int, nodes: tuple[Node, ...], edges: tuple[Edge, ...]) -> None:
+        self._recording.set_time("stamp", timestamp=np.datetime64(stamp_ns, "ns"))
+        means = {node.id: node.map_from_robot.mean for node in nodes}
+        places = {node: np.array([at.x, at.y, 0.0]) for node, at in means.items()}
         labels = [str(node.id) for node in nodes]
         self._log(
             "map/nodes", rr.Points3D(list(places.values()), labels=labels, show_labels=False, radii=0.04)
@@ -173,17 +172,9 @@ class RerunLog(TickLog):
             self._log("status", rr.TextLog(now))
 
 
-def _raised(pose: Pose2) -> Array:
-    return np.array([pose.x, pose.y, 0.0])
-
-
 def _ellipsoids(points: Array, covariances: Array) -> rr.Ellipsoids3D:
     """Ellipsoids of landmarks that are known well enough to be drawn."""
-    centres, half_sizes, axes = ellipsoids(points, covariances)
-    turns = np.array([cv2.Rodrigues(matrix)[0].ravel() for matrix in axes]).reshape(-1, 3)
-    angles = np.linalg.norm(turns, axis=1, keepdims=True)
-    units = np.divide(turns, angles, out=np.zeros_like(turns), where=angles > 0.0)
-    quaternions = np.concatenate([units * np.sin(angles / 2.0), np.cos(angles / 2.0)], axis=1)
+    centres, half_sizes, quaternions = ellipsoids(points, covariances)
     return rr.Ellipsoids3D(
         centers=centres, half_sizes=half_sizes, quaternions=quaternions,
         colors=[240, 160, 40], fill_mode=rr.components.FillMode.DenseWireframe,
@@ -194,7 +185,7 @@ def _edges(places: dict[NodeId, Array], edges: tuple[Edge, ...]) -> rr.LineStrip
     known = [edge for edge in edges if edge.a in places and edge.b in places]
     return rr.LineStrips3D(
         np.array([[places[edge.a], places[edge.b]] for edge in known]).reshape(-1, 2, 3),
-        colors=np.array([COLOURS[edge.kind] for edge in known]).reshape(-1, 3), radii=0.015,
+        colors=np.array([EDGE_COLOURS[edge.kind] for edge in known]).reshape(-1, 3), radii=0.015,
         labels=[str(edge.kind) for edge in known], show_labels=False,
     )  # fmt: skip
 

@@ -10,6 +10,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import ClassVar
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -18,7 +19,7 @@ from mapweave.agent.occupancy_grid import GridCells
 from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import Edge, Node
+from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Array, PoseGaussian
 
 log = logging.getLogger(__name__)
@@ -37,6 +38,11 @@ QUALITY = 80
 """Of the JPEG images, %."""
 STEP = 0.02
 """m between two points of the path."""
+EDGE_COLOURS = {
+    EdgeKind.MAPPED: (0.2, 0.7, 0.3), EdgeKind.TURNED: (0.6, 0.6, 0.6), EdgeKind.DRIVEN: (0.2, 0.5, 0.9),
+    EdgeKind.LOOP: (0.95, 0.6, 0.1), EdgeKind.MERGED: (0.85, 0.2, 0.6),
+}  # fmt: skip
+"""Red, green and blue, 0 to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +142,7 @@ class TickLog(ABC):
         ended = not self._thread.is_alive()
         if self._pipeline is not None and ended and not self._failed:
             # Nodes that were made when the robot had stopped.
-            self._write_last(self._stamp_ns, *_map_of(self._pipeline))
+            self._write_map(self._stamp_ns, *_map_of(self._pipeline))
         missing = f"{self.left_out} ticks, since writing was too slow" if self.left_out else ""
         return self._end(ended) or self._failed or missing
 
@@ -148,17 +154,19 @@ class TickLog(ABC):
                 continue
             try:
                 self._write(moment)
+                if moment.map is not None:
+                    self._write_map(moment.stamp_ns, *moment.map)
             except Exception as error:
                 log.debug("a tick cannot be written", exc_info=True)
                 self._failed = f"the end ({' '.join(str(error).split()) or type(error).__name__})"
 
     @abstractmethod
     def _write(self, moment: LoggedTick) -> None:
-        """Write a tick."""
+        """Write a tick without its map."""
 
     @abstractmethod
-    def _write_last(self, stamp_ns: int, nodes: tuple[Node, ...], edges: tuple[Edge, ...]) -> None:
-        """Write the map as it is in the end."""
+    def _write_map(self, stamp_ns: int, nodes: tuple[Node, ...], edges: tuple[Edge, ...]) -> None:
+        """Write the map, when it has changed and in the end."""
 
     @abstractmethod
     def _end(self, ended: bool) -> str:
@@ -180,7 +188,7 @@ def ellipsoids(points: Array, covariances: Array) -> tuple[Array, Array, Array]:
         covariances: (M, 3, 3) m^2.
 
     Returns:
-        (N, 3) m, centres; (N, 3) m, half axes; (N, 3, 3) rotations, whose columns are their directions.
+        (N, 3) m, centres; (N, 3) m, half axes; (N, 4) quaternions x, y, z, w, which turn x, y and z to them.
     """
     finite = np.isfinite(points).all(axis=1) & np.isfinite(covariances).all(axis=(1, 2))
     variances, axes = np.linalg.eigh(covariances[finite])
@@ -188,7 +196,11 @@ def ellipsoids(points: Array, covariances: Array) -> tuple[Array, Array, Array]:
     drawn = half_sizes.max(axis=1, initial=0.0) <= LARGEST
     # A rotation has no reflection.
     axes[np.linalg.det(axes) < 0.0, :, 0] *= -1.0
-    return points[finite][drawn], half_sizes[drawn], axes[drawn]
+    turns = np.array([cv2.Rodrigues(matrix)[0].ravel() for matrix in axes[drawn]]).reshape(-1, 3)
+    angles = np.linalg.norm(turns, axis=1, keepdims=True)
+    units = np.divide(turns, angles, out=np.zeros_like(turns), where=angles > 0.0)
+    quaternions = np.concatenate([units * np.sin(angles / 2.0), np.cos(angles / 2.0)], axis=1)
+    return points[finite][drawn], half_sizes[drawn], quaternions
 
 
 def tracked_of(pipeline: Pipeline) -> tuple[Array, Array, Array, Array]:
