@@ -13,6 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from typing import TypeVar
 
 import zenoh
@@ -21,6 +22,7 @@ from mapweave.hybridmap.errors import NotConnected
 from mapweave.wire import exit_closing
 from mapweave.wire.bus import Closing, Reply, Request, Sample, never
 from mapweave.wire.bus_settings import QUEUE_LIMIT, RETRY_FIRST, RETRY_LONGEST, BusSettings
+from mapweave.wire.credentials import Credentials
 from mapweave.wire.dispatch import Dispatcher
 from mapweave.wire.keyexpr import check_key, check_pattern
 from mapweave.wire.keys import questions_to_robot
@@ -68,7 +70,7 @@ class ZenohBus:
             NotConnected: a router cannot listen where it should, for example since the port is taken.
         """
         self._settings = settings or BusSettings()
-        self._closed = threading.Event()
+        self._closed, self._woken = threading.Event(), threading.Event()
         self._session: zenoh.Session | None = None
         self._in_use = 0
         self._in_use_changed = threading.Condition()
@@ -202,12 +204,21 @@ class ZenohBus:
             self._settings, self._session = settings, session
             self._watch_links(session)
 
+    def renew(self, credentials: Credentials) -> None:
+        """Let a client connect again with another key: Zenoh reads it once."""
+        with self.owner.lock:
+            if not self._closed.is_set():
+                self._settings = replace(self._settings, credentials=credentials)
+                self._close_session()
+        self._woken.set()
+
     def close(self) -> None:
         """Take everything back and disconnect."""
         with self.owner.lock:
             if self._closed.is_set():
                 return
             self._closed.set()
+            self._woken.set()
             session, self._session = self._session, None
             declared, self.owner.declared = self.owner.declared, []
         if self._connecting.is_alive():
@@ -304,9 +315,14 @@ class ZenohBus:
         longer than `ACCEPT_TIMEOUT`: the link lives, and nothing that the client declares or sends is heard.
         """
         self._connect()
-        while not self._closed.wait(max(SILENT / 10, self.owner.heard_at + SILENT - time.monotonic())):
+        while not self._closed.is_set():
+            self._woken.wait(max(SILENT / 10, self.owner.heard_at + SILENT - time.monotonic()))
+            self._woken.clear()
             session = self._session
-            if session is None or time.monotonic() - self.owner.heard_at < SILENT or not self.connected():
+            if session is None:
+                self._connect()
+                continue
+            if time.monotonic() - self.owner.heard_at < SILENT or not self.connected():
                 continue
             if self._is_answered(session):
                 self.owner.heard()
@@ -344,12 +360,12 @@ class ZenohBus:
 
     def _connect(self) -> None:
         """Try until there is a router, then declare what was asked for in the meantime."""
-        config = _config(self._settings)
         wait = RETRY_FIRST
         reported = False
         while not self._closed.is_set():
+            settings = self._settings
             try:
-                session = zenoh.open(config)
+                session = zenoh.open(_config(settings))
             except zenoh.ZError as error:
                 if not reported:
                     log.info("no router at %s yet, trying on", ", ".join(self._settings.endpoints))
@@ -359,7 +375,7 @@ class ZenohBus:
                 wait = min(2 * wait, RETRY_LONGEST)
                 continue
             with self.owner.lock:
-                if not self._closed.is_set():
+                if not self._closed.is_set() and settings is self._settings:
                     try:
                         for declared in self.owner.declared:
                             declared.declare(session)

@@ -20,6 +20,7 @@ from mapweave.commands.network import (
     connect,
     keep_files_private,
     network_of,
+    own_key,
     reach,
     settings_of,
     simulator_beside,
@@ -178,6 +179,7 @@ def run(arguments: argparse.Namespace) -> int:
     bus, keys = connect(network)
     opened, body, beside, claim = time.monotonic(), bus, network, None
     robot: Robot | None = None
+    key = own_key(bus, network, name)
     try:
         if arguments.body:
             beside = replace(network, endpoints=(arguments.body,), keys="")
@@ -225,6 +227,8 @@ def run(arguments: argparse.Namespace) -> int:
             agent = replace(agent, exploration=replace(agent.exploration, without_rangers=True))
         run_agent(robot, bus, keys, agent, options, stop)
     finally:
+        if key is not None:
+            key.close()
         if robot is not None:
             robot.close()
         if claim is not None:

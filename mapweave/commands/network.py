@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
     from mapweave.identities.key_folder import KeyFolder
     from mapweave.identities.key_renewal import KeyRenewal
+    from mapweave.identities.own_key import OwnKey
     from mapweave.settings import NetworkSettings, Settings
     from mapweave.wire.bus_settings import BusSettings
     from mapweave.wire.credentials import Credentials
@@ -235,6 +236,21 @@ def key_renewal(
         print(stamped(line), file=sys.stderr, flush=True)
 
     return KeyRenewal(bus, folder, server, settings, say, renewed)
+
+
+def own_key(bus: ZenohBus, network: NetworkSettings, name: str) -> OwnKey | None:
+    """Lets an agent go on when its key file, if it has one, is replaced; says on stderr what it does."""
+    from mapweave.identities.own_key import OwnKey
+    from mapweave.terminal import stamped
+
+    holder = key_holder(network)
+    if holder is None:
+        return None
+
+    def say(line: str) -> None:
+        print(stamped(f"{name}: {line}"), file=sys.stderr, flush=True)
+
+    return OwnKey(bus, Path(network.keys), holder, say)
 
 
 def reach(network: NetworkSettings, advice: str = "give --connect") -> tuple[ZenohBus, Keys]:

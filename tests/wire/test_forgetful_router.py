@@ -214,14 +214,14 @@ def test_a_client_that_hears_messages_looks_for_silence_once_it_may_be_there(
     """It looked ten times as often: a thousand robots, five hundred times a second."""
     with client_and_router(monkeypatch) as (client, _, _):
         looks: list[float] = []
-        wait = client._closed.wait
+        wait = client._woken.wait
 
         def noted(timeout: float | None = None) -> bool:
             ended = wait(timeout)
             looks.append(time.monotonic())
             return ended
 
-        monkeypatch.setattr(client._closed, "wait", noted)
+        monkeypatch.setattr(client._woken, "wait", noted)
         end = time.monotonic() + 2.5
         while time.monotonic() < end:
             client.owner.heard()
