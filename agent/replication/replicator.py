@@ -15,7 +15,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 
-from mapweave.agent.replication.ack_timer import AckTimer
+from mapweave.agent.replication.beacon_timer import RAREST, BeaconTimer
 from mapweave.agent.replication.journal import Draft, Journal
 from mapweave.agent.replication.log_state import LogState
 from mapweave.hybridmap.agent_status import FIRST_STATUS_PERIOD
@@ -39,7 +39,7 @@ class ReplicationSettings:
 
     Attributes:
         beacon_interval: shortest time from a change to the beacon of a map of which servers lack something,
-            s: it is sent when the acknowledgement is overdue, see AckTimer.
+            s; see BeaconTimer.
         answer_bytes: a log answer ends after so many bytes, since a link may be slow.
         retry_interval: after a failed commit (disk full), s.
     """
@@ -68,9 +68,6 @@ class ReplicationStatus:
     failure: str
 
 
-SETTLED_BEACONS = 20
-"""In the time of so many beacons, or statuses that servers want, a map that servers have sends one: a server
-that has lost it learns so."""
 COMPACTED = 1000
 """After so many further changes that servers have, what later ones undo is dropped from the disk."""
 LOOK = 0.1
@@ -81,9 +78,6 @@ MOST_WAITING = 4096
 """Messages of servers that wait for the thread; more of them are dropped, or refused."""
 BUSY = 1.0
 """After this a question that was refused may be asked again, s."""
-RAREST = 4
-"""A beacon on which nothing follows is sent again after twice the time, up to so many times that of the
-first: the beacons of a fleet that a server cannot keep up with must not hold it up further."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,10 +130,7 @@ class Replicator:
         self._unnoted = False
         self._pending: list[Draft] = []
         self._retry_at = 0.0
-        shortest = self._settings.beacon_interval
-        self._ack_timer = AckTimer(shortest, SETTLED_BEACONS * shortest)
-        self._pause = self._ack_timer.timeout
-        self._next_beacon = self._everyone_at = 0.0
+        self._beacons = BeaconTimer(self._settings.beacon_interval)
         self._compacted = 0
         for state in self._logs.values():
             self._compact(state)
@@ -287,11 +278,7 @@ class Replicator:
                     elif isinstance(item, Sample):
                         self._take_ack(item)
                     elif isinstance(item, bool):
-                        if item:
-                            # A server that has come may have lost its store, or be new.
-                            self._everyone_at = 0.0
-                            self._ack_timer.forget()
-                        self._beacon_after(0.0)
+                        (self._beacons.server_came if item else self._beacons.hasten)(time.monotonic())
                     else:
                         questions.append(item)
             except queue.Empty:
@@ -301,7 +288,7 @@ class Replicator:
                 self._commit()
             for question in questions:
                 self._answer(question)
-            if now >= self._next_beacon:
+            if now >= self._beacons.due:
                 self._send_beacons(now)
         if self._pending:
             log.error("%s: %d changes never reached the disk", self._map, len(self._pending))
@@ -326,12 +313,7 @@ class Replicator:
         return self._work.qsize() < MOST_WAITING
 
     def _next_turn(self) -> float:
-        return min(self._next_beacon, self._retry_at) if self._pending else self._next_beacon
-
-    def _beacon_after(self, seconds: float) -> None:
-        """Something has happened: the next beacon comes so soon, and those behind it at the usual times."""
-        self._pause = self._ack_timer.timeout
-        self._next_beacon = min(self._next_beacon, time.monotonic() + seconds)
+        return min(self._beacons.due, self._retry_at) if self._pending else self._beacons.due
 
     def _commit(self) -> None:
         """Disk first, then the network: a change that was sent is safe."""
@@ -371,11 +353,11 @@ class Replicator:
         if not state.compared:
             # Published, they might follow others of the same numbers unnoticed. Who asks for them shows which
             # change it has before them.
-            self._beacon_after(0.0)
+            self._beacons.hasten(time.monotonic())
             return
         if state is self._current:
-            self._ack_timer.sent(first, time.monotonic())
-        self._beacon_after(self._ack_timer.timeout)
+            self._beacons.published(first, time.monotonic())
+        self._beacons.changed(time.monotonic())
         if state.put_back:
             return
         leaves = self._bus.connected()
@@ -386,21 +368,14 @@ class Replicator:
             state.sent.add(first, first + len(drafts) - 1)
 
     def _send_beacons(self, now: float) -> None:
-        everyone = now >= self._everyone_at
-        if everyone:
-            self._everyone_at = now + SETTLED_BEACONS * max(
-                self._settings.beacon_interval, self._wanted_period(0.0)
-            )
+        everyone = self._beacons.all_due(now, self._wanted_period(0.0))
         unsettled = False
         for state in self._logs.values():
             lacking = state.unsettled(self._servers) > 0 and not state.put_back
             unsettled |= lacking
             if (everyone or lacking) and not state.put_back:
                 self._bus.publish(self._keys.head(state.map), state.head().encode())
-        self._next_beacon = self._everyone_at
-        if unsettled:
-            self._next_beacon = min(now + self._pause, self._next_beacon)
-            self._pause = min(2 * self._pause, RAREST * self._ack_timer.timeout)
+        self._beacons.sent(now, unsettled)
 
     def _take_ack(self, sample: Sample) -> None:
         try:
@@ -469,11 +444,9 @@ class Replicator:
             # Nothing but retirements is added to a map that was left.
             self._compact(state)
         if state is self._current:
-            self._ack_timer.settled(state.settled(self._servers), time.monotonic())
+            self._beacons.settled(state.settled(self._servers), time.monotonic())
         if state.unsettled(self._servers):
-            # The others have the whole time again (RFC 6298, 5.3).
-            self._next_beacon = self._everyone_at
-            self._beacon_after(self._ack_timer.timeout)
+            self._beacons.some_settled(time.monotonic())
 
     def _contradicts(self, state: LogState, stored: StoredChange | None) -> bool:
         return stored is not None and self._journal.contradicts(state.map, stored)
@@ -532,7 +505,7 @@ class Replicator:
             return
         state.compared = True
         if state is self._current:
-            self._ack_timer.asked_for(asked.first, last)
+            self._beacons.asked_for(asked.first, last)
         total = 0
         for count, (_, change) in enumerate(rows):
             total += len(change)
