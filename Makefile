@@ -16,7 +16,7 @@ COMPILE := $(BIN)/python -c 'import mapweave.agent.runner; from mapweave.hybridm
 # pytest keeps what it has read of the tests: else each of its processes reads all of them anew the first time.
 READ_TESTS := $(BIN)/python -m pytest --collect-only --quiet > /dev/null 2>&1
 
-.PHONY: setup demo test check docs bench slow slow-waits slow-most scenarios sbom audit clean
+.PHONY: setup demo test check docs bench slow slow-waits slow-most scenarios sbom audit audit-tools clean
 
 setup: $(STAMP)
 
@@ -84,6 +84,8 @@ $(AUDIT)/.installed: constraints.txt | $(STAMP)
 	@$(AUDIT)/bin/python -m pip install --quiet --disable-pip-version-check --no-compile --no-deps -c constraints.txt \
 	  axe-playwright-python || echo "axe-core cannot be installed: the tests of the page by its rules are skipped"
 	@touch $@
+
+audit-tools: $(AUDIT)/.installed
 
 # What Mapweave is installed with, exactly, as CycloneDX: the same file each time.
 SBOM := out/sbom.json
