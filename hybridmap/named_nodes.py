@@ -85,6 +85,18 @@ def ids_of(words: Iterable[str], resolve: Resolve, near: str = "") -> list[str]:
     return [ids.get(word, word) for word in written]
 
 
+def noting(resolve: Resolve, notes: list[str]) -> Resolve:
+    """The same, which adds what people need to hear about the nodes to `notes`, a line for each word."""
+
+    def answer(request: ResolveRequest) -> ResolveAnswer:
+        answered = resolve(request)
+        found = zip(request.words, answered.found, strict=True)
+        notes.extend(f"{word}: {one.note}" for word, one in found if one.note)
+        return answered
+
+    return answer
+
+
 def own_ids_of(words: Iterable[str], annotations: Record, resolve: Resolve) -> list[str]:
     """Likewise, for corrections: a place that is a node means that node, active or not.
 

@@ -10,7 +10,7 @@ from typing import Any, Literal, TypedDict, Unpack, get_type_hints
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.floor_plan import PlacedPlans, PlanImage
 from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.named_nodes import NodeWord, ids_of, is_position, word_of
+from mapweave.hybridmap.named_nodes import NodeWord, asked_of, ids_of, is_position, noting, word_of
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 from mapweave.refusals import refusals
@@ -112,12 +112,13 @@ class AnnotationMethods(ABC):
         # It loads what reads maps: who only asks a fleet does without.
         from mapweave.mapserver.annotation_words import annotation_of_words
 
+        notes: list[str] = []
         with refusals():
             annotation = annotation_of_words(
-                name, _in_words(fields), removed, self.annotations, self.resolve, self.plans, self._by,
-                because, time.time_ns(),
+                name, _in_words(fields), removed, self.annotations, noting(self.resolve, notes), self.plans,
+                self._by, because, time.time_ns(),
             )  # fmt: skip
-        return self._say(annotation, check)
+        return "; ".join((self._say(annotation, check), *notes))
 
     @abstractmethod
     def put_plan_image(self, png: bytes) -> PlanImage:
@@ -208,9 +209,11 @@ class AnnotationMethods(ABC):
             from mapweave.mapserver.plan_answers import off_plan
 
             words = off_plan(words, self.plans().plan(plan), word_of(near), self.resolve)
-        (own,) = ids_of(words, self.resolve, word_of(near))
+        notes: list[str] = []
+        (own,) = ids_of(words, noting(self.resolve, notes), word_of(near))
         name = str(NodeId.parse(own).map)
-        return self.annotate("floor", name, because, check=check, node=own, label=label)
+        said = self.annotate("floor", name, because, check=check, node=own, label=label)
+        return "; ".join((said, *notes))
 
     def portal(
         self,
@@ -285,9 +288,10 @@ class AnnotationMethods(ABC):
         """Hold the frame of a component by one of its nodes: at a pose, or where it is now; with a floor plan
         at its pose on that, so that the component gets the coordinates of the plan.
         """
-        own = str(self.resolve(word_of(node)).found[0].node)
+        notes: list[str] = []
+        own = str(noting(self.resolve, notes)(asked_of(node)).found[0].node)
         fields = _given(plan=plan, merged_from_node=None if pose is None else packed(pose))
-        return self.annotate("pin", own, because, check=check, node=own, **fields)
+        return "; ".join((self.annotate("pin", own, because, check=check, node=own, **fields), *notes))
 
 
 def _where(words: Mapping[str, Any], known: frozenset[str], **more: Any) -> dict[str, Any]:

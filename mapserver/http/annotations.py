@@ -11,6 +11,7 @@ import msgspec
 from mapweave.hybridmap.annotation import MAX_NAME
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.floor_plan import FloorPlan
+from mapweave.hybridmap.named_nodes import noting
 from mapweave.mapserver.annotation_words import annotation_of_words
 from mapweave.mapserver.floor_plans import placed_plan
 from mapweave.mapserver.http.answering import Answering
@@ -71,11 +72,13 @@ def annotate(server: Answering, data: bytes, by: str, who: str = "") -> Mapping[
         posted = read_json(data, _Posted, EXAMPLES)
     except InvalidValue as error:
         raise InvalidValue(f"{error}; send {FORM}") from None
+    notes: list[str] = []
     annotation = annotation_of_words(
-        posted.name[: MAX_NAME + 1], posted.body, posted.removed, server.annotations, server.resolve,
-        server.plans, who or posted.who or by, posted.because, time.time_ns(),
+        posted.name[: MAX_NAME + 1], posted.body, posted.removed, server.annotations,
+        noting(server.resolve, notes), server.plans, who or posted.who or by, posted.because, time.time_ns(),
     )  # fmt: skip
-    answer = {"said": server.annotate(annotation, posted.check), "annotation": json_values(annotation)}
+    said = "; ".join((server.annotate(annotation, posted.check), *notes))
+    answer = {"said": said, "annotation": json_values(annotation)}
     if posted.check and not posted.removed and isinstance(annotation.body, FloorPlan):
         placed = placed_plan(annotation.name, annotation.body, server.merged())
         answer["plan"] = json_values(placed)

@@ -40,6 +40,7 @@ def add_to(commands: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Label a map, or withdraw its label."""
+    from mapweave.commands.map_ends import noted
     from mapweave.hybridmap.annotation import Floor
     from mapweave.hybridmap.query import ResolveRequest
     from mapweave.mapserver.plan_answers import off_plan
@@ -49,11 +50,11 @@ def run(arguments: argparse.Namespace) -> int:
     if (arguments.label is None) != arguments.undo:
         raise UsageError("give the name of a floor and a node; with --undo a node alone")
     with record_of(arguments) as record:
-        words, near = [arguments.node], arguments.near or ""
+        words, near, resolve = [arguments.node], arguments.near or "", noted(record.resolve)
         if arguments.plan is not None:
-            words = off_plan(words, record.plans().plan(arguments.plan), near, record.resolve)
+            words = off_plan(words, record.plans().plan(arguments.plan), near, resolve)
         floors = set(record.annotations().floors.values())
-        node = record.resolve(ResolveRequest(tuple(words), near)).found[0].node
+        node = resolve(ResolveRequest(tuple(words), near)).found[0].node
         name, because = str(node.map), arguments.because
         if arguments.undo:
             said = [record.withdraw("floor", name, because, check=arguments.check)]

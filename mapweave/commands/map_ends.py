@@ -9,7 +9,7 @@ from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.constraint_subject import EXAMPLE, Ends, read_end, read_ends
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.named_nodes import Resolve, is_id
+from mapweave.hybridmap.named_nodes import Resolve, is_id, noting
 from mapweave.hybridmap.query import ResolveAnswer, ResolveRequest
 
 
@@ -43,10 +43,10 @@ def noted(resolve: Resolve) -> Resolve:
     """The same, with what is to be said about the nodes on stderr."""
 
     def answer(request: ResolveRequest) -> ResolveAnswer:
-        answered = resolve(request)
-        for word, one in zip(request.words, answered.found, strict=True):
-            if one.note:
-                print(f"mapweave: {word}: {one.note}", file=sys.stderr)
+        notes: list[str] = []
+        answered = noting(resolve, notes)(request)
+        for note in notes:
+            print(f"mapweave: {note}", file=sys.stderr)
         return answered
 
     return answer

@@ -44,6 +44,8 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Pin a node, take a pin out, or list them."""
+    from mapweave.commands.map_ends import noted
+    from mapweave.hybridmap.named_nodes import ids_of
     from mapweave.hybridmap.query import ResolveRequest
 
     if arguments.node is None:
@@ -56,10 +58,13 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.pose is not None:
         fields["merged_from_node"] = _pose(arguments.pose)
     with record_of(arguments) as record:
+        resolve = noted(record.resolve)
         if arguments.undo:
-            said = record.withdraw("pin", arguments.node, arguments.because, check=arguments.check)
+            # A retired node is found by its id alone.
+            (node,) = ids_of([arguments.node], resolve)
+            said = record.withdraw("pin", node, arguments.because, check=arguments.check)
         else:
-            node = str(record.resolve(ResolveRequest((arguments.node,))).found[0].node)
+            node = str(resolve(ResolveRequest((arguments.node,))).found[0].node)
             fields["node"] = node
             said = record.annotate("pin", node, arguments.because, check=arguments.check, **fields)
     print_said(arguments, said)

@@ -372,6 +372,28 @@ def test_places_stand_for_nodes_and_areas_in_corrections(path: Path) -> None:
         assert "'dor' is no place of this map" in posted(area={"anchor": "dor", "corners": corners})
 
 
+def test_a_node_in_the_place_of_a_retired_one_is_named_with_the_reason(
+    path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """Only lists and explanations named it."""
+    with serving(path) as asking:
+        asking.fleet.place("door", str(LAST))
+        asking.fleet.retire("door")
+        asking.merged()
+        why = f"door: {LAST} takes no part (node {LAST} is retired by anna on "
+        assert why in asking.fleet.pin("door", check=True)
+        body = {"name": "a.1", "body": {"kind": "floor", "node": "door", "label": "first"}, "check": True}
+        connection = http.client.HTTPConnection("127.0.0.1", asking.port, timeout=60)
+        connection.request("POST", "/annotations", json.dumps(body), {"Content-Type": "application/json"})
+        assert why in json.loads(connection.getresponse().read())["said"]
+        capfd.readouterr()
+        for command in ("map pin door", "avoid door --radius 2", "floor first door"):
+            assert main([*command.split(), "--check", *asking.at]) == 0, command
+            assert why in "".join(capfd.readouterr()), command
+        assert main(["map", "pin", "door", *asking.at]) == 0
+        assert main(["map", "pin", "door", "--undo", *asking.at]) == 0
+
+
 def test_a_closure_of_an_edge_that_is_none_is_refused_and_others_say_how_much_they_close(
     small: Asking, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ) -> None:

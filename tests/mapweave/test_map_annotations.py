@@ -94,7 +94,7 @@ def test_python_and_shell_leave_the_same_file(
             THIRD, mapweave.Pose2(12.5, -3.0, np.pi / 2), because=why
         ),
         ("reopen", "wet"): lambda: room.withdraw("closure", "wet", why),
-        ("map", "pin", THIRD, "--undo"): lambda: room.withdraw("pin", THIRD, why),
+        ("map", "pin", "kitchen", "--undo"): lambda: room.withdraw("pin", THIRD, why),
         ("plan", "remove", "flat"): lambda: room.withdraw("plan", "flat", why),
         ("map", "retire", FIRST): lambda: room.retire(FIRST, because=why),
         ("place", "remove", "hall"): lambda: room.withdraw("place", "hall", why),
