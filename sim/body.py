@@ -10,6 +10,7 @@ import numpy as np
 from msgspec import Meta
 from numpy.typing import NDArray
 
+from mapweave.agent.drivers.robot import clip
 from mapweave.agent.observation import Command, Odometry, RobotDescription
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.sim import surface
@@ -150,9 +151,9 @@ class Body:
     def drive(self, command: Command) -> None:
         """Take a command for the coming tick; clipped to the robot's limits."""
         d = self._description
-        forward = float(np.clip(command.forward, -d.max_forward, d.max_forward))
-        turn = float(np.clip(command.turn, -d.max_turn, d.max_turn))
-        self._targets = np.array([forward - turn * d.axle / 2, forward + turn * d.axle / 2]) / WHEEL_RADIUS
+        command = clip(command, d)
+        half = command.turn * d.axle / 2
+        self._targets = np.array([command.forward - half, command.forward + half]) / WHEEL_RADIUS
         # Slip is a property of floor and tyre: it wanders and the encoders do not see it.
         keep = math.exp(-d.tick / SLIP_WANDERS)
         fresh = self._rng.standard_normal(2) * self._settings.slip * math.sqrt(1.0 - keep**2)

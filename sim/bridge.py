@@ -18,7 +18,7 @@ from mapweave.agent.drivers.messages import (
     encode_description,
     encode_observation,
 )
-from mapweave.agent.drivers.remote import clip
+from mapweave.agent.drivers.robot import clip
 from mapweave.hybridmap.errors import MapweaveError
 from mapweave.sim.ground_truth_service import GroundTruthService
 from mapweave.sim.keys import SimKeys

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import secrets
 import threading
 import time
@@ -19,8 +18,9 @@ from mapweave.agent.drivers.messages import (
     decode_observation,
     encode_step,
 )
+from mapweave.agent.drivers.robot import clip
 from mapweave.agent.observation import Command, Observation, RobotDescription
-from mapweave.hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
+from mapweave.hybridmap.errors import DeviceError, InvalidMessage
 from mapweave.wire.bus import Bus, Closing
 from mapweave.wire.keys import Keys
 
@@ -38,21 +38,6 @@ PAUSE = 0.05
 """Between two questions while there is no answer, s."""
 
 _T = TypeVar("_T")
-
-
-def clip(command: Command, description: RobotDescription) -> Command:
-    """The command within the robot's limits.
-
-    Raises:
-        InvalidValue: it is not finite.
-    """
-    if not (math.isfinite(command.forward) and math.isfinite(command.turn)):
-        raise InvalidValue(f"command: {command} is not finite")
-    forward, turn = description.max_forward, description.max_turn
-    return Command(
-        min(max(command.forward, -forward), forward),
-        min(max(command.turn, -turn), turn),
-    )
 
 
 class RemoteRobot:

@@ -5,9 +5,11 @@ SI units and radians throughout. `docs/drivers.md` explains how to write a drive
 
 from __future__ import annotations
 
+import math
 from typing import Protocol
 
 from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave.hybridmap.errors import InvalidValue
 
 
 class Robot(Protocol):
@@ -34,3 +36,18 @@ class Robot(Protocol):
 
     def close(self) -> None:
         """Stop the wheels and let go."""
+
+
+def clip(command: Command, description: RobotDescription) -> Command:
+    """The command within the robot's limits.
+
+    Raises:
+        InvalidValue: it is not finite.
+    """
+    if not (math.isfinite(command.forward) and math.isfinite(command.turn)):
+        raise InvalidValue(f"command: {command} is not finite")
+    forward, turn = description.max_forward, description.max_turn
+    return Command(
+        min(max(command.forward, -forward), forward),
+        min(max(command.turn, -turn), turn),
+    )

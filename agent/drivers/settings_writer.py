@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 import tomllib
 from collections.abc import Mapping
@@ -48,7 +49,8 @@ def write_camera(path: Path, values: Mapping[str, Value]) -> None:
     while end > at + 1 and not lines[end - 1].strip():
         end -= 1
     for key, value in values.items():
-        text = f"{key} = {_toml(value)}"
+        # Numbers, texts and lists of these are the same in JSON and in TOML.
+        text = f"{key} = {json.dumps(value, ensure_ascii=False)}"
         known = next((k for k in range(at + 1, end) if re.match(rf"\s*{key}\s*=", lines[k])), None)
         if known is not None:
             comment = re.search(r"\s+#[^\"\]]*$", lines[known])
@@ -67,12 +69,3 @@ def write_camera(path: Path, values: Mapping[str, Value]) -> None:
             f"{path}: its camera is no table [robot.camera] with one key a line; nothing is changed"
         )
     write_whole(path, new.encode())
-
-
-def _toml(value: Value) -> str:
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_toml, value))}]"
-    if isinstance(value, str):
-        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
-        return f'"{escaped}"'
-    return repr(value)

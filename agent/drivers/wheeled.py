@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import logging
-import math
 import threading
 import time
 from collections import deque
@@ -17,9 +16,10 @@ from mapweave.agent.drivers.base import Base, BaseReading, Wheels
 from mapweave.agent.drivers.camera import Capture, FrameSource, StampedImage
 from mapweave.agent.drivers.checked_base import check_base, check_reading, check_wheels
 from mapweave.agent.drivers.clock import now_ns
+from mapweave.agent.drivers.robot import clip
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.hybridmap.errors import DeviceError, InvalidValue
+from mapweave.hybridmap.errors import DeviceError
 
 log = logging.getLogger(__name__)
 
@@ -208,12 +208,10 @@ class WheeledRobot:
 
     def _wheels(self, command: Command) -> Wheels:
         """Wheel speeds of a command within the limits."""
-        if not (math.isfinite(command.forward) and math.isfinite(command.turn)):
-            raise InvalidValue(f"command: {command} is not finite")
         d = self.describe()
-        forward = min(max(command.forward, -d.max_forward), d.max_forward)
-        half = min(max(command.turn, -d.max_turn), d.max_turn) * d.axle / 2
-        return Wheels(forward - half, forward + half)
+        safe = clip(command, d)
+        half = safe.turn * d.axle / 2
+        return Wheels(safe.forward - half, safe.forward + half)
 
     def _way(self, stamp_ns: int) -> Wheels:
         """Distances of the wheels at a time, interpolated or slightly extrapolated."""

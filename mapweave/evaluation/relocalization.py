@@ -38,33 +38,32 @@ class RelocalizationEvaluation:
 
     Attributes:
         about: the recording, in figures.
-        verdicts: of each question, by how places were verified.
+        verified: how places were verified: by `depths`, or by their `looks`.
+        verdicts: of each question.
         trials: of robots that ask again while they drive.
     """
 
     about: dict[str, Any]
-    verdicts: dict[str, list[JudgedAnswer]]
+    verified: str
+    verdicts: list[JudgedAnswer]
     trials: list[LostDrive]
 
     def report(self) -> dict[str, Any]:
-        """Figures of the first way at the top, those of the others under their names, for `json.dumps`."""
-        names = list(self.verdicts)
-        by_selection = {name: figures(self.verdicts[name]) for name in names[1:]}
-        first = {**figures(self.verdicts[names[0]]), **trial_figures(self.trials)}
-        return {**self.about, "verified": names[0], **first, **by_selection}
+        """All figures, for `json.dumps`."""
+        return {
+            **self.about, "verified": self.verified, **figures(self.verdicts), **trial_figures(self.trials),
+        }  # fmt: skip
 
     def write(self, folder: Path) -> list[Path]:
-        """One table of verdicts for each way."""
+        """A table of the verdicts; returns where."""
         folder.mkdir(parents=True, exist_ok=True)
-        paths = []
-        for name, verdicts in self.verdicts.items():
-            paths.append(folder / f"answers-{name}.csv")
-            with paths[-1].open("w", newline="", encoding="utf-8") as file:
-                rows = [asdict(verdict) for verdict in verdicts]
-                table = csv.DictWriter(file, list(rows[0]) if rows else ["query"])
-                table.writeheader()
-                table.writerows(rows)
-        return paths
+        path = folder / f"answers-{self.verified}.csv"
+        with path.open("w", newline="", encoding="utf-8") as file:
+            rows = [asdict(verdict) for verdict in self.verdicts]
+            table = csv.DictWriter(file, list(rows[0]) if rows else ["query"])
+            table.writeheader()
+            table.writerows(rows)
+        return [path]
 
 
 def evaluate_relocalization(
@@ -144,7 +143,7 @@ def _ask(
     questions = (verdict for robot in asking for verdict in drive.questions(robot))
     verdicts = list(tracked(questions, "asking", total=sum(map(len, asking)), console=console))
     about = {"folder": folder.name, "nodes": drive.nodes, "truth": bool(truth.poses)}
-    return RelocalizationEvaluation(about, {"depths": verdicts}, drive.trials)
+    return RelocalizationEvaluation(about, "depths", verdicts, drive.trials)
 
 
 def _examine_photographs(
@@ -160,7 +159,7 @@ def _examine_photographs(
         for number, image in tracked(list(photographs.questions.items()), "questions", console=console)
     ]
     about = {"folder": folder.name, "nodes": len(photographs.places), "focal_px": camera.fx}
-    return RelocalizationEvaluation(about, {"looks": verdicts}, photograph_trials(verdicts))
+    return RelocalizationEvaluation(about, "looks", verdicts, photograph_trials(verdicts))
 
 
 def _camera_of(folder: Path, camera_file: Path | None, focal_px: float | None) -> tuple[Camera, Distortion]:

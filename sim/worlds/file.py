@@ -94,15 +94,9 @@ def save_design(design: Design, path: Path) -> None:
 
 def _lines(item: Any) -> list[str]:
     """Fields that are not as by default, one a line."""
+    # Texts that can be printed, numbers that are finite, flags and lists are the same in JSON and in TOML.
     return [
-        f"{field.name} = {_toml(value)}"
+        f"{field.name} = {json.dumps(value, ensure_ascii=False)}"
         for field in dataclasses.fields(item)
         if field.name not in ITEMS and (value := getattr(item, field.name)) != field.default
     ]
-
-
-def _toml(value: Any) -> str:
-    if isinstance(value, tuple):
-        return f"[{', '.join(map(_toml, value))}]"
-    # Texts that can be printed, numbers that are finite, and flags are the same in JSON and in TOML.
-    return json.dumps(value, ensure_ascii=False)
