@@ -49,6 +49,8 @@ comes for so long, s. A router that is gone is noticed earlier, by Zenoh."""
 MOST_REPLIES, MOST_REPLY_BYTES = 16_384, 2**27
 """To one question; then no further one is waited for: one of each client that a router takes, and four of the
 largest size. Zenoh lets each client send any number of them."""
+ENDED = 0.5
+"""s in which a session ends; with clients that all read it takes 0.1."""
 FIRST_LOOK = 0.05
 """When a client first looks for that sign, s; later ones each take twice the time of the one before."""
 
@@ -193,8 +195,7 @@ class ZenohBus:
         with self.owner.lock:
             if self._closed.is_set():
                 raise NotConnected("this bus is closed")
-            self._close_session()
-            session = _open_router(settings)
+            session = _open_router(settings, self._close_session())
             try:
                 for entity in self.owner.declared:
                     entity.declare(session)
@@ -266,16 +267,26 @@ class ZenohBus:
                 declared.declare(self._session)
         return declared
 
-    def _close_session(self) -> None:
-        """Take everything back from the session, to be declared in the next; with the owner's lock held."""
+    def _close_session(self) -> threading.Thread | None:
+        """Take everything back from the session, to be declared in the next; with the owner's lock held.
+
+        Returns:
+            What still ends the session, if that takes long: a client that has stopped reading, with a large
+            answer on its way, holds it up for up to 20 s. The port is free by then.
+        """
         session, self._session = self._session, None
         for entity in self.owner.declared:
             entity.detach()
         with self._in_use_changed:
             self._in_use_changed.wait_for(lambda: self._in_use == 0)
         self._publishers = Publishers()
-        if session is not None:
-            _end(session)
+        if session is None:
+            return None
+        # Not a daemon, which the interpreter would kill inside Zenoh at its exit.
+        ending = threading.Thread(target=_end, args=(session,), name="zenoh-end", daemon=False)
+        ending.start()
+        ending.join(ENDED)
+        return ending if ending.is_alive() else None
 
     def _watch_links(self, session: zenoh.Session) -> None:
         """Log who connects, and who is denied everything."""
@@ -401,10 +412,21 @@ def _end(session: zenoh.Session) -> None:
         log.debug("closing a session: %s", error)
 
 
-def _open_router(settings: BusSettings) -> zenoh.Session:
+def _open_router(settings: BusSettings, ending: threading.Thread | None = None) -> zenoh.Session:
+    """Open it, if need be once a session before has left the port.
+
+    Raises:
+        NotConnected: it cannot listen where it should.
+    """
     allow_many_files()
+    config = _config(settings)
+    while ending is not None and ending.is_alive():
+        try:
+            return zenoh.open(config)
+        except zenoh.ZError:
+            ending.join(ENDED)
     try:
-        return zenoh.open(_config(settings))
+        return zenoh.open(config)
     except zenoh.ZError as error:
         where = ", ".join(settings.listen)
         if "in use" in str(error):

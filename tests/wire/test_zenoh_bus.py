@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 import socket
 import subprocess
 import sys
@@ -220,3 +221,39 @@ def test_a_router_drops_what_is_too_large(router_fleet: ZenohFleet) -> None:
     eventually(lambda: fleet.router.ask("mapweave/log", b"1000", 5.0))
     assert len(fleet.router.ask("mapweave/log", str(2**24).encode(), 10.0)[0].payload) == 2**24
     assert fleet.router.ask("mapweave/log", str(2**25 + 1).encode(), 1.0) == []
+
+
+FROZEN = """
+import sys
+from mapweave.wire.bus_settings import BusSettings
+from mapweave.wire.zenoh_bus import ZenohBus
+bus = ZenohBus(BusSettings(endpoints=(sys.argv[1],)))
+bus.wait_connected(30)
+bus.ask("mapweave/map", b"", 60.0)
+"""
+
+
+@pytest.mark.slow
+def test_a_client_that_stops_reading_does_not_hold_up_new_keys(router_fleet: ZenohFleet) -> None:
+    """With 30 MB on their way to it, the router was closed for 16 s, and no one was answered for 17."""
+    fleet, asked = router_fleet, threading.Event()
+    live = fleet.join()
+    process = subprocess.Popen([sys.executable, "-c", FROZEN, fleet.endpoints[0]])
+
+    def answer(request: Any) -> None:
+        process.send_signal(signal.SIGSTOP)
+        asked.set()
+        request.reply(bytes(30_000_000))
+
+    try:
+        fleet.router.serve("mapweave/map", answer)
+        fleet.router.serve("mapweave/small", lambda request: request.reply(b"here"))
+        assert asked.wait(30.0)
+        time.sleep(0.2)  # its buffers are full
+        began = time.monotonic()
+        fleet.router.reopen(BusSettings(mode="router", listen=fleet.endpoints))
+        assert time.monotonic() - began < 5.0
+        eventually(lambda: live.ask("mapweave/small", b"", 0.5), 10.0)
+    finally:
+        process.kill()
+        process.wait()
