@@ -8,16 +8,16 @@ import mapweave.extras
 mapweave.extras.exit_without("viz")
 from matplotlib.figure import Figure
 
-endpoint = sys.argv[1] if sys.argv[1:] else "tcp/127.0.0.1:7447"
-picture = Path("out/examples/fleet.png")
+picture, doing = Path("out/examples/fleet.png"), dict[str, str]()
 picture.parent.mkdir(parents=True, exist_ok=True)
 
-with mapweave.connect(endpoint) as fleet:
+with mapweave.connect(sys.argv[1] if sys.argv[1:] else "tcp/127.0.0.1:7447") as fleet:
     for robot in fleet.status().robots:
         print(f"{robot.robot} is {'there' if robot.alive else 'gone'}, at {robot.merged_from_robot}")
     for event in fleet.events(float(sys.argv[2]) if sys.argv[2:] else 60.0):
         match event:
-            case mapweave.AgentStatus():
+            case mapweave.AgentStatus() if doing.get(event.robot) != event.status.doing:
+                doing[event.robot] = event.status.doing
                 print(f"{event.robot}: {event.status.doing} {event.status.detail}")
             case mapweave.MapEvent():
                 print(f"{event.kind}: {event.words}")

@@ -43,4 +43,4 @@ class Pin:
     def words(self) -> str:
         """The pin in words."""
         pose = self.merged_from_node
-        return f"at {pose.x:.3f},{pose.y:.3f} m, {math.degrees(pose.heading):.1f} deg"
+        return f"at {pose.x:z.3f},{pose.y:z.3f} m, {math.degrees(pose.heading):z.1f} deg"

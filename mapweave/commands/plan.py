@@ -195,7 +195,7 @@ def plan_place(placed: PlacedPlan, pose: Pose2 | None) -> str:
     """A pose on a plan, in words."""
     if pose is None:
         return f"not on plan {placed.name}"
-    return f"on plan {placed.name}: {pose.x:.2f},{pose.y:.2f} m, {math.degrees(pose.heading):.0f} deg"
+    return f"on plan {placed.name}: {pose.x:z.2f},{pose.y:z.2f} m, {math.degrees(pose.heading):z.0f} deg"
 
 
 def _pair(word: str) -> dict[str, Any]:

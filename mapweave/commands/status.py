@@ -301,12 +301,12 @@ def _place(robot: RobotEntry, plan: PlacedPlan | None) -> str:
         name = f", {robot.place}" if robot.place else ""
         if on_plan is None:
             return f"not on plan {plan.name}{name}"
-        return f"{on_plan.x:.2f},{on_plan.y:.2f} {math.degrees(on_plan.heading):.0f}°{name}"
+        return f"{on_plan.x:z.2f},{on_plan.y:z.2f} {math.degrees(on_plan.heading):z.0f}°{name}"
     if pose is not None:
         part = f" in part {robot.component}" if robot.component > 0 else ""
         part += f", {robot.place}" if robot.place else ""
         part += f", floor {robot.floor}" if robot.floor else ""
-        return f"{pose.x:.2f},{pose.y:.2f} {math.degrees(pose.heading):.0f}°{part}"
+        return f"{pose.x:z.2f},{pose.y:z.2f} {math.degrees(pose.heading):z.0f}°{part}"
     if status is not None and status.status.fix_node is not None:
         return f"near {status.status.fix_node}"
     return "unknown"

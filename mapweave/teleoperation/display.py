@@ -22,7 +22,7 @@ def lines(name: str, report: AgentStatus, command: Command, silence: float, usag
         usage: which keys there are.
     """
     status, pose = report.status, report.status.map_from_robot
-    where = f"x {pose.x:.2f} m  y {pose.y:.2f} m  heading {math.degrees(pose.heading):.0f} deg"
+    where = f"x {pose.x:z.2f} m  y {pose.y:z.2f} m  heading {math.degrees(pose.heading):z.0f} deg"
     if status.astray:
         where = "not localized on its map"
     elif not status.nodes:

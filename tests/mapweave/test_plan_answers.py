@@ -7,11 +7,13 @@ from dataclasses import replace
 
 import pytest
 
+from mapweave.commands.plan import plan_place
 from mapweave.commands.relocalize import _json, _print
 from mapweave.commands.status import COLUMNS, cells
 from mapweave.hybridmap.agent_status import AgentStatus, RobotEntry, Status
 from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlan, PlanImage, PlanPair, PlanPart
 from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from tests.mapserver.stub_services import ANSWER
 
@@ -32,6 +34,15 @@ def test_a_robot_is_shown_on_the_plan() -> None:
     assert cells(robot(1), PLAN)[at] == "9.00,7.00 90°"
     assert cells(robot(0), PLAN)[at] == "not on plan office"
     assert cells(robot(0))[at] == "2.00,1.00 0°"
+
+
+def test_nothing_is_minus_nothing() -> None:
+    """A robot at the first node of its map was at -0.00,-0.00 m, -0 deg."""
+    least = Pose2(-1e-5, -1e-5, -1e-5)
+    there = replace(robot(0), merged_from_robot=least)
+    assert cells(there)[COLUMNS.index("at")] == "0.00,0.00 0°"
+    assert plan_place(PLAN, least) == "on plan office: 0.00,0.00 m, 0 deg"
+    assert Pin(NodeId("r0", 1, 1), least).words == "at 0.000,0.000 m, 0.0 deg"
 
 
 def test_a_place_of_a_photograph_is_given_on_the_plan(capsys: pytest.CaptureFixture[str]) -> None:
