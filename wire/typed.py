@@ -242,6 +242,9 @@ def _schema(kind: Any) -> Any:
     msgspec would read a dataclass itself, without the forms of the types within.
     """
     origin, inner = get_origin(kind), get_args(kind)
+    if (alias := getattr(origin, "__value__", None)) is not None:
+        # From NumPy 2.5 on `NDArray` is one.
+        return _schema(alias[inner])
     by_id = origin is Mapping and inner[0] in (NodeId, MapId)
     if kind in FORMS or is_dataclass(kind) or origin is np.ndarray or by_id:
         return _opaque(kind)

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+import scipy.linalg
 import scipy.optimize
 import scipy.sparse
 
@@ -166,7 +167,7 @@ def test_marginals_of_nodes_that_nothing_joins() -> None:
     rng = np.random.default_rng(4)
     own = np.array([one @ one.T + np.eye(3) for one in rng.normal(size=(4, 3, 3))])
     own[2] = np.diag([1.0, 2.0, 3.0])
-    information = scipy.sparse.block_diag(own, format="csc")
+    information = scipy.sparse.csc_matrix(scipy.linalg.block_diag(*own))
     assert np.allclose(marginal_covariances(information), np.linalg.inv(own))
     joined = information.toarray()
     joined[0, 9] = joined[9, 0] = joined[4, 8] = joined[8, 4] = 0.1
