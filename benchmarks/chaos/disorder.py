@@ -56,7 +56,9 @@ class DisorderedBus:
         self._thread.start()
 
     def publish(self, key: str, payload: bytes, attachment: bytes = b"") -> None:
-        """Send, perhaps twice or later."""
+        """Send, perhaps twice or later. Without a connection nothing leaves, and nothing comes later."""
+        if not self._bus.connected():
+            return
         self._pass_on(key, lambda: self._bus.publish(key, payload, attachment))
 
     def subscribe(self, pattern: str, handler: Callable[[Sample], None], *, direct: bool = False) -> Closing:

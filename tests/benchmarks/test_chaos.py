@@ -246,6 +246,28 @@ def test_messages_come_twice_and_late_and_none_is_lost(
         bus.close()
 
 
+def test_what_is_published_without_a_connection_does_not_come_late(
+    hub: MemoryHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A robot takes what a server has of it and has never left for changes that its disk has lost."""
+    monkeypatch.setattr("benchmarks.chaos.disorder.LONGEST", 0.1)
+    robot, server, heard = MemoryBus(hub), MemoryBus(hub), list[bytes]()
+    server.subscribe("a/b/c/d/r0/*", lambda sample: heard.append(sample.payload))
+    link = DisorderedBus(robot, tmp_path, [3])
+    flag(tmp_path, "r0").touch()
+    hub.cut(robot)
+    for _ in range(50):
+        link.publish("a/b/c/d/r0/change", b"cut off")
+    hub.restore(robot)
+    for _ in range(50):
+        link.publish("a/b/c/d/r0/change", b"connected")
+    eventually(lambda: len(heard) >= 50 and not link._late)
+    link.close()
+    assert set(heard) == {b"connected"}
+    for bus in (robot, server):
+        bus.close()
+
+
 def test_what_is_lost_on_one_store_is_lost_on_both() -> None:
     one = ON_SQLITE
     other = dict(one, store="postgresql", stored=2, lost=1, maps_equal=False, relocalize_gap_s=0.7)
