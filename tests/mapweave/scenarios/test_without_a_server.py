@@ -44,7 +44,7 @@ class Robot:
         self.fleet.advance(self.tick)
 
     def run_until(self, condition: Callable[[], bool], seconds: int) -> None:
-        """Go on until something holds, at most for so long; whoever calls asserts it."""
+        """Go on until something holds, at most for so long: the caller asserts it."""
         for _ in range(seconds):
             if condition():
                 return
