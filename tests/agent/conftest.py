@@ -3,12 +3,9 @@
 from __future__ import annotations
 
 from collections import OrderedDict
-from functools import cache
 
-import cv2
 import numpy as np
 import pytest
-import skimage.data
 
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
@@ -19,6 +16,7 @@ from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2
 from synthetic.world import World
 from tests.agent.scripted_fleet import home_map, home_world
+from tests.photo_walls import rendered, two_walls
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 DESCRIPTION = RobotDescription(camera=CAMERA)
@@ -29,25 +27,12 @@ MOST_RENDERED = 400
 RENDERED: OrderedDict[object, tuple[np.ndarray, list[np.ndarray]]] = OrderedDict()
 
 
-@cache
-def photograph(name: str) -> np.ndarray:
-    """A grey picture of scikit-image, a little blurred."""
-    grey = cv2.cvtColor(getattr(skimage.data, name)(), cv2.COLOR_RGB2GRAY)
-    soft = cv2.GaussianBlur(grey, (0, 0), 1.0)
-    soft.flags.writeable = False
-    return soft
-
-
 class PhotoWalls:
     """A near wall on the left and a far wall on the right, facing the robot, each with a photograph."""
 
     def __init__(self) -> None:
         """Hang the pictures: each is 2.4 m wide, and px of the picture are metres of the wall."""
-        # (picture, x of the wall, y of its left edge, z of its top edge, width), m in world
-        self.walls = [
-            (photograph("coffee"), 3.2, 0.2, 1.5, 2.6),
-            (photograph("astronaut"), 2.2, 1.9, 1.3, 1.8),
-        ]
+        self.walls = two_walls()
 
     def depth_at(self, world_from_robot: Pose2, pixels: np.ndarray) -> np.ndarray:
         """True depth along the optical axis at pixels of a robot that looks along x exactly."""
@@ -64,18 +49,7 @@ class PhotoWalls:
         shown = at, tuple((id(wall[0]), *wall[1:]) for wall in self.walls)
         if (kept := RENDERED.get(shown)) is not None:
             return kept[0]
-        image = np.full((CAMERA.height, CAMERA.width), 128, np.uint8)
-        for picture, x, y, z, width in self.walls:
-            scale = width / picture.shape[1]
-            height = scale * picture.shape[0]
-            corners = np.array([[x, y, z], [x, y - width, z], [x, y - width, z - height], [x, y, z - height]])
-            seen = CAMERA.project(world_from_robot.inverse().apply(corners))
-            size = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (picture.shape[1], picture.shape[0]) - 0.5
-            to_image = cv2.getPerspectiveTransform(size.astype(np.float32), seen.astype(np.float32))
-            size_out = (CAMERA.width, CAMERA.height)
-            drawn = cv2.warpPerspective(picture, to_image, size_out, flags=cv2.INTER_AREA)
-            mask = cv2.warpPerspective(np.full_like(picture, 255), to_image, size_out)
-            np.copyto(image, drawn, where=mask > 127)
+        image = rendered(self.walls, CAMERA, world_from_robot)
         image.flags.writeable = False
         # The pictures are kept with it: another one must not get the number of one that is gone.
         RENDERED[shown] = image, [wall[0] for wall in self.walls]

@@ -22,27 +22,15 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import NO_COMPONENT, Certainty, RelocalizeAnswer, Whereabouts
+from tests.photo_walls import rendered, two_walls
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
 
 
 def render(world_from_robot: Pose2, camera: Camera = CAMERA) -> np.ndarray:
-    """(240, 320) grey: two photographs on walls 2.2 m and 3.2 m from the origin, by exact homographies."""
-    size = camera.width, camera.height
-    image = np.full((camera.height, camera.width), 128, np.uint8)
-    hung = [(skimage.data.coffee(), 3.2, 0.2, 1.5, 2.6), (skimage.data.astronaut(), 2.2, 1.9, 1.3, 1.8)]
-    for picture, x, y, z, width in hung:
-        grey = cv2.GaussianBlur(cv2.cvtColor(picture, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
-        height = width * grey.shape[0] / grey.shape[1]
-        corners = np.array([[x, y, z], [x, y - width, z], [x, y - width, z - height], [x, y, z - height]])
-        seen = camera.project(world_from_robot.inverse().apply(corners)).astype(np.float32)
-        own = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (grey.shape[1], grey.shape[0]) - 0.5
-        to_image = cv2.getPerspectiveTransform(own.astype(np.float32), seen)
-        drawn = cv2.warpPerspective(grey, to_image, size, flags=cv2.INTER_AREA)
-        mask = cv2.warpPerspective(np.full_like(grey, 255), to_image, size)
-        image = np.where(mask > 127, drawn, image).astype(np.uint8)
-    return image
+    """Two photographs, 2.2 m and 3.2 m from the origin."""
+    return rendered(two_walls(), camera, world_from_robot)
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-import skimage.data
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
@@ -34,6 +33,7 @@ from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.maps import write_store
+from tests.photo_walls import photograph, rendered
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
@@ -45,22 +45,8 @@ MOVED = Pose2(0.3, 0.1, 0.06)
 
 def picture(node_from_robot: Pose2) -> np.ndarray:
     """(240, 320) grey: one photograph on a wall and one, half hidden, half a metre behind it."""
-    image = np.full((240, 320), 90, np.uint8)
-    hung = [
-        (skimage.data.coffee(), WALL + 0.6, 0.3, 1.6, 2.6),
-        (skimage.data.astronaut(), WALL, 1.7, 1.2, 1.6),
-    ]
-    for photo, x, y, z, width in hung:
-        grey = cv2.GaussianBlur(cv2.cvtColor(photo, cv2.COLOR_RGB2GRAY), (0, 0), 1.0)
-        height = width * grey.shape[0] / grey.shape[1]
-        corners = np.array([[x, y, z], [x, y - width, z], [x, y - width, z - height], [x, y, z - height]])
-        seen = CAMERA.project(node_from_robot.inverse().apply(corners)).astype(np.float32)
-        own = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * (grey.shape[1], grey.shape[0]) - 0.5
-        to_image = cv2.getPerspectiveTransform(own.astype(np.float32), seen)
-        mask = cv2.warpPerspective(np.full_like(grey, 255), to_image, (320, 240))
-        drawn = cv2.warpPerspective(grey, to_image, (320, 240), flags=cv2.INTER_AREA)
-        image = np.where(mask > 127, drawn, image).astype(np.uint8)
-    return image
+    hung = [(photograph("coffee"), WALL + 0.6, 0.3, 1.6, 2.6), (photograph("astronaut"), WALL, 1.7, 1.2, 1.6)]
+    return rendered(hung, CAMERA, node_from_robot, empty=90)
 
 
 def view_of(image: np.ndarray) -> View:
