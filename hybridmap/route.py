@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from heapq import heappop, heappush
 from itertools import count, pairwise
 
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.hybrid_map import HybridMap, reached
 from mapweave.hybridmap.ids import EdgeId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
@@ -212,7 +213,7 @@ class RouteTable:
         if not joined(self._map, start, goal, self._closed, self._portals):
             return f"what joins {start} and {goal} only ties poses: nothing there could be driven"
         if self._barred:
-            return f"every way from {start} to {goal} is blocked ({len(self._barred)} pairs)"
+            return f"every way from {start} to {goal} is blocked ({counted(len(self._barred), 'pair')})"
         return f"a node on every way from {start} to {goal} has no pose in the merged map"
 
 

@@ -76,7 +76,7 @@ def test_blocked_pairs_are_gone_around_in_either_order() -> None:
     assert around.nodes == (nodes[0].id, nodes[3].id, nodes[2].id)
     barred = [(nodes[1].id, nodes[2].id), (nodes[3].id, nodes[2].id)]
     nowhere = RouteTable(one, blocked=barred).find(nodes[0].id, nodes[2].id)
-    assert nowhere.nodes == () and "blocked" in nowhere.reason
+    assert nowhere.nodes == () and nowhere.reason.endswith(" is blocked (2 pairs)")
 
 
 def test_turning_costs() -> None:
@@ -127,6 +127,8 @@ def test_reasons() -> None:
     assert "nothing joins" in RouteTable(one).find(nodes[0].id, lonely.id).reason
     assert "not in the map" in RouteTable(one).find(nodes[0].id, NodeId("r9", 1, 1)).reason
     assert "no pose" in RouteTable(one, poses={nodes[0].id: Pose2()}).find(nodes[0].id, nodes[1].id).reason
+    alone = RouteTable(one, blocked=[(nodes[0].id, nodes[1].id)])
+    assert alone.find(nodes[0].id, nodes[1].id).reason.endswith(" is blocked (1 pair)")
 
 
 @settings(max_examples=100, deadline=None)
