@@ -14,7 +14,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.servo.plan import Leg, Price, ServoPlan, Surroundings, sample
+from mapweave.agent.servo.plan import LEG_PRICE, TURN_PRICE, Leg, ServoPlan, Surroundings, cost_of, sample
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
 
 _FIRST_OCTANT = ((1, 0), (3, 1), (2, 1), (3, 2))
@@ -52,7 +52,6 @@ def lattice_plan(
     surroundings: Surroundings,
     start: Pose2,
     margin: float,
-    price: Price,
     cell: float = 0.1,
     room: float = 1.2,
 ) -> ServoPlan | None:
@@ -62,7 +61,6 @@ def lattice_plan(
         surroundings: constraints.
         start: pose in goal.
         margin: slack to keep, rad.
-        price: of turns and legs.
         cell: m.
         room: m of floor around start and goal that is searched.
 
@@ -85,12 +83,12 @@ def lattice_plan(
     near = _nearest(allowed, start, low, cell)
     if near is None or not allowed[goal]:
         return None
-    costs = _costs_to_go(allowed, free, goal, cell, price)
+    costs = _costs_to_go(allowed, free, goal, cell)
     if not np.isfinite(costs[near]):
         return None
-    states = _descend(costs, free, near, goal, cell, price)
+    states = _descend(costs, free, near, goal, cell)
     points = np.array([[cell * (i + low[0]), cell * (j + low[1])] for _, i, j in states])
-    return _shorten(surroundings, start, _thin(points), margin, price)
+    return _shorten(surroundings, start, _thin(points), margin)
 
 
 def _free_half_cells(
@@ -136,7 +134,6 @@ def _costs_to_go(
     free: NDArray[np.bool_],
     goal: tuple[int, int, int],
     cell: float,
-    price: Price,
 ) -> Array:
     """(32, X, Y) m, infinite where no way leads to the goal.
 
@@ -145,7 +142,6 @@ def _costs_to_go(
         free: (2X-1, 2Y-1) points clear of obstacles, half cells apart.
         goal: state.
         cell: m.
-        price: of turns.
     """
     headings, nx, ny = allowed.shape
     b = _BORDER
@@ -155,7 +151,7 @@ def _costs_to_go(
     wall = np.where(allowed, 0.0, np.inf)
     halves = np.full((2 * nx - 1 + 2 * b, 2 * ny - 1 + 2 * b), np.inf)
     halves[b:-b, b:-b] = np.where(free, 0.0, np.inf)
-    turn = price.turn * np.diff(np.append(_HEADINGS, 2.0 * math.pi))
+    turn = TURN_PRICE * np.diff(np.append(_HEADINGS, 2.0 * math.pi))
     way = cell * np.hypot(_STEPS[:, 0], _STEPS[:, 1])
     # What a move costs from each cell: its length, or infinity through an obstacle half way.
     moves = [
@@ -192,7 +188,6 @@ def _descend(
     state: tuple[int, int, int],
     goal: tuple[int, int, int],
     cell: float,
-    price: Price,
 ) -> list[tuple[int, int, int]]:
     """The states along the cheapest moves from a state to the goal."""
     _, nx, ny = costs.shape
@@ -205,7 +200,7 @@ def _descend(
         for side in (-1, 1):
             neighbour = (h + side) % _COUNT
             turned = abs(wrap_angle(float(_HEADINGS[neighbour] - _HEADINGS[h])))
-            options.append((float(costs[neighbour, i, j]) + price.turn * turned, (neighbour, i, j)))
+            options.append((float(costs[neighbour, i, j]) + TURN_PRICE * turned, (neighbour, i, j)))
             a, b = i + side * int(_STEPS[h, 0]), j + side * int(_STEPS[h, 1])
             if 0 <= a < nx and 0 <= b < ny and free[i + a, j + b]:
                 step = cell * math.hypot(*_STEPS[h])
@@ -229,9 +224,7 @@ def _thin(points: Array) -> Array:
     return chosen
 
 
-def _shorten(
-    surroundings: Surroundings, start: Pose2, way: Array, margin: float, price: Price
-) -> ServoPlan | None:
+def _shorten(surroundings: Surroundings, start: Pose2, way: Array, margin: float) -> ServoPlan | None:
     """The cheapest sequence of exact legs over a way's points."""
     points = np.concatenate([[[start.x, start.y]], way])
     first, last = np.triu_indices(len(points), 1)
@@ -251,8 +244,8 @@ def _shorten(
     )
     fine = (length > 1e-6) & surroundings.allowed(poses, margin).all(axis=1)
     first, last, heading, length, direction = (a[fine] for a in (first, last, heading, length, direction))
-    best, before = _cheapest(surroundings, points, start, first, last, heading, length, margin, price)
-    turned_home = best + price.turn * np.abs(np.mod(heading + math.pi, 2.0 * math.pi) - math.pi)
+    best, before = _cheapest(surroundings, points, start, first, last, heading, length, margin)
+    turned_home = best + TURN_PRICE * np.abs(np.mod(heading + math.pi, 2.0 * math.pi) - math.pi)
     ends = np.flatnonzero((last == len(points) - 1) & np.isfinite(turned_home))
     for end in ends[np.argsort(turned_home[ends], kind="stable")][:3].tolist():
         chain = [end]
@@ -265,7 +258,7 @@ def _shorten(
             x, y = points[last[k]].tolist()
             legs.append(Leg(branch, float(direction[k]), x, y, float(length[k])))
         if surroundings.allowed(sample(start, legs), 0.7 * margin).all():
-            return ServoPlan(start, tuple(legs), price.of(start, legs), margin)
+            return ServoPlan(start, tuple(legs), cost_of(start, legs), margin)
     return None
 
 
@@ -278,7 +271,6 @@ def _cheapest(
     heading: Array,
     length: Array,
     margin: float,
-    price: Price,
 ) -> tuple[Array, NDArray[np.intp]]:
     """Cheapest cost (m) of a chain of legs that ends with each leg, and the leg before it (-1: the first)."""
     grid = np.linspace(0.0, 2.0 * math.pi, _BINS, endpoint=False)
@@ -297,9 +289,9 @@ def _cheapest(
         low = np.mod(np.minimum(origins, origins + turn), 2.0 * math.pi) / (2.0 * math.pi) * _BINS + _BINS
         high = low + np.abs(turn) / (2.0 * math.pi) * _BINS
         free = sums[vertex][np.floor(high).astype(int)] == sums[vertex][np.floor(low).astype(int)]
-        cost = np.where(free, reached + price.turn * np.abs(turn), np.inf)
+        cost = np.where(free, reached + TURN_PRICE * np.abs(turn), np.inf)
         choice = cost.argmin(axis=1)
-        best[leaving] = cost[np.arange(len(leaving)), choice] + length[leaving] + price.leg
+        best[leaving] = cost[np.arange(len(leaving)), choice] + length[leaving] + LEG_PRICE
         if vertex > 0:
             before[leaving] = arriving[choice]
     return best, before

@@ -10,9 +10,5 @@ LEAST_MARGIN = 0.008
 """Room below which no way is taken, rad."""
 TURN_GAIN = 2.5
 """Gain of turns on the spot and of the heading on legs, 1/s."""
-
-
-def margins() -> tuple[float, ...]:
-    """Margins to plan with, rad, the widest first."""
-    wide, least = FIELD_MARGIN, LEAST_MARGIN
-    return (wide, 0.6 * wide, max(0.3 * wide, least), least)
+MARGINS = (FIELD_MARGIN, 0.6 * FIELD_MARGIN, 0.3 * FIELD_MARGIN, LEAST_MARGIN)
+"""Margins to plan with, rad, the widest first."""

@@ -25,6 +25,13 @@ TURN_STEP = 0.05
 LEG_STEP = 0.04
 """m between two samples of a leg."""
 
+TURN_PRICE = 0.12
+"""What a plan costs in addition to its length, m a radian: with less to turn it is driven sooner and kept to
+better,"""
+
+LEG_PRICE = 0.05
+"""and so it is with a leg less, m a leg."""
+
 
 @dataclass(frozen=True, slots=True)
 class Leg:
@@ -88,28 +95,12 @@ def _between(a: Array, b: Array) -> Array:
     return a + np.linspace(0.0, 1.0, count)[:, None] * (b - a)
 
 
-@dataclass(frozen=True, slots=True)
-class Price:
-    """What a plan costs in addition to its length.
-
-    Attributes:
-        turn: m a radian.
-        leg: m a leg.
-    """
-
-    turn: float = 0.12
-    leg: float = 0.05
-
-    def of(self, start: Pose2, legs: Sequence[Leg]) -> float:
-        """Cost of legs from a start, m."""
-        headings = [start.heading, *(leg.heading for leg in legs)]
-        headings.append(2.0 * math.pi * round(headings[-1] / (2.0 * math.pi)))
-        turned = sum(abs(b - a) for a, b in pairwise(headings))
-        return sum(leg.length for leg in legs) + self.turn * turned + self.leg * len(legs)
-
-
-PRICE = Price()
-"""A plan with a turn or a leg less is driven sooner and kept to better."""
+def cost_of(start: Pose2, legs: Sequence[Leg]) -> float:
+    """Cost of legs from a start, m."""
+    headings = [start.heading, *(leg.heading for leg in legs)]
+    headings.append(2.0 * math.pi * round(headings[-1] / (2.0 * math.pi)))
+    turned = sum(abs(b - a) for a, b in pairwise(headings))
+    return sum(leg.length for leg in legs) + TURN_PRICE * turned + LEG_PRICE * len(legs)
 
 
 class Surroundings:

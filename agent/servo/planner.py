@@ -7,8 +7,8 @@ import math
 import numpy as np
 
 from mapweave.agent.servo.lattice_planner import lattice_plan
-from mapweave.agent.servo.margins import margins
-from mapweave.agent.servo.plan import PRICE, ServoPlan, Surroundings
+from mapweave.agent.servo.margins import MARGINS
+from mapweave.agent.servo.plan import ServoPlan, Surroundings
 from mapweave.agent.servo.two_leg_planner import two_leg_plan
 from mapweave.hybridmap.pose import Pose2
 
@@ -29,9 +29,9 @@ def quick_plan(around: Surroundings, start: Pose2) -> ServoPlan | None:
     Returns:
         The plan, or None if two legs will not do.
     """
-    for margin in margins():
+    for margin in MARGINS:
         turned = turned_inside(around, start, margin)
-        plan = two_leg_plan(around, turned, margin, PRICE) if turned is not None else None
+        plan = two_leg_plan(around, turned, margin) if turned is not None else None
         if plan is not None:
             return plan
     return None
@@ -53,12 +53,12 @@ def thorough_plan(around: Surroundings, start: Pose2) -> ServoPlan | None:
         The plan, or None if none was found.
     """
     quick = quick_plan(around, start)
-    wide, *_, least = margins()
-    for margin, cell, room in ((0.6 * wide, 0.1, 1.2), (least, 0.1, 1.2), (least, 0.06, 1.5)):
+    _, middle, _, least = MARGINS
+    for margin, cell, room in ((middle, 0.1, 1.2), (least, 0.1, 1.2), (least, 0.06, 1.5)):
         if quick is not None and margin < quick.margin:
             break
         turned = turned_inside(around, start, margin)
-        plan = lattice_plan(around, turned, margin, PRICE, cell, room) if turned is not None else None
+        plan = lattice_plan(around, turned, margin, cell, room) if turned is not None else None
         if plan is not None:
             return plan if quick is None or plan.cost < quick.cost else quick
     return quick

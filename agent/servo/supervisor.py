@@ -13,7 +13,7 @@ from mapweave.agent.servo.laws import control, saturate
 from mapweave.agent.servo.leg_controller import LegController, SpeedLimits, clip
 from mapweave.agent.servo.margins import FIELD_MARGIN, LEAST_MARGIN, MIN_VISIBLE, TURN_GAIN
 from mapweave.agent.servo.obstacles import ObstacleMemory
-from mapweave.agent.servo.plan import PRICE, ServoPlan, Surroundings, arc, sample
+from mapweave.agent.servo.plan import LEG_PRICE, TURN_PRICE, ServoPlan, Surroundings, arc, cost_of, sample
 from mapweave.agent.servo.planner import needs_thought, quick_plan, thorough_plan
 from mapweave.agent.servo.polar import Polar, continued, polar_of
 from mapweave.agent.servo.recovery import Recovery
@@ -195,7 +195,7 @@ class Servo:
             if not around.admits(sample(pose_near_start, rest), min(hard, self._plan.margin)):
                 self._drop_plan()
                 return
-            cost = PRICE.of(pose_near_start, rest)
+            cost = cost_of(pose_near_start, rest)
             law = self._best_law(polar_of(pose), around, cost)
             if law is not None:
                 self._drop_plan()
@@ -235,7 +235,7 @@ class Servo:
         if polar.rho < LAW_REACH:
             return None
         rollouts = roll_out(polar, LAMBDA, DEAD_ZONE)
-        costs = rollouts.lengths + PRICE.turn * rollouts.turns + PRICE.leg
+        costs = rollouts.lengths + TURN_PRICE * rollouts.turns + LEG_PRICE
         # Each law that had to be given up raises the bar for the next: no endless switching.
         margin = FIELD_MARGIN * (1.0 + 0.5 * self._broken_laws)
         limit = cost * (1.0 + LAW_BONUS) + LAW_BONUS_M

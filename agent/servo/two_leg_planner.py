@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from mapweave.agent.servo.plan import Leg, Price, ServoPlan, Surroundings, sample
+from mapweave.agent.servo.plan import LEG_PRICE, TURN_PRICE, Leg, ServoPlan, Surroundings, sample
 from mapweave.hybridmap.pose import Array, Pose2
 
 _SPACING = 0.06
@@ -37,7 +37,7 @@ def headings_around(surroundings: Surroundings, pose: Pose2, margin: float) -> A
     return poses[low : high + 1, 2]
 
 
-def two_leg_plan(surroundings: Surroundings, start: Pose2, margin: float, price: Price) -> ServoPlan | None:
+def two_leg_plan(surroundings: Surroundings, start: Pose2, margin: float) -> ServoPlan | None:
     """The cheapest admissible plan of at most two legs.
 
     For headings h1 and h2 the lengths follow from d1 e(h1) + d2 e(h2) = -start; a negative one is driven
@@ -47,7 +47,6 @@ def two_leg_plan(surroundings: Surroundings, start: Pose2, margin: float, price:
         surroundings: constraints.
         start: pose in goal.
         margin: slack to keep, rad.
-        price: of turns and legs.
 
     Returns:
         The plan, or None if no pair of headings will do.
@@ -62,8 +61,8 @@ def two_leg_plan(surroundings: Surroundings, start: Pose2, margin: float, price:
     h1, h2 = (h.ravel() for h in np.meshgrid(first, second, indexing="ij"))
     d1, d2 = _lengths(start, h1, h2)
     cost = np.abs(d1) + np.abs(d2)
-    cost += price.turn * (np.abs(h1 - start.heading) + np.abs(h2 - h1) + np.abs(h2))
-    cost += price.leg * ((np.abs(d1) > 1e-6).astype(float) + (np.abs(d2) > 1e-6))
+    cost += TURN_PRICE * (np.abs(h1 - start.heading) + np.abs(h2 - h1) + np.abs(h2))
+    cost += LEG_PRICE * ((np.abs(d1) > 1e-6).astype(float) + (np.abs(d2) > 1e-6))
     usable = np.isfinite(cost) & (np.maximum(np.abs(d1), np.abs(d2)) <= _LONGEST)
     order = np.flatnonzero(usable)[np.argsort(cost[usable], kind="stable")]
     done, size = 0, 24

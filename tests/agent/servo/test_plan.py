@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from mapweave.agent.observation import RobotDescription
 from mapweave.agent.servo.field_of_view import FieldOfView
 from mapweave.agent.servo.lattice_planner import FARTHEST, lattice_plan
-from mapweave.agent.servo.plan import Price, ServoPlan, Surroundings
+from mapweave.agent.servo.plan import ServoPlan, Surroundings
 from mapweave.agent.servo.planner import thorough_plan
 from mapweave.agent.servo.two_leg_planner import two_leg_plan
 from mapweave.hybridmap.camera import Camera
@@ -56,7 +56,7 @@ def test_plans_lead_to_the_goal_in_view(
         points = draw_points(rng)
         start = draw_start(rng, points)
         around = Surroundings(FieldOfView(points, robot.camera), np.zeros((0, 2)), 0.2)
-        plan = planner(around, start, 0.02, Price())
+        plan = planner(around, start, 0.02)
         if plan is not None:
             count += 1
             assert plan.start == start
@@ -74,8 +74,8 @@ def test_a_wall_in_the_way_is_driven_around(
     points = np.array([[x, y, 0.3] for x in (3.0, 4.0) for y in np.linspace(-2.0, 2.0, 9)])
     wall = np.column_stack([np.full(25, -0.9), np.linspace(-half, half, 25)])
     around = Surroundings(FieldOfView(points, robot.camera), wall, 0.2)
-    assert two_leg_plan(Surroundings(around.field, np.zeros((0, 2)), 0.2), start, 0.02, Price()) is not None
-    plan = lattice_plan(around, start, 0.02, Price())
+    assert two_leg_plan(Surroundings(around.field, np.zeros((0, 2)), 0.2), start, 0.02) is not None
+    plan = lattice_plan(around, start, 0.02)
     assert plan is not None
     assert plan.length > math.hypot(start.x + 0.9, half) + math.hypot(0.9, half)
     check(plan, start, points, robot.camera, seen, wall)
@@ -101,7 +101,7 @@ def test_there_is_no_plan_to_a_goal_that_sees_nothing(robot: RobotDescription) -
 def test_one_straight_leg_is_enough_ahead_of_the_goal(robot: RobotDescription) -> None:
     points = np.array([[3.0, y, 0.3] for y in np.linspace(-1.0, 1.0, 9)])
     around = Surroundings(FieldOfView(points, robot.camera), np.zeros((0, 2)), 0.2)
-    plan = two_leg_plan(around, Pose2(0.5, 0.0, 0.0), 0.05, Price())
+    plan = two_leg_plan(around, Pose2(0.5, 0.0, 0.0), 0.05)
     assert plan is not None
     assert [leg.direction for leg in plan.legs] == [-1.0]
     assert plan.length == pytest.approx(0.5)
@@ -115,9 +115,9 @@ def test_the_lattice_is_bounded(robot: RobotDescription) -> None:
     walls = np.column_stack([rng.uniform(-5.0, 3.0, 400), rng.uniform(1.0, 5.0, 400)])
     around = Surroundings(FieldOfView(points, robot.camera), walls, 0.2)
     for far in (Pose2(-1e6, 0.0, 0.0), Pose2(0.0, -FARTHEST - 0.1, 0.0)):
-        assert lattice_plan(around, far, 0.02, Price()) is None
+        assert lattice_plan(around, far, 0.02) is None
     tracemalloc.start()
-    lattice_plan(around, Pose2(-FARTHEST + 0.1, 0.0, 0.0), 0.02, Price(), 0.06, 1.5)
+    lattice_plan(around, Pose2(-FARTHEST + 0.1, 0.0, 0.0), 0.02, 0.06, 1.5)
     peak = tracemalloc.get_traced_memory()[1]
     tracemalloc.stop()
     assert peak < 200e6
