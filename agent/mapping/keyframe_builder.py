@@ -87,6 +87,8 @@ class KeyframeBuilder:
         self._selection = selection
         self._last: AnchoredKeyframe | None = None
         self._next_number = next_number
+        known = (node.stamp_ns for node in self.map.nodes.values() if node.clock == description.clock)
+        self._begun_ns = max(known, default=0)
         self._new: list[ChangeBody] = []
         # What was begun by another process may have been measured with other wheels.
         self._one_scale = not contents
@@ -329,6 +331,9 @@ class KeyframeBuilder:
         map_from_anchor: PoseGaussian,
         segment: TrajectorySegment | None = None,
     ) -> Node:
+        if view.stamp_ns < self._begun_ns:
+            # It was put back since another process began the map: a machine may start with an old time.
+            self.forget_clock()
         pose, d = map_from_anchor @ view.anchor_from_view, self._description
         node = Node(
             self.new_id(), view.stamp_ns, pose, d.camera, landmarks, d.clock, d.radius,

@@ -16,6 +16,7 @@ from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
+from mapweave.merge.mutual_exclusion.trajectories import runs_backwards
 from mapweave.registration.selection import choose
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
@@ -260,6 +261,28 @@ def test_a_map_that_another_process_began_keeps_its_lengths(walls, description):
     assert moved.scale == 1.0
     for change in contents:
         assert mapper.map.nodes[change.node.id] is change.node
+
+
+@pytest.mark.parametrize(("hours", "clock"), [(1, ""), (0, "utc")])
+def test_a_clock_that_was_put_back_between_two_runs_has_no_name(walls, description, hours, clock):
+    """The server called such a map implausible, for good: its clock ran backwards.
+
+    A machine without a clock of its own begins each time with an old time.
+    """
+    there, clocked = list(np.arange(0.0, 0.51, 0.025)), replace(description, clock="utc")
+    first = Mapper(MapId("r0", 1), clocked)
+    first.finish(drive(first, walls, there, start=1 + 36_000 * hours))
+    first.finish_pending()
+    contents = first.take_changes()
+    assert contents[0].node.clock == "utc"
+    mapper = Mapper(MapId("r0", 1), clocked, contents=contents, next_number=9)
+    mapper.finish(drive(mapper, walls, there, start=50))
+    mapper.finish_pending()
+    clocks = [change.node.clock for change in mapper.take_changes() if isinstance(change, NodePut)]
+    assert clocks == [clock]
+    nodes = [change.node for change in contents if isinstance(change, NodePut)]
+    nodes += [node for node in mapper.map.nodes.values() if node.clock]
+    assert not runs_backwards({node.id: node for node in nodes}.values())
 
 
 def test_a_view_without_features_gives_no_node(walls, description):
