@@ -23,7 +23,7 @@ from mapweave.wire import exit_closing
 from mapweave.wire.bus import Closing, Reply, Request, Sample, never
 from mapweave.wire.bus_settings import QUEUE_LIMIT, RETRY_FIRST, RETRY_LONGEST, BusSettings
 from mapweave.wire.credentials import Credentials
-from mapweave.wire.dispatch import Dispatcher
+from mapweave.wire.dispatch import Dispatcher, failures
 from mapweave.wire.keyexpr import check_key, check_pattern
 from mapweave.wire.keys import questions_to_robot
 from mapweave.wire.open_files import allow_many_files
@@ -146,7 +146,9 @@ class ZenohBus:
                         if enough(reply):
                             break
                         if len(replies) >= MOST_REPLIES or size >= MOST_REPLY_BYTES:
-                            log.warning("%s: too many replies (%d, %d bytes)", key, len(replies), size)
+                            if (also := failures.count(key)) is not None:
+                                words = "%s: too many replies (%d, %d bytes)%s"
+                                log.warning(words, key, len(replies), size, also)
                             break
             except zenoh.ZError as error:
                 log.debug("asking %s failed: %s", key, error)

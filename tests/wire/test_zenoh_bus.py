@@ -179,7 +179,11 @@ def router_fleet() -> Iterator[ZenohFleet]:
 
 @pytest.mark.parametrize(("limit", "most"), [("MOST_REPLIES", 20), ("MOST_REPLY_BYTES", 20_000)])
 def test_replies_without_end_fill_no_memory(
-    limit: str, most: int, router_fleet: ZenohFleet, monkeypatch: pytest.MonkeyPatch
+    limit: str,
+    most: int,
+    router_fleet: ZenohFleet,
+    monkeypatch: pytest.MonkeyPatch,
+    caplog: pytest.LogCaptureFixture,
 ) -> None:
     """A client that answers a question again and again filled 1 GB of who had asked."""
 
@@ -190,10 +194,13 @@ def test_replies_without_end_fill_no_memory(
 
     monkeypatch.setattr(zenoh_bus, limit, most)
     server, client = router_fleet.join(), router_fleet.join()
-    server.serve("a", answer)
+    log = f"mapweave/1/demo/agent/{limit.lower()}/log/1"
+    server.serve(log, answer)
     server.serve("b", lambda request: request.reply(b"b"))
     eventually(lambda: client.ask("b", b"", 5.0))
-    assert len(client.ask("a", b"", 5.0)) == 20
+    for _ in range(2):
+        assert len(client.ask(log, b"", 5.0)) == 20
+    assert len([one for one in caplog.records if "too many replies" in one.getMessage()]) == 1
     # What still comes of it is no answer to the next question.
     assert [reply.payload for reply in client.ask("b", b"", 5.0)] == [b"b"]
 
