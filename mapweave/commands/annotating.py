@@ -15,7 +15,7 @@ from mapweave.commands.map_input import SOURCES, map_source, merge_progress, ope
 from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_network, add_reason, settings_of
 from mapweave.commands.usage import UsageError
-from mapweave.hybridmap.errors import InvalidValue
+from mapweave.hybridmap.errors import InvalidValue, Refused
 
 if TYPE_CHECKING:
     from mapweave.fleet import Fleet
@@ -141,14 +141,20 @@ def record_of(arguments: argparse.Namespace) -> Iterator[Fleet | OfflineRecord]:
     """
     from mapweave.login import login
 
-    if arguments.map is None:
-        if getattr(arguments, "out", None) is not None:
-            raise UsageError("--out goes with --map: a server keeps its own record")
-        with fleet_of(arguments) as fleet:
-            yield fleet
-    else:
-        from mapweave.offline_record import OfflineRecord
+    try:
+        if arguments.map is None:
+            if getattr(arguments, "out", None) is not None:
+                raise UsageError("--out goes with --map: a server keeps its own record")
+            with fleet_of(arguments) as fleet:
+                yield fleet
+        else:
+            from mapweave.offline_record import OfflineRecord
 
-        by, out = getattr(arguments, "by", "") or login(), getattr(arguments, "out", None)
-        settings = settings_of(arguments).merge
-        yield OfflineRecord(opened(arguments.map), out, by, settings, merge_progress)
+            by, out = getattr(arguments, "by", "") or login(), getattr(arguments, "out", None)
+            settings = settings_of(arguments).merge
+            yield OfflineRecord(opened(arguments.map), out, by, settings, merge_progress)
+    except Refused as error:
+        # The refusal is the same on the page, where an option of the shell means nothing.
+        if not str(error).endswith("needs a reason"):
+            raise
+        raise Refused(f"{error}: --because TEXT") from None

@@ -259,6 +259,8 @@ def test_linking_in_a_file_and_taking_it_back(
     assert main(wrong) == NO
     error = capfd.readouterr().err
     assert "do not show one place: " in error and "--pose X,Y,DEGREES --because TEXT" in error
+    assert main([*wrong, "--pose=-1,0.5,90"]) == NO
+    assert capfd.readouterr().err.endswith(", needs a reason: --because TEXT\n")
     by_hand = [*wrong, "--pose=-1,0.5,90", "--because", "the same door", "--by", "anna"]
     only_checked = "only checked, nothing is changed: r0.1.1 and r2.1.3: linked by hand by anna"
     assert said(*by_hand, "--check").startswith(only_checked)
