@@ -62,20 +62,18 @@ def merge_maps(
     maps: Mapping[MapId, HybridMap],
     links: Iterable[Link],
     refused: Iterable[RefusedLink] = (),
-    settings: MergeSettings | None = None,
 ) -> MergedMap:
-    """Merge.
+    """Merge with the settings that are the default.
 
     Args:
         maps: by id; they are not changed.
         links: verified, at most one a pair of nodes; those at nodes that are not there are left out.
         refused: pairs that were refused before, to be kept with their reasons.
-        settings: how.
 
     Returns:
         The merged map. It does not depend on the order of maps, links or nodes.
     """
-    return decide(maps, links, refused, settings or MergeSettings(), MergeCache())[0]
+    return decide(maps, links, refused, MergeSettings(), MergeCache())[0]
 
 
 def decide(

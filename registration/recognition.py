@@ -228,9 +228,7 @@ def _examine(
     return Recognition(pose, inliers, len(pairs), len(usable), evidence, fix.pitch, fix.spread)
 
 
-def by_scales(
-    a: Node, b: Node, pairs: NDArray[np.int64], a_from_b: Pose2, settings: RecognitionSettings | None = None
-) -> Array | None:
+def by_scales(a: Node, b: Node, pairs: NDArray[np.int64], a_from_b: Pose2) -> Array | None:
     """How the pose of two nodes that was found changes with the scales of the lengths of either.
 
     Where both have depths and one's are longer, the pose is a compromise: a little back along the view.
@@ -240,13 +238,12 @@ def by_scales(
         b: the other.
         pairs: (K, 2) landmarks of a and b that agree.
         a_from_b: the pose that was found.
-        settings: by which it was found; None for the defaults.
 
     Returns:
         (3, 2) right perturbation of `a_from_b`, m, m, rad, by the natural logarithm of the scale of a, and
         of b. None without pairs that determine a pose, or where the nodes have not kept their landmarks.
     """
-    s = settings or RecognitionSettings()
+    s = RecognitionSettings()
     if len(pairs) < s.least_inliers or (pairs.max(axis=0) >= (len(a.landmarks), len(b.landmarks))).any():
         return None
     forward = a.landmarks.has_depth[pairs[:, 0]]

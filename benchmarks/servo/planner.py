@@ -16,18 +16,15 @@ from scipy.sparse.csgraph import dijkstra
 from benchmarks.servo.world import LEAST_VISIBLE, Task, in_view
 from mapweave.hybridmap.pose import Array
 
+_CELL = 0.05
+"""Of the lattice, m."""
 _REACH = 6
 _TURN_PRICE = 1e-4
 
 
-def shortest_length(task: Task, cell: float = 0.05) -> float | None:
-    """Length (m) of the shortest path, or None if there is none.
-
-    Args:
-        task: start and landmarks.
-        cell: of the lattice, m.
-    """
-    path = _lattice_path(task, cell)
+def shortest_length(task: Task) -> float | None:
+    """Length (m) of the shortest path, or None if there is none."""
+    path = _lattice_path(task)
     if path is None:
         return None
     steps = np.diff(path[:, :2], axis=0)
@@ -48,16 +45,16 @@ def _directions() -> tuple[NDArray[np.intp], Array]:
     return steps[order], headings[order]
 
 
-def _lattice_path(task: Task, cell: float) -> Array | None:
+def _lattice_path(task: Task) -> Array | None:
     """(M, 3) x m, y m, heading rad: lattice poses from start to goal, start and goal themselves exact."""
     steps, headings = _directions()
     start = task.start
     behind, ahead = np.array([1.5, 0.8]), np.array([1.0, 0.8])
-    low = np.floor((np.minimum([start.x, start.y], 0.0) - behind) / cell).astype(int)
-    high = np.ceil((np.maximum([start.x, start.y], 0.0) + ahead) / cell).astype(int)
+    low = np.floor((np.minimum([start.x, start.y], 0.0) - behind) / _CELL).astype(int)
+    high = np.ceil((np.maximum([start.x, start.y], 0.0) + ahead) / _CELL).astype(int)
     nx, ny = (high - low + 1).tolist()
     i, j = np.meshgrid(np.arange(nx), np.arange(ny), indexing="ij")
-    x, y = (i + low[0]) * cell, (j + low[1]) * cell
+    x, y = (i + low[0]) * _CELL, (j + low[1]) * _CELL
     allowed = np.stack([_fine(np.stack([x, y, np.full(x.shape, h)], axis=-1), task) for h in headings])
     index = np.arange(allowed.size).reshape(allowed.shape)
     rows, columns, costs = [], [], []
@@ -67,7 +64,7 @@ def _lattice_path(task: Task, cell: float) -> Array | None:
         both = allowed[here] & allowed[there]
         rows.append(index[here][both])
         columns.append(index[there][both])
-        costs.append(np.full(both.sum(), cell * math.hypot(dx, dy)))
+        costs.append(np.full(both.sum(), _CELL * math.hypot(dx, dy)))
         following = (k + 1) % len(steps)
         both = allowed[k] & allowed[following]
         rows.append(index[k][both])
@@ -80,7 +77,7 @@ def _lattice_path(task: Task, cell: float) -> Array | None:
     distance, before = dijkstra(graph, directed=False, indices=goal, return_predecessors=True)
     away = np.hypot(x - start.x, y - start.y)
     turned = np.abs(np.angle(np.exp(1j * (headings - start.heading))))
-    near = (away[None] <= 1.1 * cell) & (turned[:, None, None] <= 0.2) & allowed
+    near = (away[None] <= 1.1 * _CELL) & (turned[:, None, None] <= 0.2) & allowed
     total = np.where(near.ravel(), distance + np.broadcast_to(away, allowed.shape).ravel(), np.inf)
     state = int(total.argmin())
     if not np.isfinite(total[state]):

@@ -101,16 +101,14 @@ class Unicycle:
 class PoseFilter:
     """Estimates the robot's pose in goal from noisy wheels and noisy pixels of the known landmarks."""
 
-    def __init__(self, task: Task, rng: np.random.Generator, believed: Array | None = None) -> None:
+    def __init__(self, task: Task, rng: np.random.Generator) -> None:
         """Begin with a rough guess, as after a relocalization; the first images mend it.
 
         Args:
             task: what is true.
             rng: of the noise.
-            believed: (N, 3) m, landmarks as the map has them; exactly those of the task without.
         """
         self._points, self._rng = task.points, rng
-        self._believed = task.points if believed is None else believed
         self._state = task.start.vector + rng.normal(0.0, [0.05, 0.05, 0.05])
         self._covariance = np.diag([0.05, 0.05, 0.05]) ** 2
         for _ in range(3):
@@ -143,7 +141,7 @@ class PoseFilter:
         prior, information = self._state, np.linalg.inv(self._covariance)
         state = prior
         for _ in range(3):
-            q = Pose2.from_vector(state).inverse().apply(self._believed[seen])
+            q = Pose2.from_vector(state).inverse().apply(self._points[seen])
             c, s = math.cos(state[2]), math.sin(state[2])
             # d q_x and d q_y by (x, y, heading), each (n, 3); q = R^T (p - t).
             one = np.ones(len(q))

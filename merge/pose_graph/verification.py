@@ -39,10 +39,9 @@ def verify(a: Node, b: Node, settings: RecognitionSettings | None = None) -> Lin
     Returns:
         A link, or why there is none.
     """
-    s = settings or RecognitionSettings()
     if b.id < a.id:
         a, b = b, a
-    verdict = examine(a, b, s)
+    verdict = examine(a, b, settings)
     if isinstance(verdict, Recognition):
         sigma_xy, sigma_heading = verdict.evidence["sigma_xy"], verdict.evidence["sigma_heading"]
         if sigma_xy > MOST_SIGMA_XY or sigma_heading > MOST_SIGMA_HEADING:
@@ -63,6 +62,5 @@ def examine(
         b: the other one.
         settings: when they are linked.
     """
-    s = settings or RecognitionSettings()
     rng = np.random.default_rng(zlib.crc32(f"{a.id} {b.id}".encode()))
-    return examine_nodes(a, b, s, rng)
+    return examine_nodes(a, b, settings, rng)
