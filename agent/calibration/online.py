@@ -71,7 +71,8 @@ WORTH = np.full(COUNT, 2.0)
 """A change is put to use if it is larger than so many useful sigmas, and sure enough to be named."""
 WORTH[P.WHEEL_SCALE] = 1.0
 """Wheels that go less far than they report are corrected as soon as they are named: by the floor, the height
-counts. Those that go further, as soon as it is sure that it is they, and not the height."""
+counts. Those that go further, as soon as it is sure that it is they, and not the height. Once corrected on
+this drive, they follow the estimate whenever it is a sigma away."""
 
 NAMED_ONLY = [p for p in Parameter if p not in (P.FORWARD, P.HEADING, P.PITCH, P.DELAY)]
 """Named, but not used by themselves. The wheels' scales and drift are what all else is measured by; a camera
@@ -337,6 +338,9 @@ class OnlineCalibration:
         named_only = [p for p in NAMED_ONLY if not (p is P.WHEEL_SCALE and by_floor)]
         change[named_only] = False
         change &= self._lasting(change, self._changed_since)
+        if by_floor and self._used[w] and not self._earlier[w]:
+            # What was declared is contradicted already, and few pairs are far off: more know better.
+            change[w] = estimate.shown[w] and settled[w] and off[w] > sigmas[w]
         if not change.any():
             return
         # What is shown but differs less goes along: the estimates belong together. The wheels' scale brings
