@@ -335,7 +335,7 @@ class Ingest:
 
     def _take_pulled(self, pulled: Pulled) -> AgentLog | None:
         agent_log, first = pulled.log, pulled.asked.first
-        piece, damaged = pulled.piece()
+        piece, damaged = pulled.piece(self._damages)
         self._counters.add(pulled=len(piece.rows), damaged=damaged)
         self._intakes.of(agent_log.map.agent).spend(len(piece.rows), sum(len(row) for _, row in piece.rows))
         self._pulls.ends(agent_log.map.agent, answered=piece.covered >= first)

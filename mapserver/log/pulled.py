@@ -9,6 +9,7 @@ from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.agent_log import AgentLog
 from mapweave.wire.bus import Reply
+from mapweave.wire.dispatch import Failures
 from mapweave.wire.log_messages import LogAnswer, LogRequest
 
 log = logging.getLogger(__name__)
@@ -54,21 +55,27 @@ class Pulled:
     asked: LogRequest
     replies: list[Reply]
 
-    def piece(self) -> tuple[PulledChanges, int]:
-        """The changes that came, and how many replies did not decode."""
+    def piece(self, failures: Failures) -> tuple[PulledChanges, int]:
+        """The changes that came, and how many replies did not decode.
+
+        Args:
+            failures: says which of the replies that are none are logged.
+        """
         asked, agent_log, damaged = self.asked, self.log, 0
         for reply in self.replies:
             if reply.error:
-                log.info(
-                    "%s does not give %s from %d: %s",
-                    agent_log.map.agent, agent_log.map, asked.first, reply.error,
-                )  # fmt: skip
+                if (also := failures.count_of(agent_log.map.agent)) is not None:
+                    log.info(
+                        "%s does not give %s from %d: %s%s",
+                        agent_log.map.agent, agent_log.map, asked.first, reply.error, also,
+                    )  # fmt: skip
                 continue
             try:
                 answer = LogAnswer.decode(reply.payload)
             except InvalidMessage as error:
                 damaged += 1
-                log.warning("%s from %d: %s", agent_log.map, asked.first, error)
+                if (also := failures.count_of(agent_log.map.agent)) is not None:
+                    log.warning("%s from %d: %s%s", agent_log.map, asked.first, error, also)
                 if asked.first == asked.last:
                     # It was asked for alone and does not fit into a message.
                     return PulledChanges(agent_log, ((asked.first, b""),), asked.first), damaged

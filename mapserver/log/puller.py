@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import logging
 import time
 from collections.abc import Callable
@@ -20,6 +21,9 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import LogRequest, StoredChange
 
 log = logging.getLogger(__name__)
+
+MOST_REPLIES = 4
+"""To one question. A robot gives one, and what is left of it where it was started twice another."""
 
 
 class Puller:
@@ -82,9 +86,16 @@ class Puller:
         try:
             stored = self._newest_change(agent_log.map, asked.first - 1)
             asked = msgspec.structs.replace(asked, stored=stored)
-            replies = self._bus.ask(self._keys.log(agent_log.map), asked.encode(), self._timeout)
+            key = self._keys.log(agent_log.map)
+            replies = self._bus.ask(key, asked.encode(), self._timeout, _after(MOST_REPLIES))
         except InvalidFile as error:  # what comes cannot be kept now either, and that is logged
             log.debug("%s", error)
         except Exception:  # without an end the robot would count as asked, and not be asked again
             log.exception("asking for %s failed", agent_log.map)
         self._answered(Pulled(agent_log, asked, replies))
+
+
+def _after(most: int) -> Callable[[Reply], bool]:
+    """Whether so many replies have come."""
+    count = itertools.count(1)
+    return lambda reply: next(count) >= most

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -13,9 +14,10 @@ import pytest
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import InvalidFile, MapweaveError
 from mapweave.hybridmap.ids import MapId
+from mapweave.mapserver.log.puller import MOST_REPLIES
 from mapweave.mapserver.log.store import LogChanges
 from mapweave.mapserver.quotas import BURST, Quotas, QuotaSettings
-from mapweave.wire.bus import Reply, Request
+from mapweave.wire.bus import Reply, Request, never
 from mapweave.wire.codec import MAX_CHANGE_BYTES
 from mapweave.wire.log_messages import LogAnswer, LogRequest, Mark, Refusal
 from mapweave.wire.memory import MemoryBus, MemoryHub
@@ -100,6 +102,31 @@ def test_answers_that_are_none_are_asked_again(server: Server, agent: HandAgent)
     eventually(lambda: agent.beacon(2) or server.sequences == [1, 2])
     assert len(tries) >= 5
     assert server.store.refused() == 0
+
+
+@pytest.mark.parametrize("answer", [b"garbage", "no"])
+def test_answers_that_are_none_fill_neither_memory_nor_log(
+    server: Server, agent: HandAgent, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
+    answer: bytes | str,
+) -> None:  # fmt: skip
+    """A robot over TLS wrote ten lines a second, by as many answers to each question as it liked."""
+    real, taken = MemoryBus.ask, list[int]()
+
+    def many(
+        bus: MemoryBus, key: str, payload: bytes, timeout: float, enough: Callable[[Reply], bool] = never
+    ) -> list[Reply]:
+        replies = real(bus, key, payload, timeout)
+        if key != KEYS.log(MAP):
+            return replies
+        taken.append(next((k for k in range(1, 100) if enough(replies[0])), 100))
+        return replies * taken[-1]
+
+    monkeypatch.setattr(MemoryBus, "ask", many)
+    with caplog.at_level(logging.INFO):
+        agent.serve(5, lambda asked: answer)
+        eventually(lambda: agent.beacon(5) or len(taken) >= 5)
+    assert set(taken) == {MOST_REPLIES}
+    assert len([one for one in caplog.records if "r0.3 from" in one.getMessage()]) <= 1
 
 
 def test_an_agent_that_cannot_be_asked_is_asked_less_and_less(server: Server, agent: HandAgent) -> None:
