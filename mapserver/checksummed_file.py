@@ -56,7 +56,7 @@ class FileKind(Generic[Value]):
         """
         write_whole(path, self.packed(value, made_by))
 
-    def packed(self, value: Value, made_by: str) -> memoryview:
+    def packed(self, value: Value, made_by: str) -> bytes:
         """The bytes of the file; see `save`."""
         return sealed(self.magic, (json_part({**self.header, "made_by": made_by}), *self.parts(value)))
 
@@ -73,7 +73,7 @@ class FileKind(Generic[Value]):
         return read_sealed(source, self.magic, {**self.header, "made_by": made_by}, self.read, self.lack)
 
 
-def sealed(magic: bytes, parts: Iterable[NDArray[Any]]) -> memoryview:
+def sealed(magic: bytes, parts: Iterable[NDArray[Any]]) -> bytes:
     """The bytes of such a file.
 
     Args:
@@ -86,7 +86,8 @@ def sealed(magic: bytes, parts: Iterable[NDArray[Any]]) -> memoryview:
         np.lib.format.write_array(out, np.ascontiguousarray(part), allow_pickle=False)
     digest = hashlib.sha256(out.getbuffer()).digest()
     out.write(digest)
-    return out.getbuffer()
+    # Not a view: Python 3.13 reports a stream that is collected in a cycle with one.
+    return out.getvalue()
 
 
 def unseal(source: Path | bytes, magic: bytes) -> Iterator[NDArray[Any]]:

@@ -121,7 +121,7 @@ def packed(
     merged: MergedMap,
     verdict_of: Callable[[Pair], Verdict | None],
     made_by: str,
-) -> memoryview:
+) -> bytes:
     """A merge as bytes.
 
     Args:

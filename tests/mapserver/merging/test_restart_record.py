@@ -317,7 +317,7 @@ def test_parts_that_do_not_fit_are_refused(part: int, how: str) -> None:
             "short": array[:-1], "kind": array.astype(np.complex128), "shape": array[..., None]
         }[how]  # fmt: skip
         harmless = (how == "short" and part in (7, 10, 14, 15, 16, 17, 18)) or (how == "shape" and part < 2)
-    data = bytes(sealed(restart_record_file.MAGIC, [*parts[:part], array, *parts[part + 1 :]]))
+    data = sealed(restart_record_file.MAGIC, [*parts[:part], array, *parts[part + 1 :]])
     if harmless:
         load(data, "me")
     else:
