@@ -10,7 +10,7 @@ import sys
 import tomllib
 import types
 import typing
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -83,7 +83,7 @@ def build(cls: type[T], values: Mapping[str, Any], where: str) -> T:
         settings: T = convert(values, cls)
         return settings
     except msgspec.ValidationError as error:
-        raise SettingsError(f"{where}: {_in_words(str(error), values)}") from None
+        raise SettingsError(f"{where}: {_in_words(str(error), values, cls)}") from None
     except SettingsError as error:
         raise SettingsError(f"{where}: {error}") from None
 
@@ -124,27 +124,68 @@ def _dataclasses(kind: Any) -> Iterator[Any]:
             yield from _dataclasses(inner)
 
 
-def _in_words(error: str, values: Mapping[str, Any]) -> str:
+def _in_words(error: str, values: Mapping[str, Any], cls: type) -> str:
     """The error of msgspec as `path: what is wrong; what is there`.
 
     Args:
         error: for example ``Expected `float` > 0.0 - at `$.agent.navigation.speed` ``.
         values: the table.
+        cls: what was to be made of it.
     """
     what, _, place = error.partition(" - at `$")
     path = place.rstrip("`").lstrip(".")
     there: Any = values
+    hints: list[Any] = [cls]
     for name, number in re.findall(r"([^.\[\]]+)|\[(\d+)\]", path):
         there = there[int(number)] if number else there[name]
-    missing = re.fullmatch(r"Object missing required field `(\w+)`", what)
-    if missing:
-        what = f"{missing[1]} is missing"
+        hints = [inner for hint in hints for inner in _inside(hint, name)]
+    if missing := re.fullmatch(r"Object missing required field `(\w+)`", what):
+        what = f": {missing[1]} is missing"
+    elif re.fullmatch(r"Expected `(int|float)` [<>]=? .*", what) and (ranges := _ranges(hints)):
+        what = f" must be {' or '.join(ranges)}; it is {there!r}"
     else:
-        what = (
-            f"{what[:1].lower()}{what[1:]}".replace("`", "")
-            .replace("object", "table")
-            .replace("array", "list")
-        )
+        what = f": {what[:1].lower()}{what[1:]}".replace("`", "")
+        what = what.replace("object", "table").replace("array", "list")
         if not isinstance(there, Mapping | list):
             what = f"{what}; it is {there!r}"
-    return f"{path}: {what}" if path else what
+    return f"{path}{what}".removeprefix(": ")
+
+
+def _inside(hint: Any, name: str) -> Iterator[Any]:
+    """The type hints of a dataclass's field, or, without a name, of what a tuple holds."""
+    if name:
+        for kind in _dataclasses(hint):
+            yield typing.get_type_hints(kind, include_extras=True).get(name)
+    elif typing.get_origin(hint) is tuple:
+        yield from typing.get_args(hint)
+    else:
+        for inner in typing.get_args(hint):
+            yield from _inside(inner, name)
+
+
+def _ranges(hints: Iterable[Any]) -> list[str]:
+    """What numbers may be: for example `a whole number, 1 to 16`."""
+    out: list[str] = []
+    for hint in hints:
+        if typing.get_origin(hint) is not typing.Annotated:
+            out += _ranges(typing.get_args(hint))
+            continue
+        kind, *metas = typing.get_args(hint)
+        for meta in metas:
+            if isinstance(meta, msgspec.Meta) and kind in (int, float):
+                out.append(f"a {'whole ' if kind is int else ''}number, {_range(meta)}")
+    return list(dict.fromkeys(out))
+
+
+def _range(meta: msgspec.Meta) -> str:
+    """The range in words, both ends of it."""
+    if meta.ge is not None and meta.le is not None:
+        return f"{_plain(meta.ge)} to {_plain(meta.le)}"
+    ends = (
+        (meta.ge, "{} or more"), (meta.gt, "above {}"), (meta.le, "at most {}"), (meta.lt, "below {}")
+    )  # fmt: skip
+    return ", ".join(words.format(_plain(end)) for end, words in ends if end is not None)
+
+
+def _plain(number: float) -> str:
+    return str(number) if isinstance(number, int) else f"{number:g}"

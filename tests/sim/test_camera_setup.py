@@ -54,7 +54,7 @@ def test_a_robot_describes_what_was_ordered() -> None:
         ({"name": "a", "camera": {"read_nois": 1.0}}, "did you mean 'read_noise'"),
         (
             {"name": "a", "camera": {"exposure": {"seconds": 9.0}}},
-            "exposure.seconds: expected float <= 0.1; it is 9",
+            "exposure.seconds must be a number, 0 to 0.1; it is 9",
         ),
         ({"name": "a", "camera": {"distortion": [-2.0, 0, 0, 0, 0]}}, "folds"),
         ({"name": "a", "camera": {"intrinsics": 3}}, "expected table"),
@@ -62,7 +62,7 @@ def test_a_robot_describes_what_was_ordered() -> None:
         ({"camera": "wide"}, "name is missing"),
         ({"name": "a", "body": {"slip": -1.0}}, "slip"),
         ({"name": "a", "body": {"ticks_per_turn": 0}}, "ticks_per_turn"),
-        ({"name": "a", "rangers": 1000}, "rangers: expected int <= 256; it is 1000"),
+        ({"name": "a", "rangers": 1000}, "rangers must be a whole number, 0 to 256; it is 1000"),
         ({"name": "a", "start": [1, 2]}, "start: expected list of length 3"),
     ],
 )

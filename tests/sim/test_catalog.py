@@ -15,16 +15,16 @@ from mapweave.sim.worlds.catalog import KINDS, make_world, world_from_table
     ("kind", "parameters", "says"),
     [
         ("offices", {}, "no kind of world 'offices'; there are office, corridor"),
-        ("office", {"rooms": 0}, "rooms: expected int >= 1; it is 0"),
+        ("office", {"rooms": 0}, "rooms must be a whole number, 1 to 32; it is 0"),
         ("office", {"rooms": 2.5}, "expected int"),
         ("office", {"room": 2}, "did you mean 'rooms'"),
         ("corridor", {"breadth": math.nan}, "is no float"),
-        ("corridor", {"breadth": 0.2}, "breadth: expected float >= 1.2; it is 0.2"),
+        ("corridor", {"breadth": 0.2}, "breadth must be a number, 1.2 to 5; it is 0.2"),
         ("corridor", {"width": 5.0, "breadth": 3.0}, "has no middle"),
-        ("warehouse", {"rows": 21}, "rows: expected int <= 20; it is 21"),
+        ("warehouse", {"rows": 21}, "rows must be a whole number, 1 to 20; it is 21"),
         ("warehouse", {"bays": True}, "expected int"),
         ("twins", {"joined": 1}, "expected bool"),
-        ("arena", {"length": -3.0}, "length: expected float >= 2.0; it is -3.0"),
+        ("arena", {"length": -3.0}, "length must be a number, 2 to 60; it is -3.0"),
     ],
 )
 def test_wrong_parameters_are_reported_in_one_line(

@@ -41,7 +41,7 @@ def test_tables_become_events() -> None:
         ({"do": "kidnap", "robot": "r0", "x": 1.0}, "say where"),
         ({"do": "kidnap", "robot": "r0", "x": 1.0, "y": 1.0, "room": "room 1"}, "say where"),
         ({"do": "kidnap", "x": 1.0, "y": 1.0}, "robot is missing"),
-        ({"do": "light", "factor": -1}, "factor: expected float >= 0.0; it is -1"),
+        ({"do": "light", "factor": -1}, "factor must be a number, 0 to 20; it is -1"),
         ({"do": "walk"}, "say where"),
         ({"do": "walk", "near": "r0", "what": "dog"}, "known are person, box"),
         ({"do": "walk", "path": [[0, 0]]}, "2 to 1000"),

@@ -98,11 +98,15 @@ def test_what_a_waveshare_says() -> None:
             {"port": "x"},
             r"wheel_radius is missing: write it in .* --settings FILE \(docs/drivers.md\)$",
         ),
-        ("arduino", {"port": "x", "wheel_radius": 0.0, "counts_per_turn": 1}, "expected float > 0.0"),
+        (
+            "arduino",
+            {"port": "x", "wheel_radius": 0.0, "counts_per_turn": 1},
+            "wheel_radius must be a number, above 0; it is 0.0",
+        ),
         (
             "arduino",
             {"port": "x", "wheel_radius": 1.0, "counts_per_turn": 1, "baud": 0},
-            "baud: expected int",
+            "baud must be a whole number, 50 to 10000000; it is 0",
         ),
         ("waveshare", {"port": "x"}, r"no \[robot.camera\]"),
     ],

@@ -200,7 +200,10 @@ def test_settings_go_over_what_the_driver_knows() -> None:
 @pytest.mark.parametrize(
     ("text", "words"),
     [
-        ("[robot.geometry]\naxle = -1", "robot.toml: robot.geometry.axle: expected float > 0.0; it is -1"),
+        (
+            "[robot.geometry]\naxle = -1",
+            "robot.toml: robot.geometry.axle must be a number, above 0; it is -1",
+        ),
         (
             "[robot.camera]\nwidth = 640\nheight = 480\nfx = 600.0\nfy = 600.0\ncx = 320.0\ncy = 240.0\n"
             "height_m = 300\n",

@@ -82,7 +82,7 @@ def test_an_event_names_its_ways() -> None:
     assert action == TryLies("r3", ("copied places",), 3)
     for table, reason in (
         ({"robot": "r3", "ways": ["politely"]}, "no way 'politely'; known are node at 1e9 m"),
-        ({"robot": "r3", "queries": 0}, "queries must be 1 to 1000"),
+        ({"robot": "r3", "queries": 0}, "queries must be a whole number, 1 to 1000; it is 0"),
     ):
         with pytest.raises(SettingsError, match=reason):
             parse_action("lie", table, "event 1")

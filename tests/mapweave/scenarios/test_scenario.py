@@ -88,7 +88,7 @@ def test_robots_of_different_kinds(tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (("robots = 2", "robots = 0"), "robots: expected int >= 1; it is 0"),
+        (("robots = 2", "robots = 0"), "robots must be a whole number, 1 to 16; it is 0"),
         (("robots = 2", "robot = 2"), "robot: expected list, got int; it is 2"),
         (("robots = 2", "robots = 1"), "no robot 'r1'; there are r0"),
         (('kind = "office"', 'kind = "ofice"'), None),
@@ -97,7 +97,7 @@ def test_robots_of_different_kinds(tmp_path):
         (('robot = "r1"', 'robott = "r1"'), "did you mean 'robot'"),
         (('robot = "r1"', ""), "robot is missing"),
         (("factor = 0.5", "factor = -1.0"), "factor"),
-        (("at = 5.0", "at = -5.0"), "at: expected float >= 0.0; it is -5.0"),
+        (("at = 5.0", "at = -5.0"), "at must be a number, 0 to 86400; it is -5.0"),
         (("at = 5.0", 'at = "soon"'), "at: expected float, got str; it is 'soon'"),
         (('after = "joined"', 'after = "merged"'), "known are joined"),
         (("within = 60.0", ""), "needs within"),
