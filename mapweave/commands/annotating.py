@@ -13,7 +13,7 @@ from mapweave.commands import values
 from mapweave.commands.answer import add_json, print_said
 from mapweave.commands.map_input import SOURCES, map_source, merge_progress, opened
 from mapweave.commands.missions import fleet_of
-from mapweave.commands.network import add_network, add_reason, settings_of
+from mapweave.commands.network import add_network, add_reason, key_holder, network_of, settings_of
 from mapweave.commands.usage import UsageError
 from mapweave.hybridmap.errors import InvalidValue, Refused
 
@@ -68,7 +68,7 @@ def add_remove(actions: Any, kind: str, words: str, of: str, description: str) -
     """Declare the action that withdraws an annotation of a kind by its name."""
 
     def run(arguments: argparse.Namespace) -> int:
-        with record_of(arguments) as record:
+        with record_of(arguments, changes=True) as record:
             said = record.withdraw(kind, arguments.name, arguments.because, check=arguments.check)
         print_said(arguments, said)
         return 0
@@ -133,18 +133,25 @@ def two_numbers(word: str) -> tuple[float, float] | None:
 
 
 @contextmanager
-def record_of(arguments: argparse.Namespace) -> Iterator[Fleet | OfflineRecord]:
+def record_of(arguments: argparse.Namespace, changes: bool = False) -> Iterator[Fleet | OfflineRecord]:
     """The fleet that the command line names, or the map of `--map`: both answer the same questions.
 
+    Args:
+        arguments: of the command.
+        changes: whether the command changes what people say about the map: not everyone's key may.
+
     Raises:
-        MapweaveError: no server answers, or the file cannot be read.
+        MapweaveError: no server answers, the key may only look, or the file cannot be read.
     """
+    from mapweave.fleet_questions import check_role
     from mapweave.login import login
 
     try:
         if arguments.map is None:
             if getattr(arguments, "out", None) is not None:
                 raise UsageError("--out goes with --map: a server keeps its own record")
+            if changes:
+                check_role(key_holder(network_of(arguments, settings_of(arguments))))
             with fleet_of(arguments) as fleet:
                 yield fleet
         else:

@@ -108,7 +108,7 @@ def run_close(arguments: argparse.Namespace) -> int:
                 f"{word} {local_words(stamp_ns)} ({utc_words(stamp_ns)})",
                 file=sys.stderr if arguments.json else sys.stdout,
             )
-    with record_of(arguments) as record:
+    with record_of(arguments, changes=True) as record:
         name, fields = _meant(arguments, "closure", record)
         fields |= times
         said = record.annotate("closure", name, arguments.because, check=arguments.check, **fields)
@@ -127,7 +127,7 @@ def run_prefer(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--factor {arguments.factor:g}: {words}")
     if arguments.undo:
         return _withdraw(arguments, "preference")
-    with record_of(arguments) as record:
+    with record_of(arguments, changes=True) as record:
         name, fields = _meant(arguments, "preference", record)
         fields["factor"] = arguments.factor
         said = record.annotate("preference", name, arguments.because, check=arguments.check, **fields)
@@ -172,7 +172,7 @@ def _without_effect(record: Fleet | OfflineRecord, entry: Annotation) -> str:
 
 
 def _withdraw(arguments: argparse.Namespace, kind: str) -> int:
-    with record_of(arguments) as record:
+    with record_of(arguments, changes=True) as record:
         names = _names(arguments, kind, record)
         said = [record.withdraw(kind, name, arguments.because, check=arguments.check) for name in names]
     print_said(arguments, *said)

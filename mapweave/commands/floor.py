@@ -49,7 +49,7 @@ def run(arguments: argparse.Namespace) -> int:
         return print_entries(arguments, "floors", Floor, "no map has a label yet: mapweave floor NAME NODE")
     if (arguments.label is None) != arguments.undo:
         raise UsageError("give the name of a floor and a node; with --undo a node alone")
-    with record_of(arguments) as record:
+    with record_of(arguments, changes=True) as record:
         words, near, resolve = [arguments.node], arguments.near or "", noted(record.resolve)
         if arguments.plan is not None:
             words = off_plan(words, record.plans().plan(arguments.plan), near, resolve)

@@ -136,7 +136,7 @@ def run_link(arguments: argparse.Namespace) -> int:
             pose = read_pose(numbers)
     check_ids(arguments.nodes, nodes_of)
     try:
-        with record_of(arguments) as record:
+        with record_of(arguments, changes=True) as record:
             a, b = nodes_of(own_ids_of(arguments.nodes, record.annotations, noted(record.resolve)))
             with arguments_read():
                 about = Linked(a, b, pose)
@@ -177,7 +177,7 @@ def run_unmerge(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.query import ExplainRequest
 
     check_ids(arguments.ends, different_ends_of)
-    with record_of(arguments) as record:
+    with record_of(arguments, changes=True) as record:
         ends = different_ends_of(own_ids_of(arguments.ends, record.annotations, noted(record.resolve)))
         first, second = (MapId(end[0], end[1]) for end in ends)
 
@@ -239,7 +239,7 @@ def run_retire(arguments: argparse.Namespace) -> int:
             about = _window(arguments)
     if arguments.which:
         check_ids(arguments.which, read_retired)
-    with record_of(arguments) as record:
+    with record_of(arguments, changes=True) as record:
         if about is None:
             with arguments_read():
                 about = (
@@ -303,7 +303,7 @@ def run_undo(arguments: argparse.Namespace) -> int:
     from mapweave.mapserver.http.json_values import constraint_values
     from mapweave.refusals import refusals
 
-    with record_of(arguments) as record:
+    with record_of(arguments, changes=arguments.number is not None) as record:
         made = record.constraints()
         if arguments.number is not None:
             with refusals():

@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     fields: dict[str, Any] = {} if arguments.plan is None else {"plan": arguments.plan}
     if arguments.pose is not None:
         fields["merged_from_node"] = _pose(arguments.pose)
-    with record_of(arguments) as record:
+    with record_of(arguments, changes=True) as record:
         resolve = noted(record.resolve)
         if arguments.undo:
             # A retired node is found by its id alone.

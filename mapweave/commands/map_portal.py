@@ -68,7 +68,7 @@ def run_add(arguments: argparse.Namespace) -> int:
     a = arguments
     if a.a == a.b:
         raise UsageError(f"{a.a} twice: a portal leads from one node to another")
-    with record_of(a) as record:
+    with record_of(a, changes=True) as record:
         given = {name: said for name in ("near", "plan") if (said := getattr(a, name))}
         fields = {"a": a.a, "b": a.b, "means": a.kind, "note": a.note, **given}
         said = record.annotate("portal", a.name, a.because, check=a.check, **fields)

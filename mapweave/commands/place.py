@@ -79,7 +79,7 @@ def run_add(arguments: argparse.Namespace) -> int:
         raise UsageError("give a node, a position, or --corners")
     if arguments.where is not None:
         fields["node"] = arguments.where
-    with record_of(arguments) as record:
+    with record_of(arguments, changes=True) as record:
         said = record.annotate("place", arguments.name, arguments.because, check=arguments.check, **fields)
     print_said(arguments, said)
     return 0

@@ -135,7 +135,7 @@ def run_add(arguments: argparse.Namespace) -> int:
     if arguments.near:
         fields["near"] = arguments.near
     name = arguments.name or path.stem
-    with record_of(arguments) as record:
+    with record_of(arguments, changes=True) as record:
         record.put_plan_image(kept.png)
         said = [record.annotate("plan", name, arguments.because, check=arguments.check, **fields)]
         if not arguments.check:

@@ -143,7 +143,7 @@ def test_a_robot_that_is_not_let_in_hears_that_its_key_may_be_no_longer_good(key
     "words",
     [
         "map link r0.1.1 r1.1.1", "map unmerge r0.1 r1.1", "map retire r0.1", "map retire r0.1 --undo",
-        "map retire r0.1 --check", "drive r0 --gamepad /dev/null",
+        "map retire r0.1 --check", "map undo 1", "place add kitchen r0.1.1", "drive r0 --gamepad /dev/null",
     ],
 )  # fmt: skip
 def test_a_command_with_a_viewers_key_is_said_to_need_anothers(
