@@ -150,7 +150,7 @@ def test_runs_are_processes_and_all_are_accounted_for(monkeypatch: pytest.Monkey
     results = measure(["none", "small"], 1, 0, 2, Console(file=sys.stderr, quiet=True))
     assert [type(result) for result in results] == [Failure, Failure]
     assert isinstance(results[0], Failure) and "no scenario 'no-such-scenario'" in results[0].reason
-    assert isinstance(results[1], Failure) and "twin room's length" in results[1].reason
+    assert isinstance(results[1], Failure) and "twins: length must be a number, 2.5 to" in results[1].reason
 
 
 def test_median_and_sums_over_runs() -> None:
