@@ -261,7 +261,9 @@ def test_a_follower_whose_merge_is_damaged_merges_itself_and_says_so(
     monkeypatch.setattr(merge_adoption, "PATIENCE", 1000.0)
     servers.send(changes[24:])
     # So does another one that has seen the damage meanwhile: it looks every few seconds.
+    # One that has merged all by itself answers from that merge until it has taken over the leader's.
     eventually(lambda: not any(server.status()["merges_itself"] for server in servers.all), PATIENCE)
+    eventually(lambda: len({hash_of(server._worker.answers.merged) for server in servers.all}) == 1, PATIENCE)
     assert_follows(servers, unmerged=False)
 
 
