@@ -38,12 +38,12 @@ endif
 demo: setup
 	$(BIN)/mapweave demo
 
-# Two workers more than cores, four at the most: many tests wait for processes. Each takes up to 1 GB.
+# Three workers more than cores, five at the most: many tests wait for processes. Each takes up to 1 GB.
 # `make test WORKERS=0` is one process.
-WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 2)
+WORKERS ?= $(shell expr $$(getconf _NPROCESSORS_ONLN) + 3)
 test: setup
 	@$(COMPILE)
-	$(BIN)/python -m pytest -m "not slow and not scenario" -n $(WORKERS) --maxprocesses 4 --dist worksteal
+	$(BIN)/python -m pytest -m "not slow and not scenario" -n $(WORKERS) --maxprocesses 5 --dist worksteal
 
 # The files that have tests of a mark: to read all takes six seconds of processor time.
 marked = $$(grep -rl --include='*.py' 'mark\.$1\b' tests)
