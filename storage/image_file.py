@@ -26,6 +26,7 @@ BARE = (0x00, 0x01, *range(0xD0, 0xDA))
 PNG = b"\x89PNG\r\n\x1a\n"
 ANIMATION = (b"acTL", b"fcTL", b"fdAT")
 """Chunks of an animated PNG that a still one does not have."""
+NO_IMAGE = "no JPEG, PNG, PGM or BMP file; convert it to PNG"
 PNM = re.compile(rb"P[1-6](?:\s|#[^\r\n]*[\r\n])+(\d{1,9})\s(?:\s|#[^\r\n]*[\r\n])*(\d{1,9})\s")
 """As the decoder reads it. What stands between the numbers must match in one way, or this takes for ever."""
 
@@ -155,7 +156,7 @@ def image_size(data: bytes) -> tuple[int, int]:
         return int(header[1]), int(header[2])
     if data.startswith(b"\xff\xd8"):
         return _jpeg_size(data)
-    raise InvalidValue("send a JPEG or PNG image")
+    raise InvalidValue(NO_IMAGE)
 
 
 def _jpeg_size(data: bytes) -> tuple[int, int]:
@@ -173,4 +174,4 @@ def _jpeg_size(data: bytes) -> tuple[int, int]:
             height, width = struct.unpack(">HH", data[at + 5 : at + 9])
             return width, height
         at += 1 if kind == 0xFF else 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    raise InvalidValue("send a JPEG or PNG image")
+    raise InvalidValue(NO_IMAGE)

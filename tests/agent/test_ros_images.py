@@ -29,8 +29,8 @@ def test_an_empty_image_is_refused(encoding: str, size: dict[str, int]) -> None:
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (SimpleNamespace(data=b"no image"), "send a JPEG or PNG"),
-        (SimpleNamespace(data=b""), "send a JPEG or PNG"),
+        (SimpleNamespace(data=b"no image"), "no JPEG, PNG, PGM or BMP file"),
+        (SimpleNamespace(data=b""), "no JPEG, PNG, PGM or BMP file"),
         (image(width=2**16, height=2**16), "65536x65536 px is too large"),
         (image(step=2**32 - 1), "has 48 bytes"),
         (image(encoding="32FC1"), "are not supported"),

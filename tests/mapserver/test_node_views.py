@@ -99,7 +99,10 @@ GARBAGE = {
     "text": (b"<html>", "no whole JPEG file"),
     "a PNG": (picture(CAMERA.width, CAMERA.height), "no whole JPEG file"),
     "cut off": (JPEG[:-300], "no whole JPEG file"),
-    "a JPEG in name alone": (b"\xff\xd8\xff" + b"no image" * 20 + b"\xff\xd9", "JPEG or PNG"),
+    "a JPEG in name alone": (
+        b"\xff\xd8\xff" + b"no image" * 20 + b"\xff\xd9",
+        "no JPEG, PNG, PGM or BMP file",
+    ),
     "another size": (picture(CAMERA.width // 2, CAMERA.height, ".jpg"), "px instead of"),
     "a bomb of pixels": (bomb(65_500, 65_500), "65500x65500 px instead of"),
     "many scans": (JPEG[:-2] + b"\xff\xda" * 30 + b"\xff\xd9", "more than 20 scans"),

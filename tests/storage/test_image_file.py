@@ -107,7 +107,7 @@ def test_a_frame_hidden_behind_a_bare_marker_is_not_decoded(marker, monkeypatch)
     hidden = large + data[2:at] + b"\xff\xfe" + struct.pack(">H", 2 + len(frame))
     skipped = bytes([0xFF, marker]) + struct.pack(">H", 2 + len(hidden))
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
-    with pytest.raises(InvalidValue, match="send a JPEG or PNG image"):
+    with pytest.raises(InvalidValue, match="no JPEG, PNG, PGM or BMP file; convert it to PNG"):
         decode_grey(data[:2] + skipped + hidden + frame + data[end:])
 
 

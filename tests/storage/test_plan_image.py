@@ -99,8 +99,11 @@ def test_no_image_and_too_large_ones_are_refused(tmp_path: Path) -> None:
     huge[16:24] = (60_000).to_bytes(4, "big") * 2
     (tmp_path / "c.png").write_bytes(huge)
     for name, words in {
-        "a.png": "damaged", "b.png": "send a JPEG or PNG", "c.png": "too large", "none.png": "No such file",
-    }.items():  # fmt: skip
+        "a.png": "damaged",
+        "b.png": "no JPEG, PNG, PGM or BMP file",
+        "c.png": "too large",
+        "none.png": "No such file",
+    }.items():
         with pytest.raises(InvalidFile, match=words):
             read_plan_file(tmp_path / name)
     with pytest.raises(InvalidValue, match="20000 px a side"):

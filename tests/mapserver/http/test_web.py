@@ -160,11 +160,11 @@ def huge_png() -> bytes:
 @pytest.mark.parametrize(
     ("body", "words"),
     [
-        (b"no image", "send a JPEG or PNG image"),
-        (b"\xff\xd8", "send a JPEG or PNG image"),
-        (b"\xff\xd8\xff\xff\xff\xe0\x00\x00" * 9, "send a JPEG or PNG image"),
-        (b"\xff\xd8" + b"\xff\xe0\x00\x02" * 1_000_000, "send a JPEG or PNG image"),
-        (b"\xff\xd8" + b"\xff" * 5_000_000, "send a JPEG or PNG image"),
+        (b"no image", "no JPEG, PNG, PGM or BMP file; convert it to PNG"),
+        (b"\xff\xd8", "no JPEG, PNG, PGM or BMP file; convert it to PNG"),
+        (b"\xff\xd8\xff\xff\xff\xe0\x00\x00" * 9, "no JPEG, PNG, PGM or BMP file; convert it to PNG"),
+        (b"\xff\xd8" + b"\xff\xe0\x00\x02" * 1_000_000, "no JPEG, PNG, PGM or BMP file; convert it to PNG"),
+        (b"\xff\xd8" + b"\xff" * 5_000_000, "no JPEG, PNG, PGM or BMP file; convert it to PNG"),
         (picture(kind=".jpg") + b"\xff\xda" * 20, "more than 20 scans"),
         (picture()[:60], "the image is damaged"),
         (huge_png(), "an image of 100000x100000 px is too large"),
