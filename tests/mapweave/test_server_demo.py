@@ -326,12 +326,12 @@ def test_robots_events_and_links_are_there_before_the_server_is_loaded() -> None
 
 
 @pytest.mark.slow
-def test_the_page_is_filled_within_a_second_from_when_the_server_runs() -> None:
+def test_the_page_is_filled_within_a_second_of_the_start_of_the_process() -> None:
     """A person sees its nodes, robots and events at once, and the server has them once it is loaded."""
     http = free_port()
     with demo(http, free_port()) as server:
-        eventually(lambda: get(http, "status") != {}, 90)
         clock, seen = CoreTime(server), set[str]()
+        eventually(lambda: get(http, "status") != {}, 90)
         with connect(f"ws://127.0.0.1:{http}/live", proxy=None) as socket:
             while not {"map", "state", "events"} <= seen:
                 message = json.loads(socket.recv(timeout=20))
