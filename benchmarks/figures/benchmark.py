@@ -13,8 +13,7 @@ import sys
 from pathlib import Path
 
 from benchmarks.figures.measurements import MEASUREMENTS
-from benchmarks.figures.page import page
-from benchmarks.figures.readme import with_table
+from benchmarks.figures.page import page, with_table
 from benchmarks.figures.results import FOLDER, load, run, store
 from benchmarks.figures.scale import scale_page
 from mapweave.hybridmap.errors import MapweaveError

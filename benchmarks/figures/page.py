@@ -1,26 +1,36 @@
-"""docs/figures.md, written of stored results alone."""
+"""docs/figures.md and README.md's table, filled in from stored results alone.
+
+`page.md` and `readme_table.md` beside this file are the templates. `{result/path/of/keys:format}` is
+a figure; `{command}` becomes the commands behind the figures of its row, `{measured}` a row of each
+result.
+"""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
-from benchmarks.figures.questions import INTRODUCTION, QUESTIONS, Question
 from benchmarks.figures.results import StoredResult
-from benchmarks.figures.rules import RULES, Rule
 from mapweave.hybridmap.errors import InvalidValue
 
-FIELD = re.compile(r"\{([^{}:]+)(?::([^{}]*))?\}")
-"""`{path/of/keys:format}`; a format that ends in `k` or `m` shows thousands or thousandths."""
+PAGE = Path(__file__).with_name("page.md")
+README_TABLE = Path(__file__).with_name("readme_table.md")
+FIELD = re.compile(r"\{([^{}:/]+/[^{}:]+)(?::([^{}]*))?\}")
+"""A figure; a format that ends in `k` or `m` shows thousands or thousandths."""
 SCALES = {"k": 1e-3, "m": 1e3}
 
 
 def filled(template: str, figures: Mapping[str, Any]) -> str:
-    """A template with the figures of a result.
+    """A template with figures.
+
+    Args:
+        template: with fields.
+        figures: JSON object of each result, by its name.
 
     Raises:
-        InvalidValue: the result does not have a figure.
+        InvalidValue: a result is missing, or does not have a figure.
     """
     return FIELD.sub(lambda found: _shown(figures, found[1], found[2] or ""), template)
 
@@ -46,63 +56,41 @@ def page(results: Mapping[str, StoredResult]) -> str:
     Raises:
         InvalidValue: a result or one of its figures is missing.
     """
-    parts = ["# Figures", INTRODUCTION, *(_question(one, results) for one in QUESTIONS)]
-    parts += [_rules(RULES, results), _measured(results)]
-    return "\n\n".join(parts) + "\n"
+    figures = {name: result.figures for name, result in results.items()}
+    lines, before = [], ""
+    for template in PAGE.read_text(encoding="utf-8").splitlines():
+        line = filled(template, figures)
+        if "{command}" in line:
+            named = dict.fromkeys(
+                _command(results[path.split("/")[0]]) for path, _ in FIELD.findall(template)
+            )
+            commands = ", ".join(named) or "none is stored"
+            line = line.replace("{command}", "same" if commands == before else commands)
+            before = commands
+        else:
+            before = ""
+        lines += [_measured(*one) for one in results.items()] if line == "{measured}" else [line]
+    return "\n".join(lines) + "\n"
 
 
-def _question(question: Question, results: Mapping[str, StoredResult]) -> str:
-    lines = [f"## {question.title}", "", "| what | figure | asked | command |", "|---|---|---|---|"]
-    before = ""
-    for row in question.rows:
-        result = _of(results, row.source)
-        command = "same" if row.source == before else _command(result)
-        lines.append(f"| {row.what} | {filled(row.figure, result.figures)} | {row.asked} | {command} |")
-        before = row.source
-    return "\n".join(lines)
+def with_table(text: str, results: Mapping[str, StoredResult]) -> str:
+    """README.md with the table of stored results.
+
+    Raises:
+        InvalidValue: there is not one table, or a figure is missing.
+    """
+    template = README_TABLE.read_text(encoding="utf-8")
+    head = "".join(template.splitlines(keepends=True)[:2])
+    table = filled(template, {name: result.figures for name, result in results.items()})
+    made, tables = re.subn(rf"{re.escape(head)}(?:\|.*\n)*", lambda _: table, text)
+    if tables != 1:
+        raise InvalidValue(f"README.md has {tables} tables of figures instead of one")
+    return made
 
 
-def _rules(rules: Sequence[Rule], results: Mapping[str, StoredResult]) -> str:
-    lines = [
-        "## What fails without each rule", "",
-        "A rule that rejects links, answers or frames is switched off by itself; everything else stays.", "",
-        "| rule | file | what fails without it | command |", "|---|---|---|---|",
-    ]  # fmt: skip
-    before = ""
-    for rule in rules:
-        reasons = "; ".join(_reason(results, *one) for one in rule.fails)
-        named = dict.fromkeys(_command(_of(results, source)) for _, source in rule.fails if source)
-        commands = ", ".join(named) or "none is stored"
-        lines.append(
-            f"| {rule.name} | `{rule.file}` | {reasons} | {'same' if commands == before else commands} |"
-        )
-        before = commands
-    return "\n".join(lines)
-
-
-def _reason(results: Mapping[str, StoredResult], words: str, source: str) -> str:
-    """What fails without a rule, with the figures of the named result; without a name it has none."""
-    return filled(words, _of(results, source).figures) if source else words
-
-
-def _measured(results: Mapping[str, StoredResult]) -> str:
-    lines = [
-        "## When and where", "",
-        "`DATA` is the folder of recordings. Minutes are those of the processor.", "",
-        "| name | command | date | version | machine | minutes |", "|---|---|---|---|---|---|",
-    ]  # fmt: skip
-    lines += [
-        f"| {name} | {_command(one)} | {one.date} | {one.version} | {one.machine} | {one.minutes:g} |"
-        for name, one in results.items()
-    ]
-    return "\n".join(lines)
+def _measured(name: str, one: StoredResult) -> str:
+    return f"| {name} | {_command(one)} | {one.date} | {one.version} | {one.machine} | {one.minutes:g} |"
 
 
 def _command(result: StoredResult) -> str:
     return f"`{result.command.removesuffix(' --json')}`"
-
-
-def _of(results: Mapping[str, StoredResult], name: str) -> StoredResult:
-    if name not in results:
-        raise InvalidValue(f"no result {name}: python -m benchmarks.figures --run {name}")
-    return results[name]

@@ -9,8 +9,7 @@ import pytest
 
 from benchmarks.figures.benchmark import README, written_pages
 from benchmarks.figures.measurements import MEASUREMENTS
-from benchmarks.figures.page import filled
-from benchmarks.figures.readme import HEAD, with_table
+from benchmarks.figures.page import filled, with_table
 from benchmarks.figures.results import FOLDER, load, run, store
 from benchmarks.liar.benchmark import RULES as LIE_RULES
 from benchmarks.rules.switches import (
@@ -37,18 +36,18 @@ def test_each_stored_result_is_of_the_command_that_is_named() -> None:
 
 def test_a_figure_of_the_readme_that_is_no_result_is_replaced() -> None:
     """Also a row that no result is behind; what is not in the table stays."""
-    results = {name: load(name) for name in MEASUREMENTS}
+    head, results = "| what | figure |\n|---|---|\n", {name: load(name) for name in MEASUREMENTS}
     kept = README.read_text(encoding="utf-8")
-    wrong = re.sub(r"[\d.]+ m \|", "59 m |", kept).replace(HEAD, HEAD + "| of no result | 1 |\n")
+    wrong = re.sub(r"[\d.]+ m \|", "59 m |", kept).replace(head, head + "| of no result | 1 |\n")
     assert wrong.count("59 m") == 1
     assert with_table(wrong, results) == kept
     with pytest.raises(InvalidValue, match="0 tables"):
-        with_table(kept.replace(HEAD, ""), results)
+        with_table(kept.replace(head, ""), results)
 
 
 def test_figures_are_filled_in() -> None:
-    figures = {"a": {"b c": 0.0123, "80": None}, "n": 7, "some": ["one", "two"], "no": []}
-    template = "{a/b c:.1m} mm, {a/b c:.1%}, {n} of {n:.2f}, {a/80:.0f}; {some}; {no}"
+    figures = {"a": {"b c": 0.0123, "80": None}, "r": {"n": 7, "some": ["one", "two"], "no": []}}
+    template = "{a/b c:.1m} mm, {a/b c:.1%}, {r/n} of {r/n:.2f}, {a/80:.0f}; {r/some}; {r/no}"
     assert filled(template, figures) == "12.3 mm, 1.2%, 7 of 7.00, none; one, two; none"
     with pytest.raises(InvalidValue, match="no figure a/x"):
         filled("{a/x}", figures)
