@@ -17,6 +17,8 @@ from mapweave.commands.network import add_network, network_of
 from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:
+    from rich.console import Console
+
     from mapweave.agent.drivers.robot import Robot
     from mapweave.doctor.finding import Finding
     from mapweave.settings import Settings
@@ -24,6 +26,8 @@ if TYPE_CHECKING:
 
 NARROW = 72
 """Characters of a line below which a table would break words."""
+SUBJECT = 14
+"""Characters of the longest subject but one of a port."""
 STYLES = {"good": "green", "warning": "yellow", "wrong": "bold red", "skipped": "dim"}
 
 
@@ -138,28 +142,36 @@ def _ask(words: str) -> bool:
 
 
 def _print(findings: Sequence[Finding]) -> None:
-    """A table; paragraphs on a narrow terminal, and lines where rich is not installed."""
-    try:
-        from rich.box import SIMPLE
-        from rich.padding import Padding
-        from rich.table import Table
-        from rich.text import Text
+    """A table on a terminal, paragraphs on a narrow one, and else a line for each, as long as it is."""
+    if (console := _terminal()) is None:
+        for one in findings:
+            advice = f"; do: {one.advice}" if one.advice else ""
+            print(f"{one.verdict:<8} {one.subject:<{SUBJECT}} {one.detail}{advice}")
+        return
+    from rich.padding import Padding
+    from rich.table import Table
+    from rich.text import Text
 
-        from mapweave.terminal import plain_or_terminal
-    except ImportError:
-        for one in findings:
-            print(f"{one.verdict:<8} {one.subject:<18} {one.detail}{'; ' if one.advice else ''}{one.advice}")
-        return
-    console = plain_or_terminal(stderr=False)
-    if console.width < NARROW:
-        for one in findings:
-            console.print(Text.assemble((one.verdict, STYLES[one.verdict]), f" {one.subject}: {one.detail}"))
-            if one.advice:
-                console.print(Padding(Text(f"do: {one.advice}"), (0, 0, 0, 2)))
-        return
-    table = Table("", "subject", box=SIMPLE)
-    table.add_column("finding", overflow="fold", ratio=3)
-    table.add_column("what to do", overflow="fold", ratio=2)
+    table = Table.grid(padding=(0, 2, 0, 0))
     for one in findings:
-        table.add_row(Text(one.verdict, STYLES[one.verdict]), one.subject, Text(one.detail), Text(one.advice))
-    console.print(table)
+        verdict = Text(one.verdict, STYLES[one.verdict])
+        advice = f"do: {one.advice}" if one.advice else ""
+        if console.width >= NARROW:
+            table.add_row(verdict, one.subject, Text("\n".join(filter(None, (one.detail, advice)))))
+            continue
+        console.print(Text.assemble(verdict, f" {one.subject}: {one.detail}"))
+        if advice:
+            console.print(Padding(Text(advice), (0, 0, 0, 2)))
+    if table.rows:
+        console.print(table)
+
+
+def _terminal() -> Console | None:
+    """The terminal; None where there is none, or rich is not installed."""
+    try:
+        from mapweave.terminal import plain_or_terminal
+
+        console = plain_or_terminal(stderr=False)
+    except ImportError:
+        return None
+    return console if console.is_terminal else None

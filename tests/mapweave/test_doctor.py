@@ -400,6 +400,21 @@ def test_a_table_names_the_first_thing_wrong(tmp_path, capfd) -> None:
     assert capfd.readouterr().out.rstrip().endswith("nothing is wrong")
 
 
+def test_a_pipe_gets_a_line_for_each_check_without_padding(capfd) -> None:
+    """Each line had 274 characters, most of them spaces before an empty column."""
+    found = [
+        Finding("encoders", FindingLevel.SKIPPED, "not compared with the image", "mapweave doctor --drive"),
+        Finding("extra postgres", FindingLevel.GOOD, "installed"),
+        Finding("libraries", FindingLevel.GOOD, " ".join(["eclipse-zenoh 1.10.2,"] * 20)),
+    ]
+    doctor_command._print(found)
+    assert capfd.readouterr().out.splitlines() == [
+        "skipped  encoders       not compared with the image; do: mapweave doctor --drive",
+        "good     extra postgres installed",
+        f"good     libraries      {found[2].detail}",
+    ]
+
+
 @pytest.mark.parametrize("width", [40, 60])
 def test_a_narrow_terminal_cuts_no_word(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """On 40 columns the table had `observa` and `tions` on two lines, and `encode…`."""
