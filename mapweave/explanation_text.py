@@ -21,6 +21,7 @@ from mapweave.hybridmap.explanation import (
     RouteExplanation,
     Standing,
 )
+from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, retired_words
 from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.merge.explanation.twin_maps import TWINS
@@ -38,11 +39,21 @@ TITLES = {
 }
 
 
-def pair_words(explanation: PairExplanation) -> list[str]:
-    """The explanation of two nodes, line by line."""
-    lines = [
-        f"{explanation.a.id} and {explanation.b.id} {TITLES[explanation.standing]}: {explanation.reason}"
-    ]
+def with_node(word: str, node: NodeId) -> str:
+    """A node as a person has written it, and its id where that is another word."""
+    return word if word == str(node) else f"{word} ({node})"
+
+
+def pair_words(explanation: PairExplanation, ends: Sequence[str] = ()) -> list[str]:
+    """The explanation of two nodes, line by line.
+
+    Args:
+        explanation: of the two nodes.
+        ends: the two as a person has written them (default: their ids).
+    """
+    nodes = explanation.a.id, explanation.b.id
+    a, b = map(with_node, ends, nodes) if ends else nodes
+    lines = [f"{a} and {b} {TITLES[explanation.standing]}: {explanation.reason}"]
     # Landmarks that a robot tracked on its way need not match at both ends.
     followed = explanation.standing is Standing.OWN and "inliers" not in explanation.evidence
     agree = "were followed on the way" if followed else "agree on one pose"
@@ -118,15 +129,18 @@ def maps_words(explanation: MapsExplanation) -> list[str]:
     return lines
 
 
-def route_words(explanation: RouteExplanation, places: Sequence[str] | None = None) -> list[str]:
+def route_words(
+    explanation: RouteExplanation, places: Sequence[str] | None = None, title: str = ""
+) -> list[str]:
     """The explanation of a route, line by line.
 
     Args:
         explanation: of the route.
         places: where its start and the end of each of its hops are, in words.
+        title: from where to where (default: from node to node).
     """
     way = "the route is" if explanation.found else "there is no way"
-    lines = [f"{explanation.start} to {explanation.goal}: {way}: {explanation.reason}"]
+    lines = [f"{title or f'{explanation.start} to {explanation.goal}'}: {way}: {explanation.reason}"]
     steps = [f"  {_hop(hop)}" for hop in explanation.hops]
     if places is not None:
         lines.append(f"  {explanation.start} {places[0]}")

@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         explanation = record.explained(ExplainRequest(ends))
     values = json_values(explanation)
     if isinstance(explanation, PairExplanation):
-        lines = pair_words(explanation)
+        lines = pair_words(explanation, arguments.ends)
         if arguments.draw is not None:
             from mapweave.drawing.link_picture import draw_link
 

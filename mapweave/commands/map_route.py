@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
     """Ask and print."""
     from mapweave.commands.map_ends import check_ids, nodes_of, noted
     from mapweave.commands.plan import plan_of, plan_place
-    from mapweave.explanation_text import route_words
+    from mapweave.explanation_text import route_words, with_node
     from mapweave.extras import need
     from mapweave.hybridmap.explanation import RouteExplanation, route_over
     from mapweave.hybridmap.named_nodes import ids_of
@@ -90,7 +90,9 @@ def run(arguments: argparse.Namespace) -> int:
                 for node, pose in zip(way, poses, strict=True)
             ]
             on_plan = [plan_place(plan, pose) for pose in poses]
-        lines = route_words(explanation, on_plan)
+        start, *via, goal = map(with_node, stops, nodes)
+        passing = f" via {', '.join(via)}" if via else ""
+        lines = route_words(explanation, on_plan, f"{start} to {goal}{passing}")
         if arguments.draw is not None and explanation.found:
             draw_route(arguments.draw, record.map(), explanation)
             values["picture"] = str(arguments.draw)

@@ -149,6 +149,23 @@ def test_a_route_is_explained(
     assert "r0.1 is a map: give one of its nodes" in capfd.readouterr().err
 
 
+def test_places_are_named_beside_their_nodes(files: list[Path], said: Said, tmp_path: Path) -> None:
+    """Only the nodes were named: who had asked for `kitchen` could not see what was taken for it."""
+    path = tmp_path / "m.mapweave"
+    path.write_bytes(files[3].read_bytes())
+    first, second = map(str, links(path)[0])
+    said("place", "add", "kitchen", second, "--map", path)
+    out = said("map", "route", "kitchen", first, "--map", path)
+    assert out.startswith(f"kitchen ({second}) to {first}: the route is: ")
+    out = said("map", "route", first, "kitchen", "--via", "kitchen", "--map", path)
+    assert out.startswith(f"{first} to kitchen ({second}) via kitchen ({second}): ")
+    for ends, words in (
+        (("kitchen", first), f"kitchen ({second}) and {first} are linked: "),
+        ((first, "kitchen"), f"{first} and kitchen ({second}) are linked: "),
+    ):
+        assert said("map", "explain", *ends, "--map", path).startswith(words)
+
+
 def test_maps_are_explained(files: list[Path], said: Said) -> None:
     values = json.loads(said("map", "explain", "--map", files[3], "--json"))["maps"]
     assert [(item["first"], item["second"], item["joined"]) for item in values] == [
