@@ -119,7 +119,8 @@ class AgentLink:
         self._replicator = Replicator(self._bus, keys, self.journal, self._map, (SERVER,))
         self._client = FleetClient(self._bus, keys, self._map, MissionControl(name))
         self.submitted: list[float] = []
-        self.stops: list[list[ChangeBody]] = drive(number, stops, orders.seed).changes[::-1]
+        self._tour = drive(number, stops, orders.seed)
+        self.stops: list[list[ChangeBody]] = self._tour.changes[::-1]
 
     def map_on(self) -> None:
         """Hand over the next stop."""
@@ -146,8 +147,8 @@ class AgentLink:
         return [b - a for a, b in zip(self.submitted, noted, strict=False) if begin <= a < end]
 
     def flood(self, until: float) -> None:
-        """Send more than it may."""
-        flood(self._bus, Keys(FLEET), self.journal, self._map, until)
+        """Send and ask more than it may."""
+        flood(self._bus, Keys(FLEET), self.journal, self._map, self._tour.view, until)
 
     def close(self) -> None:
         """Disconnect."""

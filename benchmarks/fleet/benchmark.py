@@ -11,7 +11,8 @@ is. Journals lie in memory, as they are other machines' disks; the server's stor
 
 With `--disturb` three more agents hold the server up as well as they can: a slow one, none of whose changes
 comes by itself and whose log takes a second to answer, one that is frozen in the middle, and one that sends a
-thousand changes and beacons a second. The figures are those of the others.
+thousand changes and beacons a second and asks where it is from three threads without a pause. The figures are
+those of the others.
 
 By number of agents: `connected_s` until all have handed over their first node; `acked_per_s`; `ack_p50_ms`
 and `ack_p99_ms` from handing a change over to the journal's note that the server has it; `burst_p99_ms` and

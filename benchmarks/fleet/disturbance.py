@@ -11,8 +11,11 @@ from typing import Protocol
 
 from mapweave.agent.replication.journal import Journal
 from mapweave.hybridmap.ids import MapId
+from mapweave.hybridmap.query import View
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Head, Mark
+from mapweave.wire.messages import encode_view
+from mapweave.wire.senders import sent_by
 from mapweave.wire.zenoh_bus import ZenohBus
 
 KINDS = ("slow", "frozen", "flooding")
@@ -20,6 +23,8 @@ SLOW = 1.0
 """Of a slow agent to answer a question for its log, s. None of its changes comes by itself."""
 FLOOD = 1000.0
 """Changes a second of a flooding agent, and as many beacons: twenty times its quota of each."""
+ASKERS, ANSWERED = 3, 5.0
+"""Threads in which a flooding agent asks where it is without a pause; s that each waits for an answer."""
 FREEZE_AFTER, THAW_BEFORE = 2.0, 1.0
 """From the start of mapping until an agent is frozen, and from when it goes on until the end, s."""
 
@@ -42,9 +47,10 @@ class SlowJournal(Journal):
         return super().rows(map_id, first, last)
 
 
-def flood(bus: ZenohBus, keys: Keys, journal: Journal, map_id: MapId, until: float) -> None:
-    """Publish the newest change of a map and its beacon again and again, in a thread of its own."""
-    log_id = journal.log_id(map_id)
+def flood(bus: ZenohBus, keys: Keys, journal: Journal, map_id: MapId, view: View, until: float) -> None:
+    """Publish the newest change of a map and its beacon, and ask about a view, again and again."""
+    log_id, question = journal.log_id(map_id), encode_view(view)
+    where = sent_by(keys.any_relocalize(), map_id.agent)
 
     def publish() -> None:
         began, count = time.monotonic(), 0
@@ -57,7 +63,12 @@ def flood(bus: ZenohBus, keys: Keys, journal: Journal, map_id: MapId, until: flo
                 count += 1
             time.sleep(0.02)
 
-    threading.Thread(target=publish, name="flood", daemon=True).start()
+    def ask() -> None:
+        while time.monotonic() < until:
+            bus.ask(where, question, ANSWERED)
+
+    for work in (publish, *[ask] * ASKERS):
+        threading.Thread(target=work, name="flood", daemon=True).start()
 
 
 class Process(Protocol):

@@ -158,4 +158,6 @@ def test_a_small_fleet_is_measured_as_a_whole() -> None:
     assert 0.0 < row["ack_p50_ms"] <= row["ack_p99_ms"] and row["relocalize_p95_ms"] > 0.0
     for name in ("connected_s", "server_cpu", "router_cpu", "generator_cpu", "server_rss_mb"):
         assert row[name] > 0.0, name
-    assert {*report["said"]["4"]} == {"slow", "frozen", "flooding"}
+    said = report["said"]["4"]
+    assert {*said} == {"slow", "frozen", "flooding"}
+    assert "changes" in said["flooding"] and "questions" in said["flooding"], said

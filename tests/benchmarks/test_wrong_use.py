@@ -27,8 +27,6 @@ WRONG = [
     ("landmarks", "--pairs 1", "at least 2 pairs, 0 places and seed 0"),
     ("landmarks", "--places -1", "at least 2 pairs, 0 places and seed 0"),
     ("landmarks", "--pairs x", "--pairs"),
-    ("flood", "--seconds nan", "--seconds and --rate must be positive"),
-    ("flood", "--rate 0", "--seconds and --rate must be positive"),
     ("fuzz", "--seconds 0", "seconds above 0"),
     ("mapping_run", "--out {file}", "name a folder that can be written"),
     ("mapping_run", "--out {file}/below", "name a folder that can be written"),
