@@ -44,15 +44,17 @@ def with_node(word: str, node: NodeId) -> str:
     return word if word == str(node) else f"{word} ({node})"
 
 
-def pair_words(explanation: PairExplanation, ends: Sequence[str] = ()) -> list[str]:
+def pair_words(explanation: PairExplanation, written: Mapping[str, str] | None = None) -> list[str]:
     """The explanation of two nodes, line by line.
 
     Args:
         explanation: of the two nodes.
-        ends: the two as a person has written them (default: their ids).
+        written: how a person has written each, by its id (default: as ids).
     """
-    nodes = explanation.a.id, explanation.b.id
-    a, b = map(with_node, ends, nodes) if ends else nodes
+    a, b = (
+        with_node((written or {}).get(str(node), str(node)), node)
+        for node in (explanation.a.id, explanation.b.id)
+    )
     lines = [f"{a} and {b} {TITLES[explanation.standing]}: {explanation.reason}"]
     # Landmarks that a robot tracked on its way need not match at both ends.
     followed = explanation.standing is Standing.OWN and "inliers" not in explanation.evidence

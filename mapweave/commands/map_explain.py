@@ -57,7 +57,7 @@ def run(arguments: argparse.Namespace) -> int:
         explanation = record.explained(ExplainRequest(ends))
     values = json_values(explanation)
     if isinstance(explanation, PairExplanation):
-        lines = pair_words(explanation, arguments.ends)
+        lines = pair_words(explanation, dict(zip(words, arguments.ends, strict=True)))
         if arguments.draw is not None:
             from mapweave.drawing.link_picture import draw_link
 

@@ -159,11 +159,9 @@ def test_places_are_named_beside_their_nodes(files: list[Path], said: Said, tmp_
     assert out.startswith(f"kitchen ({second}) to {first}: the route is: ")
     out = said("map", "route", first, "kitchen", "--via", "kitchen", "--map", path)
     assert out.startswith(f"{first} to kitchen ({second}) via kitchen ({second}): ")
-    for ends, words in (
-        (("kitchen", first), f"kitchen ({second}) and {first} are linked: "),
-        ((first, "kitchen"), f"{first} and kitchen ({second}) are linked: "),
-    ):
-        assert said("map", "explain", *ends, "--map", path).startswith(words)
+    for ends in (("kitchen", first), (first, "kitchen")):
+        out = said("map", "explain", *ends, "--map", path)
+        assert out.startswith(f"{first} and kitchen ({second}) are linked: ")
 
 
 def test_maps_are_explained(files: list[Path], said: Said) -> None:
