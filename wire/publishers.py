@@ -47,9 +47,7 @@ class Publishers:
         declared = session.declare_publisher(key)
         with self._lock:
             publisher = self._by_key.setdefault(key, declared)
-            unused = [] if publisher is declared else [declared]
             if len(self._by_key) > self._most:
-                unused.append(self._by_key.popitem(last=False)[1])
-        for one in unused:
-            one.undeclare()  # type: ignore[no-untyped-call]
+                # Another thread may be sending by it now. Zenoh takes it back when the last one lets it go.
+                self._by_key.popitem(last=False)
         return publisher

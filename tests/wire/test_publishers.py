@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import threading
+import weakref
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -37,12 +38,14 @@ def test_a_key_has_one_publisher_until_others_need_its_place(session: zenoh.Sess
         used.append(publishers.of(session, key))
         used[-1].put(str(number).encode())
         assert len(publishers) <= 2
+    # Another thread may have it from before its place was needed: undeclared, it would lose what is sent,
+    # and Zenoh raises "Already borrowed" while a message is on its way.
+    used[1].put(b"7")
+    keys.append("a/2")
     eventually(lambda: len(got) == len(keys))
     assert sorted(got, key=lambda one: int(one[1])) == [(k, str(n).encode()) for n, k in enumerate(keys)]
     assert used[0] is used[2] is used[4], "it was used again before its place was needed"
     assert used[1] is not used[5] and used[5] is used[6]
-    with pytest.raises(zenoh.ZError):
-        used[1].put(b"it is taken back")
     subscriber.undeclare()  # type: ignore[no-untyped-call]
 
 
@@ -51,20 +54,18 @@ class SlowSession:
 
     def __init__(self) -> None:
         self.allowed = {key: threading.Event() for key in ("slow", "quick")}
-        self.asked, self.undeclared = list[str](), list[object]()
+        self.asked, self.declared = list[str](), weakref.WeakSet[SlowPublisher]()
 
     def declare_publisher(self, key: str) -> object:
         self.asked.append(key)
         assert self.allowed[key].wait(30)
-        return SlowPublisher(self)
+        publisher = SlowPublisher()
+        self.declared.add(publisher)
+        return publisher
 
 
 class SlowPublisher:
-    def __init__(self, session: SlowSession) -> None:
-        self.session = session
-
-    def undeclare(self) -> None:
-        self.session.undeclared.append(self)
+    """Taken back when nothing refers to it, as Zenoh's."""
 
 
 def test_a_key_whose_publisher_is_being_declared_holds_up_no_other() -> None:
@@ -78,4 +79,4 @@ def test_a_key_whose_publisher_is_being_declared_holds_up_no_other() -> None:
         session.allowed["slow"].set()
         first, second = (future.result() for future in both)
     assert first is second is of("slow") and first is not quick
-    assert len(session.undeclared) == 1 and first not in session.undeclared
+    eventually(lambda: set(session.declared) == {first, quick})
