@@ -111,6 +111,16 @@ def test_a_frame_hidden_behind_a_bare_marker_is_not_decoded(marker, monkeypatch)
         decode_grey(data[:2] + skipped + hidden + frame + data[end:])
 
 
+def test_a_jpeg_of_thousands_of_segments_is_not_decoded(monkeypatch):
+    """To read over the four million that fit into an upload takes seconds."""
+    data = cv2.imencode(".jpg", np.zeros((48, 64), np.uint8))[1].tobytes()
+    segment = b"\xff\xe0\x00\x02"
+    assert decode_grey(data[:2] + 500 * segment + data[2:]).shape == (48, 64)
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(InvalidValue):
+        decode_grey(data[:2] + 2000 * segment + data[2:])
+
+
 def test_a_bomb_in_a_recording_is_not_decoded(tmp_path, monkeypatch):
     path = tmp_path / "1.png"
     path.write_bytes(png(20_000, 2_600))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import threading
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
@@ -199,6 +200,26 @@ def test_a_viewer_moves_no_robot(fleet: Fleet) -> None:
     for key in commands:
         assert not any(asked(bob, sent_by(key, who)) for who in ("", "anna", "bob"))
         assert not any(asked(anna, sent_by(key, who)) for who in ("", "bob")), "under her own name alone"
+
+
+def test_a_robot_moves_no_other(certified: Fleet) -> None:
+    """Neither by an order nor by a step of the wheels, whatever name it gives."""
+    r1 = certified.join("r1")
+    orders = KEYS.mission("r1"), KEYS.portal("r1"), KEYS.drive("r1")
+    steps = KEYS.robot_describe("r1"), KEYS.robot_step("r1")
+    for key in steps:
+        r1.serve(key, answer)
+    for key in orders:
+        serve_senders(r1, key, lambda request, who: answer(request))
+    own, anna, r0 = certified.join("r1"), certified.join("anna"), certified.join("r0")
+    for key in steps:
+        eventually(lambda key=key: asked(own, key))
+    for key in orders:
+        eventually(lambda key=key: asked(anna, sent_by(key, "anna")))
+    forged = [*steps, *(sent_by(key, who) for key in orders for who in ("", "anna", "r0", "r1"))]
+    forged += [f"{key}/**" for key in orders]
+    with ThreadPoolExecutor(len(forged)) as pool:
+        assert not any(pool.map(lambda key: asked(r0, key), forged))
 
 
 def test_the_views_of_a_robot_are_for_servers_alone(fleet: Fleet) -> None:
