@@ -147,11 +147,15 @@ class FileMap(Map, ConstraintMethods, AnnotationMethods):
         if not isinstance(annotation.body, Pin):
             self._read = self._read.with_content(content)
             return words
-        moved = MapReading(content, self._read.settings)
+        moved = self._read_again(content)
         if content.poses:
             moved = moved.with_content(replace(content, poses=dict(moved.merged.poses)))
         self._read = moved
         return words
+
+    def _read_again(self, content: MapFile) -> MapReading:
+        """A content of which another merged map follows."""
+        return MapReading(content, self._read.settings)
 
     def _router(self) -> Router:
         """The router over the ways that are open now."""

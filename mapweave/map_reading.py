@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import cached_property
 from typing import TYPE_CHECKING
@@ -34,10 +34,22 @@ class MapReading:
         settings: how it is explained; as it was merged.
     """
 
-    def __init__(self, content: MapFile, settings: MergeSettings | None = None) -> None:
-        """Take a content. Nothing is worked out yet."""
+    def __init__(
+        self,
+        content: MapFile,
+        settings: MergeSettings | None = None,
+        solve: Callable[[], MergedMap] | None = None,
+    ) -> None:
+        """Take a content. Nothing is worked out yet.
+
+        Args:
+            content: of the map file.
+            settings: see the class.
+            solve: gives the merged map; by default that of a file, as it was decided when it was written.
+        """
         self.content = content
         self.settings = settings or MergeSettings()
+        self._solve = solve
 
     def with_content(self, content: MapFile) -> MapReading:
         """Another content with the same measurements and pins: what follows from those is kept.
@@ -45,7 +57,7 @@ class MapReading:
         Args:
             content: of which no more differs than annotations without pins, images and poses.
         """
-        other = MapReading(content, self.settings)
+        other = MapReading(content, self.settings, self._solve)
         same = ("graph", "merged", "router", "relocalizer")
         vars(other).update({name: value for name, value in vars(self).items() if name in same})
         return other
@@ -94,6 +106,8 @@ class MapReading:
             InvalidFile: its measurements determine no poses.
         """
         need("server")
+        if self._solve is not None:
+            return self._solve()
         from mapweave.mapserver.map_files import merged_of
 
         return merged_of(self.content, self.settings)
