@@ -26,10 +26,13 @@ function ellipseOf(covariance) {
   return { major: Math.sqrt(middle + reach), minor: Math.sqrt(Math.max(middle - reach, 0)),
     angle: Math.atan2(2 * xy, xx - yy) / 2 };
 }
+// A robot that waits says for what.
+const doingOf = ({ doing, detail }) => doing.startsWith("waiting") && detail ? `${doing}: ${detail}` : doing;
 const life = robot => robot.before || robot.lost ? ["as last shown", "soft"] : !robot.alive ? ["gone", "bad"] : robot.age > QUIET ? ["silent", "warn"] : ["alive", "good"];
 function missionWords(mission, shares = true) {
   if (!mission) return "";
-  const { order, state, progress, reason } = mission, goal = order.goal || order.node || "";
+  const { order, state, progress, reason } = mission, { goal: written, node } = order;
+  const goal = written && node && written !== node ? `${written} (${node})` : written || node || "";
   const share = shares && state === "running" && progress ? ` ${percent(progress)}` : "", why = reason ? `: ${reason}` : "";
   return `${order.kind}${goal ? " to " + goal : ""}, ${state}${share}${why} (by ${order.by})`;
 }
@@ -38,7 +41,7 @@ export function listRobots(robots, select, none) {
     const [word, kind] = life(robot), status = robot.status, after = [made("span", ` ${word}`, kind)];
     if (robot.over_quota) after.push(made("span", ", over its quota", "bad"));
     if (robot.accusation) after.push(Object.assign(made("span", " not trusted", "bad"), { title: robot.accusation }));
-    const parts = [status?.status.doing, status?.battery != null ? `battery ${percent(status.battery)}` : "",
+    const parts = [status && doingOf(status.status), status?.battery != null ? `battery ${percent(status.battery)}` : "",
       robot.component < 0 ? "not on the map" : "", robot.place && `at ${robot.place}`, robot.floor && `floor ${robot.floor}`];
     return { text: robot.robot, act: () => select(robot.robot), after: [...after, " " + parts.filter(Boolean).join(", ")] };
   }));

@@ -9,12 +9,13 @@ from pathlib import Path
 
 import pytest
 
-from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
+from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
 from mapweave.hybridmap.annotation import Annotation, Annotations, Floor, Place
 from mapweave.hybridmap.errors import Busy, InvalidValue
 from mapweave.hybridmap.floor_plan import PlacedPlans
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
+from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, SimilarPlace, View
 from mapweave.mapserver.http.web import Web
@@ -512,3 +513,16 @@ def test_numbers_in_events_are_no_names_of_maps(page: Browser, services: StubSer
     eventually(lambda: words in page.run(text_of("history")))
     buttons = "return [...document.querySelectorAll('#history button')].map(one => one.textContent)"
     assert page.run(buttons) == ["r0.1.5", "r0.1", "b-2.1.7"]
+
+
+def test_who_a_robot_waits_for_and_where_it_is_sent_are_said(page: Browser, services: StubServices) -> None:
+    """Of a robot that waits the list said for no one, and of a goal with a name the panel said no node."""
+    doing = Status("waiting for another robot", "r1 drives there", 1, 8, Pose2(), False)
+    order = MissionOrder("m1", "r0", MissionKind.GO, 1, "anna", NodeId("r0", 1, 5), "kitchen")
+    mission = MissionReport(order, MissionState.RUNNING, 0.25)
+    said = AgentStatus(doing, 10**18, "r0", 1, mission=mission)
+    services.fleet = FleetStatus((RobotEntry("r0", True, 0.1, said), RobotEntry("r1", True)))
+    person = Person(page)
+    eventually(lambda: "r0 alive waiting for another robot: r1 drives there, not" in person.text("robots"))
+    page.run("document.querySelector('#robots button').click()")
+    eventually(lambda: "go to kitchen (r0.1.5), running 25" in person.text("selected"))
