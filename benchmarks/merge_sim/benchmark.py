@@ -16,13 +16,9 @@ can be looked at by itself with `mapweave sim run NAME --seed ...`.
 `merged_ate_m_median`: error of the merged map's nodes after one rigid alignment a component. `components`: of
 the merged map, median; `whole`: share of the runs that became one map. `false_merges`: pairs of maps that
 ended up joined wrongly (by more than 0.5 m or 15 degrees), of all runs; `false_links`: links that are off by
-as much. `link_recall`: of all pairs of nodes of different maps that truly share a view (each shows at least
-half of what the other one shows, by rays in the world), the share that a true link joins; null where no two
-maps share a view. Most of these pairs look at each other along a corridor, and its walls have no common
-features who sees them from the other end. So `link_recall_one_side` counts only what both see from directions
-within 45 degrees of each other, and `verified_one_side` which of these pairs are recognised when one asks for
-them: what lies between the two is what candidates and consistency cost. `place_recall` is the share of the
-chances to join a node's place to another map's that are taken (median). Each figure is an object by scenario.
+as much. `link_recall` is the share of the chances to join a node's place to another map's that are taken, as
+`mapweave sim run` has it (median); null where no two maps share a place. Each figure is an object by
+scenario.
 
 A run takes one to three minutes on a core of its own; 10 runs of all four scenarios on two cores 35 to 50
 minutes. A run that fails or is killed is reported, is under `failed`, and makes the exit status 1.
@@ -137,7 +133,7 @@ def outcome(name: str, seed: int, status: int, out: str, said: str) -> MergeRun 
 def figures(runs: Sequence[MergeRun]) -> dict[str, float | None]:
     """The figures of some runs of one scenario."""
     errors = [run.merged_ate_m for run in runs if run.merged_ate_m is not None]
-    chances = [run.place_recall for run in runs if run.place_recall is not None]
+    recalls = [run.link_recall for run in runs if run.link_recall is not None]
     return {
         "merged_ate_m_median": _median(errors),
         "merged_ate_m_worst": max(errors, default=None),
@@ -146,10 +142,7 @@ def figures(runs: Sequence[MergeRun]) -> dict[str, float | None]:
         "false_merges": sum(run.false_merges for run in runs) if runs else None,
         "links": sum(run.links for run in runs) if runs else None,
         "false_links": sum(run.false_links for run in runs) if runs else None,
-        "link_recall": _share([run.linked_views for run in runs], [run.shared_views for run in runs]),
-        "link_recall_one_side": _share([run.linked_one_side for run in runs], [run.one_side for run in runs]),
-        "verified_one_side": _share([run.verified_one_side for run in runs], [run.one_side for run in runs]),
-        "place_recall": _median(chances),
+        "link_recall": _median(recalls),
         "wall_s": _median([run.wall_s for run in runs]),
     }
 
@@ -235,10 +228,6 @@ def main() -> None:
 
 def _median(values: Sequence[float]) -> float | None:
     return statistics.median(values) if values else None
-
-
-def _share(parts: Sequence[int], wholes: Sequence[int]) -> float | None:
-    return sum(parts) / sum(wholes) if sum(wholes) else None
 
 
 def _arguments() -> argparse.Namespace:

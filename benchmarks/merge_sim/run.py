@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import math
 import sys
 import tempfile
 from collections.abc import Mapping, Sequence
@@ -19,24 +18,13 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.merge_sim.views import views_shared
-from mapweave.evaluation.map_score import FALSE_LINK, FALSE_LINK_TURN, align, is_false, pose_error
+from mapweave.evaluation.map_score import FALSE_LINK, FALSE_LINK_TURN, align, pose_error
 from mapweave.hybridmap.errors import MapweaveError
-from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.merge.pose_graph.links import Link
-from mapweave.merge.pose_graph.verification import verify
 from mapweave.scenarios.run import TrialOptions, run_trial
 from mapweave.scenarios.scenario import Scenario, load_scenario, scenario_path
 from mapweave.scenarios.score import node_truth
-from mapweave.sim.world import PanelSet
-
-VIEW = 0.5
-"""Two images share a view if each shows at least this share of what the other one shows."""
-SIDE = math.radians(45.0)
-"""What two images show from directions further apart than this, they do not show from one side."""
 
 
 @dataclass(frozen=True)
@@ -53,13 +41,7 @@ class MergeRun:
         links: between maps.
         false_links: of these, off by more than 0.5 m or 15 degrees.
         false_merges: pairs of maps in one component that stand to each other wrongly, by as much.
-        shared_views: pairs of nodes of different maps that truly share a view.
-        linked_views: of these, pairs that a true link joins.
-        one_side: pairs that share a view which both have from one side: what is counted lies within 45
-            degrees of the other's line of sight.
-        verified_one_side: of these, pairs that are truly recognised when one asks for them.
-        linked_one_side: of these, pairs that a true link joins.
-        place_recall: as `mapweave sim run` has it: share of the chances to join a node's place to another
+        link_recall: as `mapweave sim run` has it: share of the chances to join a node's place to another
             map's that are taken; None without any.
         sim_s: simulated time, s.
         wall_s: how long that took, s.
@@ -74,12 +56,7 @@ class MergeRun:
     links: int
     false_links: int
     false_merges: int
-    shared_views: int
-    linked_views: int
-    one_side: int
-    verified_one_side: int
-    linked_one_side: int
-    place_recall: float | None
+    link_recall: float | None
     sim_s: float
     wall_s: float
 
@@ -93,12 +70,6 @@ def run_one(scenario: Scenario, seed: int, out: Path) -> MergeRun:
     trial = run_trial(scenario, TrialOptions(seed, out, processes=False, film_every=0.0, quiet=True))
     recording, figures = trial.recording, trial.figures
     truth = node_truth(recording)
-    whole = HybridMap(recording.merged.changes)
-    links = [edge for edge in whole.edges.values() if edge.kind is EdgeKind.MERGED]
-    views = shared_views(scenario, seed, truth)
-    one_side = shared_views(scenario, seed, truth, SIDE)
-    found = [verify(whole.nodes[a], whole.nodes[b]) for a, b in sorted(sorted(pair) for pair in one_side)]
-    right = {frozenset((link.a, link.b)) for link in links if not is_false(link, truth)}
     return MergeRun(
         scenario=scenario.name,
         seed=seed,
@@ -112,37 +83,10 @@ def run_one(scenario: Scenario, seed: int, out: Path) -> MergeRun:
             {node: (component, pose.mean) for node, (component, pose) in recording.merged.poses.items()},
             truth,
         ),
-        shared_views=len(views),
-        linked_views=len(views & right),
-        one_side=len(one_side),
-        verified_one_side=sum(isinstance(one, Link) and not is_false(one.edge(), truth) for one in found),
-        linked_one_side=len(one_side & right),
-        place_recall=figures.link_recall,
+        link_recall=figures.link_recall,
         sim_s=figures.sim_s,
         wall_s=round(figures.wall_s, 1),
     )
-
-
-def shared_views(
-    scenario: Scenario,
-    seed: int,
-    truth: Mapping[NodeId, Pose2],
-    most_angle: float = math.pi,
-) -> set[frozenset[NodeId]]:
-    """Pairs of nodes of different maps whose images truly show the same surfaces.
-
-    Args:
-        scenario: that was tried; the furniture has stood still.
-        seed: of its world.
-        truth: `world_from_robot` of each node.
-        most_angle: rad, between the lines of sight to what counts as shared.
-    """
-    panels = PanelSet.of(scenario.world(seed).panels)
-    nodes = sorted(truth)
-    camera = scenario.robots[0].camera.intrinsics
-    both = views_shared(panels, camera, [truth[node] for node in nodes], VIEW, most_angle) >= VIEW
-    pairs = ((nodes[i], nodes[j]) for i, j in np.argwhere(np.triu(both, 1)))
-    return {frozenset(pair) for pair in pairs if pair[0].map != pair[1].map}
 
 
 def false_merges(poses: Mapping[NodeId, tuple[int, Pose2]], truth: Mapping[NodeId, Pose2]) -> int:
