@@ -18,8 +18,9 @@ from mapweave.hybridmap.errors import InvalidValue
 PAGE = Path(__file__).with_name("page.md")
 README_TABLE = Path(__file__).with_name("readme_table.md")
 FIELD = re.compile(r"\{([^{}:/]+/[^{}:]+)(?::([^{}]*))?\}")
-"""A figure; a format that ends in `k` or `m` shows thousands or thousandths."""
+"""A figure; a format that ends in `k` or `m` shows thousands or thousandths, `bytes` bytes in words."""
 SCALES = {"k": 1e-3, "m": 1e3}
+UNITS = {"TB": 1e12, "GB": 1e9, "MB": 1e6, "kB": 1e3}
 
 
 def filled(template: str, figures: Mapping[str, Any]) -> str:
@@ -41,10 +42,13 @@ def _shown(figures: Mapping[str, Any], path: str, form: str) -> str:
         if not isinstance(value, Mapping) or key not in value:
             raise InvalidValue(f"no figure {path}")
         value = value[key]
-    if value is None:
-        return "none"
+    if value is None or isinstance(value, str):
+        return value or "none"
     if isinstance(value, list):
         return ", ".join(map(str, value)) or "none"
+    if form == "bytes":
+        unit = next(unit for unit, size in UNITS.items() if value >= size)
+        return f"{value / UNITS[unit]:.3g} {unit}"
     if form[-1:] in SCALES:
         return format(value * SCALES[form[-1]], form[:-1] + "f")
     return format(value, form)

@@ -10,7 +10,7 @@ import pytest
 from benchmarks.figures import scale
 from benchmarks.figures.measurements import MEASUREMENTS
 from benchmarks.figures.results import StoredResult, load
-from benchmarks.figures.scale import Costs, ScalePlan, scale_page
+from benchmarks.figures.scale import costs_of, scale_page, site
 from benchmarks.fleet.drives import drive
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.change import Change, EdgePut
@@ -61,22 +61,22 @@ def test_bytes_are_those_of_today(tmp_path: Path) -> None:
 
 def test_the_sums_are_those_of_simulated_minutes(results: dict[str, StoredResult]) -> None:
     """One robot after the other, minute by minute, instead of by rates."""
-    costs = Costs.of(results)
-    plan = ScalePlan.of(costs)
+    costs = costs_of(results)
+    plan = site(costs)
     robots, minutes = scale.ROBOTS // scale.SITES, 60 * 24
     sent, nodes, answers = 0.0, 0, 0
     for robot in range(robots):
         maps = robot < robots * scale.MAPPING
         per_minute = 60 / scale.NODE_EVERY if maps else 0
-        sent += per_minute * (costs.node_bytes + scale.EDGE_BYTES + 2 * scale.FRAME_BYTES)
+        sent += per_minute * (costs["node_bytes"] + scale.EDGE_BYTES + 2 * scale.FRAME_BYTES)
         sent += 120 * (scale.STATUS_BYTES + scale.FRAME_BYTES) + scale.QUESTION_BYTES + scale.FRAME_BYTES
         nodes += int(per_minute) * minutes
         answers += minutes
-    assert plan.robot_bps == pytest.approx(sent / robots / 60)
-    assert plan.disk_day == pytest.approx(nodes * scale.DISK_BYTES)
-    assert plan.answer_cores == pytest.approx(answers * costs.answer_s / 86_400)
-    assert plan.compare_cores == pytest.approx(nodes * costs.compare_s / 86_400)
-    assert plan.memory > plan.nodes * costs.kept_bytes > 0
+    assert plan["robot_bps"] == pytest.approx(sent / robots / 60)
+    assert plan["disk_day"] == pytest.approx(nodes * scale.DISK_BYTES)
+    assert plan["answer_cores"] == pytest.approx(answers * costs["answer_s"] / 86_400)
+    assert plan["compare_cores"] == pytest.approx(nodes * costs["compare_s"] / 86_400)
+    assert plan["memory"] > plan["nodes"] * costs["kept_bytes"] > 0
 
 
 def test_a_server_carries_the_largest_fleet_that_is_in_time(results: dict[str, StoredResult]) -> None:
@@ -84,14 +84,14 @@ def test_a_server_carries_the_largest_fleet_that_is_in_time(results: dict[str, S
     figures = {
         "agents": {"50": row, "1000": {**row, "ack_p99_ms": 400.0}, "2000": {**row, "ack_p99_ms": 9e3}}
     }
-    costs = Costs.of({**results, "fleet": replace(results["life"], figures=figures)})
-    assert (costs.agents, costs.carried) == (2000, 1000)
-    assert costs.link_s == pytest.approx(0.6 / 2000)
+    costs = costs_of({**results, "fleet": replace(results["life"], figures=figures)})
+    assert (costs["agents"], costs["carried"]) == (2000, 1000)
+    assert costs["link_s"] == pytest.approx(0.6 / 2000)
     page = scale_page({**results, "fleet": replace(results["life"], figures=figures)})
     assert "| front servers | robots over that | 10 |" in page
     # A twentieth of 10 000 robots maps, a node every 10 s; of ten servers one compares all 50 a second.
-    assert f"| new nodes × comparing | {50 * costs.compare_s:.1f} |" in page
-    assert f"| new nodes × comparing | {20 * 50 * costs.compare_s:.0f} |" in page
+    assert f"| new nodes × comparing | {50 * costs['compare_s']:.1f} |" in page
+    assert f"| new nodes × comparing | {20 * 50 * costs['compare_s']:.0f} |" in page
     assert "| cores for merging, of the one that leads | share of a core | 0.4 |" in page
     late = {"agents": {"50": {**row, "ack_p99_ms": 501.0}}}
     page = scale_page({**results, "fleet": replace(results["life"], figures=late)})
