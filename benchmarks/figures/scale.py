@@ -68,10 +68,10 @@ def costs_of(results: Mapping[str, StoredResult]) -> Figures:
 
     Returns:
         Bytes: of a node on the wire, of a server's memory without maps (`base`), of a node in it (`kept`),
-        and of that in the place index. Processor, s: of a new node compared, of an answer, of a merge of 10 000
-        nodes behind five new ones, and of the server a second and robot (`link`). Nodes per m^2 that an
-        exploring robot makes; `growth`, active nodes after six drives over those of the first. `agents` with
-        which the link was measured; `carried`, the largest fleet that is in time, 0 if none is.
+        and of that in the place index. Processor, s: of a new node compared, of an answer, of a merge of
+        10 000 nodes behind five new ones, and of the server a second and robot (`link`). Nodes per m^2 that
+        an exploring robot makes; `growth`, active nodes after six drives over those of the first. `agents`
+        with which the link was measured; `carried`, the largest fleet that is in time, 0 if none is.
     """
     merge, answers = results["merge_scale"].figures["scale"], results["relocalize"].figures
     explored = results["explore"].figures
