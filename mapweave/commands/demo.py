@@ -50,7 +50,7 @@ def run(arguments: argparse.Namespace) -> int:
             raise UsageError(f"--{option} {count}: the demo needs {least} to {most}")
     report = run_demo(TrialOptions(arguments.seed, arguments.out), arguments.robots, arguments.rooms)
     if arguments.json:
-        print(json.dumps(report.as_dict()))
+        print(json.dumps(report))
     else:
         console = plain_or_terminal(stderr=False)
         console.print(summary_table(report))
@@ -58,4 +58,4 @@ def run(arguments: argparse.Namespace) -> int:
             f"in {arguments.out}: map.png, film.webm, report.md, report.json, merged.mapweave, "
             "and a map file of each robot"
         )
-    return DONE if report.goal.reached else NO
+    return DONE if report["goal"]["reached"] else NO
