@@ -1,6 +1,6 @@
 """What a node's landmarks cost on the wire, and how many matches they keep, beside other ways to keep a view.
 
-    python -m benchmarks.landmarks [--images DIR] [--pairs N] [--places N] [--seed N] [--out DIR] [--json]
+    python -m benchmarks.landmarks [--images DIR] [--pairs N] [--places N] [--seed N] [--json]
 
 Pairs of views of the same thing: of a folder of photographs of one scene (a match is right if it agrees with
 the others on one fundamental matrix), or, without one, images that no table was trained on under known warps,
@@ -37,7 +37,7 @@ from rich.progress import track
 from rich.table import Table
 
 from benchmarks.command_line import command_line
-from benchmarks.landmarks.curve import LABELS, draw, recall_curve
+from benchmarks.landmarks.curve import LABELS, recall_curve
 from benchmarks.landmarks.pairs import Pair, folder_pairs, known_pairs
 from benchmarks.landmarks.rivals import MOST, Packed, features, keep_all, matched, pack
 from mapweave.hybridmap.errors import InvalidFile
@@ -148,8 +148,6 @@ def run(arguments: argparse.Namespace, console: Console) -> dict[str, Any]:
     }
     if arguments.places:
         result["recall"] = recall_curve(arguments.seed, arguments.places, console)
-        if arguments.out is not None:
-            console.print(f"wrote {draw(result['recall'], arguments.seed, arguments.out)}")
     return result
 
 
@@ -192,8 +190,7 @@ def main() -> None:
     parser = command_line("landmarks", __doc__, "changes pairs and places", whole=True)
     parser.add_argument("--images", type=Path, metavar="DIR", help="photographs of one scene")
     parser.add_argument("--pairs", type=int, default=60, help="of views, at most (default 60)")
-    parser.add_argument("--places", type=int, default=40, help="simulated, for the curve (default 40)")
-    parser.add_argument("--out", type=Path, metavar="DIR", help="folder for the picture of the curve")
+    parser.add_argument("--places", type=int, default=40, help="simulated, for the recall (default 40)")
     arguments = parser.parse_args()
     if arguments.pairs < 2 or arguments.places < 0:
         parser.error("at least 2 pairs, 0 places and seed 0 are needed")

@@ -6,7 +6,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +21,7 @@ from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.hybridmap.query import View
 from mapweave.registration.recognition import Recognition, examine_view
-from mapweave.registration.selection import FIXED_BYTES, SelectionSettings, choose, worth
+from mapweave.registration.selection import SelectionSettings, choose, worth
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 
@@ -36,11 +35,7 @@ AGAIN_PX = 2.5
 EPISODE = (Pose2(0.25, 0.0, 0.03), Pose2(-0.2, 0.0, -0.04), Pose2(0.1, 0.0, 0.08))
 """Where a robot that maps has looked from besides, seen from the node."""
 
-BYTES_BEFORE = 23
-"""A landmark's in the first version: 16 of the descriptor, 7 of the rest."""
-
-LABELS = {"chosen": "chosen", "strongest": "the strongest", "before": "the strongest, 23 bytes each"}
-COLOURS = {"chosen": "#d35400", "strongest": "#1f77b4", "before": "#999999"}
+LABELS = {"chosen": "chosen", "strongest": "the strongest"}
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,10 +73,7 @@ def recall_curve(seed: int, places: int, console: Console) -> dict[str, dict[str
 
 
 def _kept(site: MappedSite, way: str, budget: int) -> NDArray[np.int64]:
-    settings = SelectionSettings(budget)
-    if way == "before":
-        return np.arange(min(len(site.every), (budget - FIXED_BYTES) // BYTES_BEFORE))
-    chosen = choose(site.every, site.likely, site.camera, settings)
+    chosen = choose(site.every, site.likely, site.camera, SelectionSettings(budget))
     # As many landmarks, which cost as much.
     return chosen if way == "chosen" else np.arange(len(chosen))
 
@@ -140,27 +132,3 @@ def _view(place: SimulatedPlace, sift: Sift, rng: np.random.Generator) -> tuple[
     features = sift.extract(place.picture(at))
     pixels = place.undistorted(features.raw).astype(np.float32)
     return View(pixels, features.codes, place.camera), at
-
-
-def draw(curve: dict[str, dict[str, float]], seed: int, out: Path) -> Path:
-    """Write a PNG into a folder, which is made; returns its path."""
-    # It takes long to import, which tests that draw nothing do not wait for.
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(6.0, 4.0), dpi=110, layout="constrained")
-    FigureCanvasAgg(figure)
-    axes = figure.subplots()
-    for way, by_budget in curve.items():
-        axes.plot([int(b) for b in by_budget], list(by_budget.values()), "o-", color=COLOURS[way],
-                  label=LABELS[way], markersize=4)  # fmt: skip
-    axes.set_xlabel("a node may cost, bytes on the wire")
-    axes.set_ylabel("views recognised where they are")
-    axes.set_ylim(0.0, 1.0)
-    axes.grid(color="#eeeeee")
-    axes.legend(loc="lower right", frameon=False, title="landmarks kept")
-    axes.set_title(f"simulated places, seed {seed}")
-    out.mkdir(parents=True, exist_ok=True)
-    path = out / f"landmarks-{seed}.png"
-    figure.savefig(path)
-    return path
