@@ -97,7 +97,9 @@ sbom: $(AUDIT)/.installed
 
 # Known vulnerabilities of these versions, by the advisories of PyPI. One that cannot be looked up is an error.
 audit: $(AUDIT)/.installed
-	$(AUDIT)/bin/pip-audit --strict --no-deps --disable-pip -r constraints.txt
+	@$(AUDIT)/bin/pip-audit --strict --no-deps --disable-pip --progress-spinner off -r constraints.txt \
+	  > $(AUDIT)/found 2> $(AUDIT)/said && echo "no known vulnerabilities" || { cat $(AUDIT)/found; test -s $(AUDIT)/found || \
+	  echo "the advisories of PyPI cannot be looked up: $$(tail -n 1 $(AUDIT)/said | cut -c 1-200)"; exit 1; }
 
 bench: setup
 	@for b in $$(dirname benchmarks/*/__main__.py); do \

@@ -1,4 +1,4 @@
-"""`make setup` where something is missing, with scripts in the place of Python and pip."""
+"""`make setup` and `make audit` where something is missing, with scripts in the place of Python and tools."""
 
 from __future__ import annotations
 
@@ -43,12 +43,16 @@ def checkout(tmp_path: Path) -> Path:
     return tmp_path
 
 
+def _environment() -> dict[str, str]:
+    """That of this process without what another make has put there."""
+    return {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
+
+
 def setup(checkout: Path) -> tuple[int, str]:
     """Exit status and output."""
-    environment = {name: value for name, value in os.environ.items() if not name.startswith("MAKE")}
     ran = subprocess.run(
         ["make", "setup", f"PYTHON={checkout / 'python'}"],
-        cwd=checkout, env=environment, capture_output=True, text=True, timeout=60, check=False,
+        cwd=checkout, env=_environment(), capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     return ran.returncode, ran.stdout + ran.stderr
 
@@ -91,3 +95,37 @@ def test_what_was_skipped_is_said_in_one_line_for_each_reason() -> None:
     (line,) = (line for line in ran.stdout.splitlines() if line.startswith("skipped "))
     count = sum((MAKEFILE.parent / name).read_text(encoding="utf-8").count("\ndef test_") for name in tests)
     assert line == f"skipped {count}: needs chromium and chromedriver on the PATH"
+
+
+@pytest.mark.parametrize(
+    ("status", "found", "said", "words"),
+    [
+        (0, "", "No known vulnerabilities found", "no known vulnerabilities"),
+        (1, "anyio 4.16.0 PYSEC-1", "Found 1 known vulnerability", "anyio 4.16.0 PYSEC-1"),
+        (
+            1,
+            "",
+            "Traceback:\n  a step\nProxyError: refused",
+            "cannot be looked up: ProxyError: refused",
+        ),
+    ],
+    ids=["nothing", "found", "no-network"],
+)
+def test_an_audit_says_in_one_line_what_it_has_found_or_why_it_cannot(
+    tmp_path: Path, status: int, found: str, said: str, words: str
+) -> None:
+    """Without its service it printed fifty lines."""
+    for name in ("pyproject.toml", "constraints.txt", "stamp", "audit/bin/pip-audit", "audit/.installed"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).touch()
+    tool = tmp_path / "audit" / "bin" / "pip-audit"
+    (tmp_path / "audit" / "words").write_text(said)
+    tool.write_text(f"#!/bin/sh\nprintf %s '{found}'\ncat audit/words >&2\nexit {status}\n")
+    tool.chmod(0o755)
+    ran = subprocess.run(
+        ["make", "-f", MAKEFILE, "-s", "audit", "STAMP=stamp", "AUDIT=audit"],
+        cwd=tmp_path, env=_environment(), capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert ran.returncode == (2 if status else 0)
+    assert words in ran.stdout and len(ran.stdout.splitlines()) == 1
+    assert "Traceback" not in ran.stderr
