@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import replace
 from functools import partial
-from itertools import count
 from multiprocessing import get_context
 from pathlib import Path
 
@@ -20,15 +19,15 @@ import numpy as np
 
 from benchmarks.relocalize.distractors import Distractors
 from benchmarks.relocalize.places import TruePlace
-from mapweave.hybridmap.change import Change, ChangeBody, EdgePut, NodePut
+from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import snap
 from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
-from mapweave.mapserver.log.store import Store
 from mapweave.wire.codec import encode_change
+from synthetic.maps import fill_store, numbered
 
 ROBOT_NODES = 500
 """Nodes of each robot that is made up."""
@@ -57,7 +56,7 @@ def fill(
     store = SqliteStore(path)
     for number in sorted({place.site for place in places}):
         here = [place for place in places if place.site == number]
-        _keep(store, MapId(f"m{number}", 1), _surveyed([place.node for place in here]))
+        fill_store(store, {MapId(f"m{number}", 1): _surveyed([place.node for place in here])})
         progress(len(here))
     left = max(total - len(places), 0)
     robots = [range(k, min(k + ROBOT_NODES, left)) for k in range(0, left, ROBOT_NODES)]
@@ -71,14 +70,6 @@ def fill(
     store.close()
 
 
-def _keep(store: Store, map_id: MapId, bodies: Iterator[ChangeBody]) -> None:
-    entries = [
-        ReceivedChange.read(map_id, k, encode_change(Change(map_id, k, 0, body)))
-        for k, body in zip(count(1), bodies, strict=False)
-    ]
-    store.apply(map_id, 1, entries)
-
-
 def _robot(distractors: Distractors, numbers: range) -> list[bytes]:
     """The log of one robot that is made up: nodes along a way, and the way."""
     map_id = MapId(f"d{numbers.start // ROBOT_NODES}", 1)
@@ -90,8 +81,7 @@ def _robot(distractors: Distractors, numbers: range) -> list[bytes]:
         landmarks = snap(node.landmarks, node.camera)
         nodes.append(replace(node, id=NodeId(*map_id, k + 1), map_from_robot=pose, landmarks=landmarks))
         at = at @ Pose2(STEP, 0.0, float(rng.uniform(-TURN, TURN)))
-    bodies = enumerate(_surveyed(nodes), 1)
-    return [encode_change(Change(map_id, k, 0, body)) for k, body in bodies]
+    return [encode_change(change) for change in numbered(map_id, _surveyed(nodes))]
 
 
 def _surveyed(nodes: Sequence[Node]) -> Iterator[ChangeBody]:

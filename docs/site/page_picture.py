@@ -21,20 +21,17 @@ from PIL import Image
 from PIL.PngImagePlugin import PngInfo
 
 from docs.floor_plan import looks_the_same, plan_of, to_pixels
-from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.ids import NodeId
 from mapweave.mapserver.http import pages
 from mapweave.mapserver.http.last_shown import read_shown
 from mapweave.mapserver.http.web import Web
-from mapweave.mapserver.log.entry import ReceivedChange
-from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.server import MapServer
 from mapweave.recorded_fleet.fleet import prepare, replayed_robots
 from mapweave.recorded_fleet.recording import DEMO_PAGE
-from mapweave.wire.codec import encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from synthetic.building import Building
+from synthetic.maps import write_store
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.waiting import eventually
 
@@ -68,16 +65,11 @@ MERGED = 240.0
 @contextmanager
 def page_of(building: Building, folder: Path) -> Iterator[Browser]:
     """The page of a server with the robots' maps."""
-    store = SqliteStore(folder / "s0.sqlite")
+    logs = {}
     for robot in range(building.robots):
         log = list(building.log(robot))
-        map_id = log[0][0]
-        entries = [
-            ReceivedChange.read(map_id, k, encode_change(Change(map_id, k, 0, body)))
-            for k, (_, body) in enumerate(log, 1)
-        ]
-        store.apply(map_id, 7, entries, len(entries))
-    store.close()
+        logs[log[0][0]] = [body for _, body in log]
+    write_store(folder / "s0.sqlite", logs)
     hub = MemoryHub()
     with MapServer(MemoryBus(hub), Keys("docs"), folder / "s0.sqlite", "s0") as server:
         assert server.settle(MERGED), "the map is merged"
