@@ -15,7 +15,7 @@ import pytest
 import zenoh
 
 from mapweave.hybridmap.errors import NotConnected
-from mapweave.wire import zenoh_bus
+from mapweave.wire import zenoh_bus, zenoh_config
 from mapweave.wire.bus import Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.zenoh_bus import ZenohBus
@@ -228,6 +228,20 @@ def test_a_router_drops_what_is_too_large(router_fleet: ZenohFleet) -> None:
     eventually(lambda: fleet.router.ask("mapweave/log", b"1000", 5.0))
     assert len(fleet.router.ask("mapweave/log", str(2**24).encode(), 10.0)[0].payload) == 2**24
     assert fleet.router.ask("mapweave/log", str(2**25 + 1).encode(), 1.0) == []
+
+
+def test_a_router_puts_no_message_together_that_is_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
+    """What it drops for its kind it has first put together of its fragments, whatever they came to."""
+    monkeypatch.setattr(zenoh_config, "LARGEST_MESSAGE", 2**19)
+    fleet = ZenohFleet()
+    try:
+        client = fleet.join()
+        fleet.router.serve("mapweave/size", lambda request: request.reply(b"%d" % len(request.payload)))
+        eventually(lambda: client.ask("mapweave/size", bytes(2**18), 5.0))
+        assert client.ask("mapweave/size", bytes(zenoh_config.LARGEST["query"] - 1024), 1.0) == []
+        eventually(lambda: client.ask("mapweave/size", bytes(2**18), 5.0))
+    finally:
+        fleet.close()
 
 
 FROZEN = """
