@@ -50,13 +50,7 @@ def add_to(commands: Any) -> None:
     relocalize.add_argument(
         "--robot", metavar="NAME", help="with --map: one of the robots in the recording's splits.toml asks"
     )
-    relocalize.add_argument(
-        "-o", "--out", type=Path, metavar="DIR", help="write each answer to a table there"
-    )
-    relocalize.add_argument("--json", action="store_true", help="print one JSON object at the end")
-    relocalize.add_argument(
-        "--settings", type=Path, metavar="FILE", help="TOML with settings of the pipeline"
-    )
+    _add_output(relocalize, "write each answer to a table there")
     relocalize.set_defaults(run=run)
     merge: argparse.ArgumentParser = kinds.add_parser(
         "merge",
@@ -72,17 +66,7 @@ def add_to(commands: Any) -> None:
         "--robots", type=values.count, metavar="N",
         help="cut it into N consecutive pieces instead, which overlap by 30 %% (even images, odd images)",
     )  # fmt: skip
-    merge.add_argument(
-        "-o",
-        "--out",
-        type=Path,
-        metavar="DIR",
-        help="map, links and picture (default: out/eval-merge/FOLDER)",
-    )
-    merge.add_argument("--json", action="store_true", help="print one JSON object at the end")
-    merge.add_argument(
-        "--settings", type=Path, metavar="FILE", help="TOML with settings of the pipeline and the merge"
-    )
+    _add_output(merge, "map, links and picture (default: out/eval-merge/FOLDER)", " and the merge")
     merge.set_defaults(run=run_merge)
     replay: argparse.ArgumentParser = kinds.add_parser(
         "replay",
@@ -100,10 +84,17 @@ def add_to(commands: Any) -> None:
         help="truth.csv, or poses as TUM has them (default: truth.csv beside it)",
     )
     replay.add_argument("--robot", metavar="NAME", help="one of the robots in the recording's splits.toml")
-    replay.add_argument("-o", "--out", type=Path, metavar="DIR", help="default: out/eval-replay/RECORDING")
-    replay.add_argument("--json", action="store_true", help="print one JSON object at the end")
-    replay.add_argument("--settings", type=Path, metavar="FILE", help="TOML with settings of the pipeline")
+    _add_output(replay, "default: out/eval-replay/RECORDING")
     replay.set_defaults(run=run_replay)
+
+
+def _add_output(parser: argparse.ArgumentParser, out: str, also: str = "") -> None:
+    """Declare what is written and printed, and the settings."""
+    parser.add_argument("-o", "--out", type=Path, metavar="DIR", help=out)
+    parser.add_argument("--json", action="store_true", help="print one JSON object at the end")
+    parser.add_argument(
+        "--settings", type=Path, metavar="FILE", help=f"TOML with settings of the pipeline{also}"
+    )
 
 
 def run_replay(arguments: argparse.Namespace) -> int:
