@@ -236,10 +236,8 @@ def test_visible_words_are_part_of_the_names_that_are_spoken(page: Browser) -> N
     assert differing == []
 
 
-@pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_all_words_have_contrast_as_they_are_shown(page: Browser, scheme: str) -> None:
+def test_all_words_have_contrast_as_they_are_shown(page: Browser) -> None:
     """By the computed styles. The hints in fields had 4.3 to 1 in the light theme, 3.9 in the dark one."""
-    page.look(1280, 800, scheme)
     low = {}
     for panel in ("fleet", "selected", "why", "events", "edit", "photo"):
         page.run(
@@ -247,7 +245,9 @@ def test_all_words_have_contrast_as_they_are_shown(page: Browser, scheme: str) -
             if panel == "selected"
             else f"document.getElementById('tab-{panel}').click()"
         )
-        low[panel] = page.run(CONTRASTS)
+        for scheme in ("light", "dark"):
+            page.look(1280, 800, scheme)
+            low[f"{panel}, {scheme}"] = page.run(CONTRASTS)
     assert not any(low.values()), json.dumps(low)
 
 
@@ -271,17 +271,17 @@ def test_the_open_tab_is_marked_in_colours_of_the_system(page: Browser) -> None:
     assert opacities and set(opacities) == {"1"}
 
 
-@pytest.mark.parametrize(("width", "height"), [(320, 256), (667, 375)])
-def test_a_small_or_enlarged_page_scrolls_one_way(page: Browser, width: int, height: int) -> None:
+def test_a_small_or_enlarged_page_scrolls_one_way(page: Browser) -> None:
     """1280x1024 px at 400 %, and a small phone on its side: the panel was 34 px high."""
-    page.look(width, height, mobile=True)
     page.run("document.querySelector('#robots button').click()")
-    wide, panel, of_panel, drawn = page.run("""
-        const panel = document.getElementById("selected"), { canvas } = mapweave.painter;
-        return [document.documentElement.scrollWidth, panel.clientHeight, panel.scrollHeight,
-          canvas.getBoundingClientRect().height]
-    """)
-    assert wide == width
-    assert panel >= of_panel and panel > 0.5 * height, "all of it is reached by scrolling the page"
-    assert drawn > 0.5 * height
-    eventually(lambda: math.isclose(drawn, page.run("return mapweave.viewport.height"), abs_tol=1.0))
+    for width, height in ((320, 256), (667, 375)):
+        page.look(width, height, mobile=True)
+        wide, panel, of_panel, drawn = page.run("""
+            const panel = document.getElementById("selected"), { canvas } = mapweave.painter;
+            return [document.documentElement.scrollWidth, panel.clientHeight, panel.scrollHeight,
+              canvas.getBoundingClientRect().height]
+        """)
+        assert wide == width
+        assert panel >= of_panel and panel > 0.5 * height, "all of it is reached by scrolling the page"
+        assert drawn > 0.5 * height
+        eventually(lambda d=drawn: math.isclose(d, page.run("return mapweave.viewport.height"), abs_tol=1.0))
