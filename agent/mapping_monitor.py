@@ -116,7 +116,7 @@ class MappingMonitor:
         """Why there are no nodes."""
         if status.mission == "idle":
             return "the mission is idle: nothing is mapped; `--mission explore` or `carried` maps"
-        return self._fault or f"{status.doing}: {status.detail}".rstrip(": ")
+        return self._fault or status.words
 
     def _remember(self, observation: Observation) -> None:
         odometry, command, image = observation.odometry, self._command, observation.image

@@ -28,6 +28,10 @@ RAYS = 48
 """Rays of a full turn."""
 
 
+FREE, OCCUPIED, UNKNOWN = 0, 100, -1
+"""Cells, as in nav_msgs/msg/OccupancyGrid."""
+
+
 class GridCells(NamedTuple):
     """An occupancy grid as it was at one time.
 
@@ -42,6 +46,13 @@ class GridCells(NamedTuple):
     decided: float
     corner: Array
     side: float
+
+    @property
+    def occupancy(self) -> NDArray[np.int8]:
+        """(N, N) OCCUPIED, FREE or UNKNOWN."""
+        free_or_not = np.where(self.odds < -self.decided, FREE, UNKNOWN)
+        cells = np.where(self.odds > self.decided, OCCUPIED, free_or_not)
+        return cells.astype(np.int8)
 
 
 class OccupancyGrid:

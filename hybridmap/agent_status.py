@@ -87,6 +87,11 @@ class Status:
     portal: PortalWait | None = None
     covariance: tuple[Amount, float, Amount, Amount] = (0.0, 0.0, 0.0, 0.0)
 
+    @property
+    def words(self) -> str:
+        """What the pipeline is doing, and why or how far."""
+        return f"{self.doing}: {self.detail}" if self.detail else self.doing
+
 
 @dataclass(frozen=True)
 class HandDrive:

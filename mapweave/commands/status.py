@@ -244,7 +244,7 @@ def cells(robot: RobotEntry, plan: PlacedPlan | None = None) -> tuple[str, ...]:
     return (
         robot.robot,
         mission,
-        f"{doing.doing}: {doing.detail}" if doing.detail else doing.doing,
+        doing.words,
         _place(robot, plan),
         _newest(robot),
         _links(robot),

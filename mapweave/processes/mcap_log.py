@@ -11,13 +11,11 @@
 
 from __future__ import annotations
 
-import math
 from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
-import numpy as np
 
 from mapweave.agent.occupancy_grid import GridCells
 from mapweave.agent.recordings.mcap_writer import McapTopics, check_new
@@ -32,8 +30,6 @@ from mapweave.wire.ros2.messages import make
 
 POINTS, TRACK_PX = 1, 4.0
 """Of foxglove_msgs/msg/PointsAnnotation: type, and size of a point."""
-UNKNOWN, FREE, OCCUPIED = -1, 0, 100
-"""Cells of nav_msgs/msg/OccupancyGrid."""
 
 
 class McapLog(TickLog):
@@ -83,18 +79,12 @@ class McapLog(TickLog):
             ellipsoids(moment.landmarks, moment.covariances),
         )
         send("/landmarks", markers)
-        if len(moment.bearings):
-            for side, sign, outermost in (
-                ("left", 1, moment.bearings.max()),
-                ("right", -1, moment.bearings.min()),
-            ):
-                send(f"/bearings/outermost_{side}", _number(math.degrees(outermost)))
-                send(f"/bearings/limit_{side}", _number(sign * math.degrees(moment.camera.semi_aperture)))
+        for curve, degrees in moment.bearing_curves.items():
+            send(f"/bearings/{curve}", _number(degrees))
         if moment.floor is not None:
             send("/floor", _floor(moment.floor, moment.stamp_ns))
         status = moment.status
-        doing = f"{status.doing}: {status.detail}" if status.detail else status.doing
-        send("/status", make("std_msgs/msg/String", data=f"{status.mission}; {doing}"))
+        send("/status", make("std_msgs/msg/String", data=f"{status.mission}; {status.words}"))
 
     def _end(self, ended: bool) -> str:
         if not ended:
@@ -155,15 +145,13 @@ def _number(value: float) -> Any:
 
 def _floor(cells: GridCells, stamp_ns: int) -> Any:
     """Rows of the message are along y of the map, columns along x."""
-    seen = np.where(
-        cells.odds > cells.decided, OCCUPIED, np.where(cells.odds < -cells.decided, FREE, UNKNOWN)
-    )
+    seen = cells.occupancy
     x, y = cells.corner.tolist()
     info = make(
         "nav_msgs/msg/MapMetaData", map_load_time=making.header(stamp_ns, MAP).stamp,
         resolution=cells.side, width=seen.shape[0], height=seen.shape[1],
         origin=making.pose(Pose2(x, y)),
     )  # fmt: skip
-    data = seen.T.astype(np.int8).ravel()
+    data = seen.T.ravel()
     head = making.header(stamp_ns, MAP)
     return make("nav_msgs/msg/OccupancyGrid", header=head, info=info, data=data)

@@ -15,7 +15,6 @@ Below the robot's name, on the time line `stamp`:
 
 from __future__ import annotations
 
-import math
 import socket
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -50,8 +49,6 @@ IMAGE_AT = 0.5
 """m before the camera, where its image hangs: farther away it hides the map."""
 SIDES, LIMIT = {"left": [60, 150, 230], "right": [50, 170, 90]}, [200, 60, 60]
 """Colours of the outermost bearings, and of their limits."""
-FREE, UNKNOWN, OCCUPIED = 0, 255, 100
-"""Cells of the floor, as in an OccupancyGrid of ROS, where -1 is unknown."""
 
 
 class RerunLog(TickLog):
@@ -128,12 +125,8 @@ class RerunLog(TickLog):
         if moment.image is not None:
             self._log(path, rr.Image(moment.image).compress(jpeg_quality=QUALITY))
         self._log(f"{path}/tracks", rr.Points2D(moment.tracks_px, radii=2.0, colors=[60, 220, 90]))
-        if len(moment.bearings):
-            for side, sign in (("left", 1.0), ("right", -1.0)):
-                limit = rr.Scalars(sign * math.degrees(camera.semi_aperture))
-                outermost = moment.bearings.max() if sign > 0.0 else moment.bearings.min()
-                self._log(f"bearings/outermost_{side}", rr.Scalars(math.degrees(outermost)))
-                self._log(f"bearings/limit_{side}", limit)
+        for curve, degrees in moment.bearing_curves.items():
+            self._log(f"bearings/{curve}", rr.Scalars(degrees))
 
     def _write_pose(self, moment: LoggedTick) -> None:
         self._log("map/robot/landmarks", rr.Points3D(moment.landmarks, radii=0.01, colors=[240, 160, 40]))
@@ -165,11 +158,10 @@ class RerunLog(TickLog):
 
     def _write_words(self, moment: LoggedTick) -> None:
         status = moment.status
-        now = f"{status.doing}: {status.detail}" if status.detail else status.doing
-        self._log("now", rr.TextDocument(f"mission: {status.mission}\n\n{now}"))
+        self._log("now", rr.TextDocument(f"mission: {status.mission}\n\n{status.words}"))
         if status.doing != self._words:
             self._words = status.doing
-            self._log("status", rr.TextLog(now))
+            self._log("status", rr.TextLog(status.words))
 
 
 def _ellipsoids(points: Array, covariances: Array) -> rr.Ellipsoids3D:
@@ -192,10 +184,7 @@ def _edges(places: dict[NodeId, Array], edges: tuple[Edge, ...]) -> rr.LineStrip
 
 def _floor(cells: GridCells) -> rr.GridMap:
     """Rows of the image are along -y of the map, columns along x."""
-    grey = np.where(
-        cells.odds > cells.decided, OCCUPIED, np.where(cells.odds < -cells.decided, FREE, UNKNOWN)
-    )
-    image = np.ascontiguousarray(grey.T[::-1].astype(np.uint8))
+    image = np.ascontiguousarray(cells.occupancy.T[::-1].astype(np.uint8))  # unknown becomes 255
     form = rr.components.ImageFormat(
         width=image.shape[1], height=image.shape[0], color_model="L", channel_datatype="U8"
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import math
 import queue
 import threading
 from abc import ABC, abstractmethod
@@ -76,6 +77,19 @@ class LoggedTick:
     command: Command
     map: tuple[tuple[Node, ...], tuple[Edge, ...]] | None
     floor: GridCells | None
+
+    @property
+    def bearing_curves(self) -> dict[str, float]:
+        """The outermost bearings of the tracks and the limit of the field of view, degrees; empty without
+        tracks.
+        """
+        if not len(self.bearings):
+            return {}
+        limit = math.degrees(self.camera.semi_aperture)
+        left, right = math.degrees(self.bearings.max()), math.degrees(self.bearings.min())
+        return {
+            "outermost_left": left, "limit_left": limit, "outermost_right": right, "limit_right": -limit,
+        }  # fmt: skip
 
 
 class TickLog(ABC):

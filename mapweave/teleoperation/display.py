@@ -27,9 +27,7 @@ def lines(name: str, report: AgentStatus, command: Command, silence: float, usag
         where = "not localized on its map"
     elif not status.nodes:
         where = f"no map yet  {where}"
-    doing = f"{status.doing}: {status.detail}" if status.detail else status.doing
-    if silence:
-        doing = f"no answer for {silence:.1f} s: the robot stands"
+    doing = f"no answer for {silence:.1f} s: the robot stands" if silence else status.words
     return [
         f"{name}  map {name}.{report.epoch}  {status.nodes} nodes  {status.mission}  {where}",
         doing,

@@ -11,7 +11,7 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from mapweave.agent.occupancy_grid import OccupancyGrid
+from mapweave.agent.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.settings import AgentSettings
@@ -22,7 +22,7 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.markers import SPHERE, landmark_markers
-from mapweave.processes.mcap_log import FREE, OCCUPIED, McapLog, _floor
+from mapweave.processes.mcap_log import McapLog, _floor
 from mapweave.processes.tick_log import ellipsoids
 from mapweave.scenarios.fleet import TrialStage
 from mapweave.scenarios.process_fleet import ProcessFleet

@@ -17,7 +17,7 @@ from scipy.spatial.transform import Rotation
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from mapweave.agent.occupancy_grid import OccupancyGrid
+from mapweave.agent.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.cli import main
@@ -117,7 +117,7 @@ def test_a_replay_is_read_back_as_it_was(
 def test_ellipsoids_have_the_covariance_and_the_floor_lies_where_it_was_seen() -> None:
     from rerun.components import Colormap
 
-    from mapweave.processes.rerun_log import FREE, OCCUPIED, _ellipsoids, _floor
+    from mapweave.processes.rerun_log import _ellipsoids, _floor
 
     rng = np.random.default_rng(3)
     roots = rng.normal(0, 0.2, (6, 3, 3))
