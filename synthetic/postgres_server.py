@@ -39,7 +39,7 @@ class PostgresServer:
         folder: Path,
         *options: str,
         primary: PostgresServer | None = None,
-        template: PostgresServer | None = None,
+        template: Path | None = None,
     ) -> None:
         """Make a cluster and start it.
 
@@ -47,7 +47,7 @@ class PostgresServer:
             folder: for all it has; short, since a socket's path is.
             options: for `postgres`.
             primary: of which it is a standby, named `standby`.
-            template: a stopped server whose cluster is copied, which is faster than to make one.
+            template: the `data` of a stopped server, which is copied: that is faster than to make a cluster.
         """
         self.folder, self.data, self._options = folder, folder / "data", options
         self._count = 0
@@ -59,8 +59,8 @@ class PostgresServer:
         if self.user:
             os.chown(folder, pwd.getpwnam(name).pw_uid, pwd.getpwnam(name).pw_gid)
         if template is not None:
-            assert template.process.poll() is not None, "files of a running server are no copy"
-            subprocess.run(["cp", "-a", template.data, self.data], user=self.user, check=True, timeout=120)
+            assert not (template / "postmaster.pid").exists(), "files of a running server are no copy"
+            subprocess.run(["cp", "-a", template, self.data], user=self.user, check=True, timeout=120)
         elif primary is None:
             self.run(
                 "initdb", "-D", str(self.data), "-U", ROLE, "--auth=trust", "--no-sync", "--data-checksums",

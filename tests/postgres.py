@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import fcntl
+import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from functools import cache
 from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 
 from synthetic.postgres_server import PostgresServer, binaries
+
+TEMPLATE = "MAPWEAVE_TEST_POSTGRES"
+"""Names the folder of the cluster that others are copies of, to all processes of a run."""
 
 
 def started(*options: str) -> Iterator[PostgresServer]:
@@ -50,18 +54,25 @@ def address(postgres: PostgresServer) -> str:
     return postgres.database()
 
 
-def pytest_unconfigure() -> None:
-    """Remove the cluster that the others are copies of."""
-    if _template.cache_info().currsize:
-        shutil.rmtree(_template().folder, ignore_errors=True)
+def pytest_configure(config: pytest.Config) -> None:
+    if not hasattr(config, "workerinput"):
+        os.environ[TEMPLATE] = str(_folder())
 
 
-@cache
-def _template() -> PostgresServer:
-    """A stopped server, as it is when it is new: to make its cluster costs a second of processor time."""
-    server = PostgresServer(_folder())
-    server.stop()
-    return server
+def pytest_unconfigure(config: pytest.Config) -> None:
+    if not hasattr(config, "workerinput"):
+        shutil.rmtree(os.environ[TEMPLATE], ignore_errors=True)
+
+
+def _template() -> Path:
+    """The data of a stopped server, as it is when it is new: to make it costs a second of processor time."""
+    folder = Path(os.environ[TEMPLATE])
+    with (folder / "lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if not (folder / "made").exists():
+            PostgresServer(folder).stop()
+            (folder / "made").touch()
+    return folder / "data"
 
 
 def _folder() -> Path:
