@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
@@ -77,13 +79,15 @@ def test_what_became_of_a_mission_replaces_what_was_said_when_it_was_given(
     """Beside "done" the panel went on saying that it was running."""
     select(person)
     person.page.type("#goal", "hall\n")
-    eventually(lambda: person.page.run(SENT.format("textContent")) == "go to hall, running (by page)")
+    eventually(
+        lambda: person.page.run(SENT.format("textContent")) == "go to hall (r0.1.3), running (by page)"
+    )
     services.fleet = robot_at(0.5, 0.0, report(MissionState.RUNNING, 0.25))
-    eventually(lambda: "go to hall, running 25 % (by page)" in person.text("selected"))
+    eventually(lambda: "go to hall (r0.1.3), running 25 % (by page)" in person.text("selected"))
     # A share that grows is not read out.
-    assert person.page.run(SENT.format("textContent")) == "go to hall, running (by page)"
+    assert person.page.run(SENT.format("textContent")) == "go to hall (r0.1.3), running (by page)"
     services.fleet = robot_at(0.5, 0.0, report(MissionState.FAILED, 0.25, "a door is shut"))
-    failed = "go to hall, failed: a door is shut (by page)"
+    failed = "go to hall (r0.1.3), failed: a door is shut (by page)"
     eventually(lambda: person.page.run(SENT.format("textContent")) == failed)
     assert person.page.run(SENT.format("className")) == "bad"
 
@@ -152,6 +156,39 @@ def test_the_goal_of_a_mission_and_the_way_there_are_on_the_map(
     eventually(lambda: person.page.run(drawn) == [["goal of r0"], False, False])
     services.fleet = robot_at(end.x, end.y + 1.0, done)
     eventually(lambda: person.page.run(drawn) == [[], False, False])
+
+
+DRAWN_WAYS = """
+return import("/static/goals.js").then(({ drawGoals }) => {
+  const goal = { name: "r0", alive: true, way: %s, goal: null, passed: [] };
+  return %s.map(scale => {
+    const lines = [], viewport = { scale, toScreen: (x, y) => [x * scale, y * scale] };
+    const c = { beginPath() {}, stroke() {},
+      moveTo(...at) { lines.push([at]); }, lineTo(...at) { lines.at(-1).push(at); } };
+    drawGoals(c, viewport, [goal], null);
+    return lines;
+  });
+});
+"""
+"""The lines that are drawn of a way, px, at some scales, px a metre."""
+
+
+def test_a_way_is_drawn_over_few_points_and_passes_all(person: Person) -> None:
+    """The ways of 40 robots took half of a frame: each joint of a wide line takes as long as a short line."""
+    # With a corner and 3 cm of noise; beyond a portal, in another part of the map, it goes on.
+    here = [[min(k, 40), max(k - 40, 0) + k % 2 * 0.03, 0] for k in range(64)]
+    way, scales = [*here, [3, 50, 1], [4, 50, 1]], [10, 14, 16, 200]
+    drawn = person.page.run(DRAWN_WAYS % (json.dumps(way), scales))
+    for scale, lines in zip(scales, drawn, strict=True):
+        first, second = (np.array(line) for line in lines)
+        assert second.tolist() == [[3 * scale, 50 * scale], [4 * scale, 50 * scale]]
+        for point in scale * np.array(here)[:, :2]:
+            along = np.diff(first, axis=0)
+            share = ((point - first[:-1]) * along).sum(1) / (along**2).sum(1)
+            nearest = first[:-1] + np.clip(share, 0.0, 1.0)[:, None] * along
+            assert np.linalg.norm(nearest - point, axis=1).min() <= 1.0
+        # Near by, the noise is seen.
+        assert len(first) > 40 if scale == 200 else len(first) <= 5
 
 
 def test_the_selected_robot_stays_in_view(person: Person, services: DrivenServices) -> None:
