@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
+import networkx as nx
 import numpy as np
 
 from benchmarks.relocalize.pictures import Photographer, Wish
@@ -65,26 +66,12 @@ def mapped_office(seed: int, rooms: int) -> MappedBuilding:
         changes.append(EdgePut(Edge(NodeId(MAPPER, 1, number), a, b, step, kind)))
         number += 2
     whole = HybridMap(changes)
-    joined = _joined(whole, max(truth, key=lambda node: len(_joined(whole, node))))
+    joined = max(nx.connected_components(whole.graph()), key=len)
     kept = [
         change for change in changes
         if (change.node.id if isinstance(change, NodePut) else change.edge.a) in joined
     ]  # fmt: skip
-    return MappedBuilding(world, HybridMap(kept), {node: truth[node] for node in joined})
-
-
-def _joined(hybrid_map: HybridMap, start: NodeId) -> set[NodeId]:
-    """The nodes to which ways lead from one."""
-    beside: dict[NodeId, list[NodeId]] = {}
-    for edge in hybrid_map.edges.values():
-        beside.setdefault(edge.a, []).append(edge.b)
-        beside.setdefault(edge.b, []).append(edge.a)
-    reached, border = {start}, [start]
-    while border:
-        new = [node for node in beside.get(border.pop(), ()) if node not in reached]
-        reached.update(new)
-        border += new
-    return reached
+    return MappedBuilding(world, HybridMap(kept), {node: truth[node] for node in truth if node in joined})
 
 
 def _pairs(plan: BuildingPlan, truth: dict[NodeId, Pose2]) -> list[tuple[NodeId, NodeId]]:
