@@ -6,7 +6,7 @@ from typing import Any
 
 from rich.table import Table
 
-from mapweave.scenarios.run import TrialResult
+from mapweave.scenarios.score import TrialResult
 
 
 def report_of(trial: TrialResult) -> dict[str, Any]:

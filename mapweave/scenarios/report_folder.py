@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
-from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -17,11 +15,10 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.error_plot import draw_errors
-from mapweave.scenarios.expectations import ExpectationResult
 from mapweave.scenarios.figures import Figures
 from mapweave.scenarios.recording import Lost, TrialRecording, TrialTrajectory
 from mapweave.scenarios.report_page import report_page
-from mapweave.scenarios.score import node_truth
+from mapweave.scenarios.score import TrialResult, node_truth
 from mapweave.scenarios.trajectories import score_trajectory
 from mapweave.storage.atomic_file import write_whole
 from mapweave.storage.map_file import write_map_file
@@ -32,13 +29,7 @@ OWN = ("*.tum", "merged.mapweave", "map.png", "errors.png", "report.md", "scenar
 """What is written here; of these, an earlier trial's are removed first."""
 
 
-def write_folder(
-    out: Path,
-    recording: TrialRecording,
-    figures: Figures,
-    verdicts: Sequence[ExpectationResult],
-    scenario_text: str,
-) -> None:
+def write_folder(out: Path, trial: TrialResult, scenario_text: str) -> None:
     """Write everything that a trial measured; a crash leaves whole files only, and no `figures.json`.
 
     | file | what |
@@ -55,9 +46,7 @@ def write_folder(
 
     Args:
         out: the folder; it is made. A `film.webm` in it is mentioned and left alone.
-        recording: what was left behind.
-        figures: of it.
-        verdicts: what came of the scenario's expectations.
+        trial: what came of it.
         scenario_text: the scenario's file.
 
     Raises:
@@ -67,18 +56,13 @@ def write_folder(
         out.mkdir(parents=True, exist_ok=True)
         for old in (path for pattern in reversed(OWN) for path in out.glob(pattern)):
             old.unlink()
-        _write_all(out, recording, figures, verdicts, scenario_text)
+        _write_all(out, trial, scenario_text)
     except OSError as error:
         raise InvalidFile(f"{out}: the report cannot be written ({error.strerror})") from None
 
 
-def _write_all(
-    out: Path,
-    recording: TrialRecording,
-    figures: Figures,
-    verdicts: Sequence[ExpectationResult],
-    scenario_text: str,
-) -> None:
+def _write_all(out: Path, trial: TrialResult, scenario_text: str) -> None:
+    recording, figures, verdicts = trial.recording, trial.figures, trial.verdicts
     whole, truth = HybridMap(recording.merged.changes), node_truth(recording)
     poses = {n: (c, p.mean) for n, (c, p) in recording.merged.poses.items()}
     links = [e for e in whole.edges.values() if e.kind is EdgeKind.MERGED]
@@ -99,14 +83,7 @@ def _write_all(
     files = {m: (f"{m.agent}.truth.tum", _estimate_name(m)) for m in scores}
     page = report_page(recording, figures, verdicts, files, (out / "film.webm").exists())
     write_whole(out / "report.md", page.encode())
-    content = {
-        "scenario": recording.scenario,
-        "seed": recording.seed,
-        "passed": all(v.good for v in verdicts),
-        "figures": figures.as_dict(),
-        "verdicts": [asdict(verdict) for verdict in verdicts],
-    }
-    write_whole(out / FIGURES, f"{json.dumps(content, indent=2, allow_nan=False)}\n".encode())
+    write_whole(out / FIGURES, f"{json.dumps(trial.as_dict(), indent=2, allow_nan=False)}\n".encode())
 
 
 def _map_picture(

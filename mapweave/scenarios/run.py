@@ -5,21 +5,19 @@ from __future__ import annotations
 import shutil
 import time
 from contextlib import ExitStack
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.scenarios.disks import read_disks
-from mapweave.scenarios.expectations import ExpectationResult, check
-from mapweave.scenarios.figures import Figures
+from mapweave.scenarios.expectations import check
 from mapweave.scenarios.filming import FilmingOptions, filming
 from mapweave.scenarios.fleet import TrialFleet, TrialStage
 from mapweave.scenarios.recording import RobotRecord, TrialRecording, TrialTrajectory
 from mapweave.scenarios.scenario import Scenario
 from mapweave.scenarios.scenario_runner import ScenarioRunner
-from mapweave.scenarios.score import score
+from mapweave.scenarios.score import TrialResult, score
 from mapweave.scenarios.terminal_progress import TerminalProgress
 from mapweave.sim.placement import starting_places
 
@@ -60,30 +58,6 @@ class TrialOptions:
     mcap_log: bool = False
 
 
-@dataclass(frozen=True, eq=False)
-class TrialResult:
-    """What came of a trial."""
-
-    recording: TrialRecording
-    figures: Figures
-    verdicts: tuple[ExpectationResult, ...]
-
-    def as_dict(self) -> dict[str, Any]:
-        """The run for JSON."""
-        return {
-            "scenario": self.recording.scenario,
-            "seed": self.recording.seed,
-            "passed": self.passed,
-            "figures": self.figures.as_dict(),
-            "verdicts": [asdict(verdict) for verdict in self.verdicts],
-        }
-
-    @property
-    def passed(self) -> bool:
-        """Whether every expectation was met."""
-        return all(verdict.good for verdict in self.verdicts)
-
-
 def run_trial(scenario: Scenario, options: TrialOptions) -> TrialResult:
     """Run a scenario and leave its report in a folder.
 
@@ -103,9 +77,9 @@ def run_trial(scenario: Scenario, options: TrialOptions) -> TrialResult:
         recording = _record(stage, options, show)
         show.stage("scoring")
         figures = score(recording)
-        verdicts = tuple(check(figures, scenario.expectations))
-        write_folder(options.out, recording, figures, verdicts, scenario.text)
-    return TrialResult(recording, figures, verdicts)
+        trial = TrialResult(recording, figures, tuple(check(figures, scenario.expectations)))
+        write_folder(options.out, trial, scenario.text)
+    return trial
 
 
 def _record(stage: TrialStage, options: TrialOptions, show: TerminalProgress) -> TrialRecording:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import hashlib
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any
 
 import numpy as np
@@ -17,6 +17,7 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.coverage import explored_share, longest_loop
+from mapweave.scenarios.expectations import ExpectationResult
 from mapweave.scenarios.figures import Figures, RobotFigures, measured
 from mapweave.scenarios.recording import Lost, RobotRecord, TrialRecording, TrialTrajectory
 from mapweave.scenarios.trajectories import score_trajectory
@@ -26,6 +27,30 @@ FOUND_M, FOUND_DEG = 0.25, 5.0
 REACHED_M, REACHED_DEG = 0.05, 3.0
 """A robot farther from its goal has not reached it."""
 HALF_TICK_NS = 50_000_000
+
+
+@dataclass(frozen=True, eq=False)
+class TrialResult:
+    """What came of a trial."""
+
+    recording: TrialRecording
+    figures: Figures
+    verdicts: tuple[ExpectationResult, ...]
+
+    def as_dict(self) -> dict[str, Any]:
+        """The run for JSON."""
+        return {
+            "scenario": self.recording.scenario,
+            "seed": self.recording.seed,
+            "passed": self.passed,
+            "figures": self.figures.as_dict(),
+            "verdicts": [asdict(verdict) for verdict in self.verdicts],
+        }
+
+    @property
+    def passed(self) -> bool:
+        """Whether every expectation was met."""
+        return all(verdict.good for verdict in self.verdicts)
 
 
 def score(recording: TrialRecording) -> Figures:

@@ -6,8 +6,8 @@ from rich.table import Table
 from rich.text import Text
 
 from mapweave.scenarios.figures import as_text
-from mapweave.scenarios.run import TrialResult
 from mapweave.scenarios.scenario import Scenario
+from mapweave.scenarios.score import TrialResult
 
 SHOWN = (
     "components", "maps", "nodes", "links", "false_links", "false_edges", "merged_ate_m", "trajectory_ate_m",

@@ -22,7 +22,7 @@ from mapweave.scenarios.error_plot import _labels
 from mapweave.scenarios.expectations import check, parse_expectations
 from mapweave.scenarios.recording import TrialEvent
 from mapweave.scenarios.report_folder import write_folder
-from mapweave.scenarios.score import score
+from mapweave.scenarios.score import TrialResult, score
 from mapweave.storage.map_file import read_map_file
 from tests.mapweave.scenarios.conftest import stage, stage_events
 
@@ -40,7 +40,7 @@ def reported(tmp_path_factory):
     recording = stage_events(stage()).recording()
     figures = score(recording)
     out = tmp_path_factory.mktemp("reported") / "made for" / "it"
-    write_folder(out, recording, figures, check(figures, WANTED), SCENARIO)
+    write_folder(out, TrialResult(recording, figures, tuple(check(figures, WANTED))), SCENARIO)
     return out, recording, figures
 
 
@@ -137,7 +137,7 @@ def test_files_of_an_earlier_trial_are_removed_and_others_are_kept(written):
     (out / "r9.truth.tum").write_text("old")
     (out / "notes.txt").write_text("mine")
     (out / "film.webm").write_bytes(b"a film")
-    write_folder(out, recording, figures, (), SCENARIO)
+    write_folder(out, TrialResult(recording, figures, ()), SCENARIO)
     assert {path.name for path in out.iterdir()} == FILES | {"notes.txt", "film.webm"}
     page = (out / "report.md").read_text()
     assert "[Film](film.webm)" in page
@@ -156,7 +156,7 @@ def test_a_crash_leaves_no_figures_and_no_halves(written, monkeypatch):
 
     monkeypatch.setattr(Figure, "savefig", crash)
     with pytest.raises(RuntimeError, match="crashed"):
-        write_folder(out, recording, figures, (), SCENARIO)
+        write_folder(out, TrialResult(recording, figures, ()), SCENARIO)
     left = {path.name for path in out.iterdir()}
     assert left < FILES
     assert not left & {"figures.json", "errors.png", "report.md"}
@@ -166,7 +166,7 @@ def test_an_unwritable_place_is_reported_in_one_line(eventful, tmp_path):
     recording = eventful.recording()
     (tmp_path / "file").write_text("in the way")
     with pytest.raises(InvalidFile, match="cannot be written"):
-        write_folder(tmp_path / "file", recording, score(recording), (), SCENARIO)
+        write_folder(tmp_path / "file", TrialResult(recording, score(recording), ()), SCENARIO)
 
 
 def test_an_empty_trial_has_a_folder(staged, tmp_path):
@@ -175,7 +175,7 @@ def test_an_empty_trial_has_a_folder(staged, tmp_path):
     staged.truth = {"r0": staged.truth["r0"]}
     recording = staged.recording()
     recording.robots["r0"].estimates.clear()
-    write_folder(tmp_path, recording, score(recording), (), SCENARIO)
+    write_folder(tmp_path, TrialResult(recording, score(recording), ()), SCENARIO)
     names = {path.name for path in tmp_path.iterdir()}
     assert "r0.truth.tum" in names
     assert not any("map-1" in name or "nodes" in name for name in names)
