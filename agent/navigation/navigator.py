@@ -120,7 +120,7 @@ class Navigator:
         self._following = self._parking_retried = False
         self._touched = self._detour = ""
         self._portal: PortalStop | None = None
-        self._aside: NodeId | None = None
+        self._aside: tuple[NodeId, str] | None = None  # where to, and for which robot
         self._behaviour = self._go()
 
     @property
@@ -206,7 +206,7 @@ class Navigator:
                 self._patience.refused_since = None
                 yield from self._follow(route, self.fix)
                 if self._aside is not None and self.fix is not None:
-                    yield from self._step_aside(self.fix, self._aside)
+                    yield from self._step_aside(self.fix, *self._aside)
             else:
                 yield from self._wait_for_a_way()
         yield from self._stand()
@@ -365,7 +365,8 @@ class Navigator:
             yield Command()
             passage = right_of_way.passage(follower.leg, follower.fix)
         self._following = passage is Passage.FREE
-        self._aside = right_of_way.aside if passage is Passage.ASIDE else None
+        aside = right_of_way.aside if passage is Passage.ASIDE else None
+        self._aside = None if aside is None else (aside, right_of_way.holder)
         if passage is Passage.CLOSED:
             self._patience.trouble = self.detail = right_of_way.reason
         elif passage is Passage.STUCK:
@@ -376,7 +377,7 @@ class Navigator:
                 self._blocks.add(*follower.blocked, self._motion.now)
         return self._following
 
-    def _step_aside(self, fix: Fix, node: NodeId) -> Behaviour:
+    def _step_aside(self, fix: Fix, node: NodeId, other: str) -> Behaviour:
         """Drive to a node off another robot's way; then the way to the goal is asked for again."""
         self._aside = None
         route = (yield from self._get_route(fix, node)).legs
@@ -387,7 +388,8 @@ class Navigator:
         right_of_way = RightOfWay(self._motion, [leg.node.id for leg in route])
         while follower.to_goal > THERE and (yield from self._let_pass(right_of_way, follower)):
             command = follower.step(self._motion.observation)
-            self.fix, self.stage, self.detail = follower.fix, NavigationStage.ASIDE, follower.detail
+            self.fix, self.stage = follower.fix, NavigationStage.ASIDE
+            self.detail = f"{other} is to pass; {follower.detail}"
             if follower.to_goal <= THERE or follower.progress not in UNDERWAY:
                 break
             yield command

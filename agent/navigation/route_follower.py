@@ -185,8 +185,10 @@ class RouteFollower:
         target = self._target()
         distance = math.hypot(target.x, target.y)
         node = self._route[self.leg].node.id
-        self.detail = f"{distance:.2f} m to node {node}, {self._last - self.leg} further"
         parking = self.leg == self._last
+        self.detail = f"{distance:.2f} m to node {node}"
+        if not parking:
+            self.detail += f", {self._last - self.leg} further"
         self.progress = RouteProgress.DRIVING
         if self.fix.blind > s.blind_distance and not (parking and distance < NEAR):
             self.progress = RouteProgress.UNSURE

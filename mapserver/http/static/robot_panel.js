@@ -26,8 +26,9 @@ function ellipseOf(covariance) {
   return { major: Math.sqrt(middle + reach), minor: Math.sqrt(Math.max(middle - reach, 0)),
     angle: Math.atan2(2 * xy, xx - yy) / 2 };
 }
-// A robot that waits says for what.
-const doingOf = ({ doing, detail }) => doing.startsWith("waiting") && detail ? `${doing}: ${detail}` : doing;
+// A robot that waits or gives way says for what.
+const SAID = /^(waiting|stepping aside)/;
+const doingOf = ({ doing, detail }) => SAID.test(doing) && detail ? `${doing}: ${detail}` : doing;
 const life = robot => robot.before || robot.lost ? ["as last shown", "soft"] : !robot.alive ? ["gone", "bad"] : robot.age > QUIET ? ["silent", "warn"] : ["alive", "good"];
 function missionWords(mission, shares = true) {
   if (!mission) return "";

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -147,6 +148,7 @@ def test_a_robot_steps_aside_and_asks_for_its_way_again(home):
     trial.run(4.0)
     goals = [question.goal for question in trial.ways]
     assert goals[:2] == [B, C] and trial.navigator.stage == NavigationStage.ASIDE
+    assert re.fullmatch(rf"r7 is to pass; \d\.\d\d m to node {C}", trial.navigator.detail)
     trial.traffic = let_drive
     trial.run(20.0, lambda: len(trial.asked) > 3)
     assert trial.asked[-1].goal == B

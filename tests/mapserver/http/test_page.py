@@ -527,5 +527,10 @@ def test_who_a_robot_waits_for_and_where_it_is_sent_are_said(page: Browser, serv
     services.fleet = FleetStatus((RobotEntry("r0", True, 0.1, said), RobotEntry("r1", True)))
     person = Person(page)
     eventually(lambda: "r0 alive waiting for another robot: r1 drives there, not" in person.text("robots"))
+    aside = replace(
+        said, status=replace(doing, doing="stepping aside for another robot", detail="r1 is to pass")
+    )
+    services.fleet = FleetStatus((RobotEntry("r0", True, 0.1, aside), RobotEntry("r1", True)))
+    eventually(lambda: "r0 alive stepping aside for another robot: r1 is to pass" in person.text("robots"))
     page.run("document.querySelector('#robots button').click()")
     eventually(lambda: "go to kitchen (r0.1.5), running 25" in person.text("selected"))
