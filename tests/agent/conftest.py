@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from functools import cached_property
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2
 from synthetic.world import World
 from tests.agent.scripted_fleet import home_map, home_world
-from tests.photo_walls import rendered, two_walls
+from tests.photo_walls import Wall, rendered, two_walls
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
 DESCRIPTION = RobotDescription(camera=CAMERA)
@@ -30,9 +31,10 @@ RENDERED: OrderedDict[object, tuple[np.ndarray, list[np.ndarray]]] = OrderedDict
 class PhotoWalls:
     """A near wall on the left and a far wall on the right, facing the robot, each with a photograph."""
 
-    def __init__(self) -> None:
-        """Hang the pictures: each is 2.4 m wide, and px of the picture are metres of the wall."""
-        self.walls = two_walls()
+    @cached_property
+    def walls(self) -> list[Wall]:
+        """Photographs, and where they hang."""
+        return two_walls()
 
     def depth_at(self, world_from_robot: Pose2, pixels: np.ndarray) -> np.ndarray:
         """True depth along the optical axis at pixels of a robot that looks along x exactly."""

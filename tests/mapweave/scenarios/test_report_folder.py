@@ -14,7 +14,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from matplotlib.figure import Figure
 
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -148,13 +147,13 @@ def test_files_of_an_earlier_trial_are_removed_and_others_are_kept(written):
 def test_a_crash_leaves_no_figures_and_no_halves(written, monkeypatch):
     out, recording, figures = written
 
-    def crash(figure: Figure, file: io.BytesIO | Path, **options: object) -> None:
+    def crash(figure: object, file: io.BytesIO | Path, **options: object) -> None:
         if figure.get_size_inches()[1] != 4.5:  # the map is drawn
             return
         (file.write if isinstance(file, io.BytesIO) else file.write_bytes)(b"half a picture")
         raise RuntimeError("crashed")
 
-    monkeypatch.setattr(Figure, "savefig", crash)
+    monkeypatch.setattr("matplotlib.figure.Figure.savefig", crash)
     with pytest.raises(RuntimeError, match="crashed"):
         write_folder(out, TrialResult(recording, figures, ()), SCENARIO)
     left = {path.name for path in out.iterdir()}
