@@ -37,13 +37,19 @@ def is_bent(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> bool:
     return bool((nearly_there(links, placed, fixed).mean(axis=1) >= AGREEING).any())
 
 
-def nearly_there(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> NDArray[np.bool_]:
+def nearly_there(
+    links: Sequence[Link],
+    placed: Fragment,
+    fixed: Fragment,
+    most: tuple[float, float] = (BENT_XY, BENT_HEADING),
+) -> NDArray[np.bool_]:
     """(N, N) whether the placement by link j has the node of link k nearly where link k has it.
 
     Args:
         links: from `placed` to `fixed`, at least one.
         placed: piece of map.
         fixed: piece of map.
+        most: what is nearly, m and rad.
     """
     own = compose_poses(
         fixed.graph.means[fixed.graph.index([link.b for link in links])],
@@ -57,6 +63,6 @@ def nearly_there(links: Sequence[Link], placed: Fragment, fixed: Fragment) -> ND
         some = placements[first : first + rows]
         laid = compose_poses(np.repeat(some, count, axis=0), np.tile(inside, (len(some), 1)))
         off = compose_poses(np.tile(from_own, (len(some), 1)), laid)
-        fits = (np.hypot(off[:, 0], off[:, 1]) < BENT_XY) & (np.abs(off[:, 2]) < BENT_HEADING)
+        fits = (np.hypot(off[:, 0], off[:, 1]) < most[0]) & (np.abs(off[:, 2]) < most[1])
         near[first : first + rows] = fits.reshape(len(some), count)
     return near

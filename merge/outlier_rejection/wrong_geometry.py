@@ -18,6 +18,9 @@ that only looks like theirs. If it has their places in another arrangement than 
 through each other, wherever it is placed.
 
 A map that is only a little wrong is seen through nowhere: see `mapweave.merge.outlier_rejection.bent_maps`.
+
+Of few links between two maps some miss by chance, and the two seem to contradict each other. So a map is
+right if its links to all maps that agree put the whole of it in one place.
 """
 
 from __future__ import annotations
@@ -311,7 +314,7 @@ def all_refuted(
         nodes: of both.
         s: when links agree.
     """
-    if not _nodes_agree(links, fixed):
+    if not _nodes_agree(links, fixed) or fits_whole(links, placed, fixed, s):
         return False
     if is_bent(links, placed, fixed) or is_shuffled(links, placed, fixed):
         return True
@@ -335,6 +338,27 @@ def all_refuted(
         )
         for some_links in sets
     )
+
+
+def fits_whole(links: Sequence[Link], placed: Fragment, fixed: Fragment, s: ConsistencySettings) -> bool:
+    """Whether one placement has nearly all links right, and no node is elsewhere by most of its own links.
+
+    Parts that many links hold do not outvote another part that few links put elsewhere.
+
+    Args:
+        links: from `placed` to `fixed`, at least one.
+        placed: piece of map.
+        fixed: piece of map that several maps agree on.
+        s: when links agree.
+    """
+    best = {link.key for link in link_sets(links, placed, fixed, s)[0]}
+    if len(best) < AGREEING * len(links):
+        return False
+    agreeing = [k for k, link in enumerate(links) if link.key in best]
+    near = nearly_there(links, placed, fixed, (SAME_XY, SAME_HEADING))[agreeing].any(axis=0)
+    held = Counter(link.a for link in links)
+    there = Counter(links[k].a for k in np.flatnonzero(near).tolist())
+    return all(2 * there[node] >= count for node, count in held.items())
 
 
 def _nodes_agree(links: Sequence[Link], fixed: Fragment) -> bool:

@@ -115,6 +115,56 @@ def test_no_robot_alone_makes_maps_of_others_seem_wrong(count: int) -> None:
     assert not finder.wrong(maps, links.__getitem__, (), [ids[-1]])
 
 
+def missed(link: Link, off: float) -> Link:
+    """A false link: its nodes are so far off, m."""
+    pose = PoseGaussian(link.a_from_b.mean @ Pose2(off, 0.0, 0.0), LINK)
+    return Link(link.a, link.b, pose, evidence=link.evidence)
+
+
+def drives(
+    count: int, gap: float = 0.0
+) -> tuple[dict[MapId, HybridMap], dict[tuple[MapId, MapId], list[Link]]]:
+    """Maps of one robot's drives, the last with a jump after six views, and all links between them."""
+    maps = {MapId("c", k): corridor("c", epoch=k) for k in range(1, count)}
+    maps[MapId("c", count)] = corridor("c", 1.0, gap, 8, epoch=count)
+    ids = sorted(maps)
+    return maps, {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+
+
+def found(maps: dict[MapId, HybridMap], links: dict[tuple[MapId, MapId], list[Link]]) -> set[MapId]:
+    """The maps that are wrong; the last contradicts the first two."""
+    finder = WrongGeometrySearch(ConsistencySettings())
+    wrong = set(finder.wrong(maps, links.__getitem__, links.keys()))
+    first, second, *_, last = sorted(maps)
+    assert not any(finder._ties[one, last].agrees for one in (first, second))
+    return wrong
+
+
+def test_a_few_false_links_make_no_map_wrong_that_all_others_hold_in_one_place() -> None:
+    """Two false ones of nine and of fifteen, as in the life of a map (seed 62113)."""
+    maps, links = drives(6)
+    *others, last = sorted(maps)
+    for other, count in zip(others, (9, 15), strict=False):
+        some = links[other, last]
+        some = [some[k] for k in np.linspace(0, len(some) - 1, count).round().astype(int)]
+        off = {3: 0.4, 6: 3.0}
+        links[other, last] = [missed(link, off.get(k, 0.0)) for k, link in enumerate(some)]
+    assert found(maps, links) == set()
+
+
+def test_a_part_of_a_map_that_few_links_show_elsewhere_makes_it_wrong() -> None:
+    """Nine links in ten hold the rest of it in one place, and do not outvote them."""
+    maps, links = drives(6, gap=1.0)
+    *others, last = sorted(maps)
+    for k, other in enumerate(others):
+        before, after = (
+            [one for one in links[other, last] if (one.b.number >= 6) is late] for late in (False, True)
+        )
+        links[other, last] = before[:12] + after[:2] if k < 2 else before
+    assert sum(one.b.number >= 6 for pair in links if last in pair for one in links[pair]) == 4
+    assert found(maps, links) == {last}
+
+
 @settings(max_examples=10, deadline=None)
 @given(st.randoms(use_true_random=False))
 def test_the_order_in_which_links_were_found_changes_nothing(random: Random) -> None:
