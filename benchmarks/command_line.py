@@ -1,8 +1,16 @@
-"""The command line that all benchmarks share."""
+"""What all benchmarks share: their command line, how they fail, and a table of figures."""
 
 from __future__ import annotations
 
 import argparse
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from typing import Any
+
+from rich.table import Table
+
+from mapweave.hybridmap.errors import MapweaveError
 
 
 def command_line(
@@ -31,3 +39,33 @@ def _seed(word: str) -> int:
     if seed < 0:
         raise argparse.ArgumentTypeError(f"{seed}: give 0 or more")
     return seed
+
+
+@contextmanager
+def failing_in_one_line(name: str) -> Iterator[None]:
+    """End with 1 and one line on stderr where a file, a folder or an argument is wrong.
+
+    Args:
+        name: of the benchmark's folder.
+    """
+    try:
+        yield
+    except (MapweaveError, OSError) as error:
+        print(f"{name}: {error}", file=sys.stderr)
+        raise SystemExit(1) from None
+
+
+def figure_table(
+    columns: Mapping[str, Mapping[str, Any]], title: str = "", shown: Callable[[Any], str] = str
+) -> Table:
+    """A row for each figure, and a column for each of what was measured.
+
+    Args:
+        columns: figures by name, of each; what one lacks stays empty.
+        title: of the table.
+        shown: a figure in words.
+    """
+    table = Table("figure", *columns, title=title)
+    for name in dict.fromkeys(name for column in columns.values() for name in column):
+        table.add_row(name, *(shown(one[name]) if name in one else "" for one in columns.values()))
+    return table

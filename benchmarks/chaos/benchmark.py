@@ -44,7 +44,6 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
-from rich.table import Table
 
 from benchmarks.chaos.account import Account, account, sent_changes
 from benchmarks.chaos.agent_process import FLEET
@@ -54,7 +53,7 @@ from benchmarks.chaos.questions import LostRobot
 from benchmarks.chaos.recovery import RobotTimes, recoveries
 from benchmarks.chaos.schedule import KILLS, LINKS, Disturbance, Kind, draw_schedule
 from benchmarks.chaos.scripted_robot import ScriptedRobot
-from benchmarks.command_line import command_line
+from benchmarks.command_line import command_line, figure_table
 from mapweave.agent.replication.journal import Journal
 from mapweave.mapserver.log.opening import open_store
 from mapweave.scenarios.children import ChildFailed
@@ -300,12 +299,8 @@ def main() -> None:
                 without = shutil.ignore_patterns(DATABASE)
                 shutil.copytree(folder, options.keep, ignore=without, dirs_exist_ok=True)
     report = together(reports)
-    table = Table("", "", title="chaos", show_header=False)
-    for key, value in report.items():
-        if key == "stores":
-            continue
-        table.add_row(key, str(value))
-    Console(stderr=options.json).print(table)
+    shown = {key: value for key, value in report.items() if key != "stores"}
+    Console(stderr=options.json).print(figure_table({"value": shown}, "chaos"))
     if options.json:
         print(json.dumps(report))
     sys.exit(0 if good(report) else 1)

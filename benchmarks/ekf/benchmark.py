@@ -23,10 +23,9 @@ from multiprocessing import get_context
 import numpy as np
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 from scipy.special import chdtri
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import command_line, figure_table
 from benchmarks.ekf_speed.benchmark import measure, one_thread
 from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
 from synthetic.localization_run import FEW, Start, SurveyedNode, try_drives, try_start
@@ -134,13 +133,14 @@ def main() -> None:
         trials = list(track(results, "filtering", total=arguments.runs, console=console))
     figures = summary(trials)
     figures |= times
-    table = Table("figure", "value", title=f"{arguments.runs} runs of 500 steps")
-    for key, value in figures.items():
-        parts = value if isinstance(value, list) else [value]
-        table.add_row(key, ", ".join(f"{part:.3g}" if part < 1e-3 else f"{part:.3f}" for part in parts))
-    console.print(table)
+    console.print(figure_table({"value": figures}, f"{arguments.runs} runs of 500 steps", _shown))
     if arguments.json:
         print(json.dumps({key: _rounded(value) for key, value in figures.items()}))
+
+
+def _shown(value: float | list[float]) -> str:
+    parts = value if isinstance(value, list) else [value]
+    return ", ".join(f"{part:.3g}" if part < 1e-3 else f"{part:.3f}" for part in parts)
 
 
 def _rounded(value: float | list[float]) -> float | list[float] | None:

@@ -9,14 +9,13 @@ one after the other, each in a process of its own.
 from __future__ import annotations
 
 import argparse
-import sys
 from pathlib import Path
 
+from benchmarks.command_line import failing_in_one_line
 from benchmarks.figures.measurements import MEASUREMENTS
 from benchmarks.figures.page import page, with_table
 from benchmarks.figures.results import FOLDER, load, run, store
 from benchmarks.figures.scale import scale_page
-from mapweave.hybridmap.errors import MapweaveError
 
 PAGE = FOLDER.with_suffix(".md")
 SCALE = FOLDER.with_name("scale.md")
@@ -41,12 +40,9 @@ def main() -> None:
                         help=f"measure first: {', '.join(MEASUREMENTS)}")  # fmt: skip
     parser.add_argument("--data", type=Path, metavar="DIR", help="folder of recordings, DATA in commands")
     arguments = parser.parse_args()
-    try:
+    with failing_in_one_line("figures"):
         for name in arguments.run:
             print(store(name, run(MEASUREMENTS[name], arguments.data)))
         for path, text in written_pages().items():
             path.write_text(text, encoding="utf-8")
             print(path)
-    except (MapweaveError, OSError) as problem:
-        print(f"figures: {problem}", file=sys.stderr)
-        raise SystemExit(1) from None

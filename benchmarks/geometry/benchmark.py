@@ -22,7 +22,6 @@ import argparse
 import json
 import math
 import os
-import sys
 from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
@@ -34,6 +33,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from benchmarks.command_line import failing_in_one_line
 from mapweave.agent.calibration.correction import OdometryCorrection, declaring, geometry_of
 from mapweave.agent.calibration.recorded_drive import calibrate
 from mapweave.agent.calibration.report import Cause, causes
@@ -45,7 +45,7 @@ from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.recording import Recording
 from mapweave.evaluation.replaying import errors
 from mapweave.evaluation.truth import Truth
-from mapweave.hybridmap.errors import InvalidValue, MapweaveError
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 
@@ -252,11 +252,8 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     console = Console(stderr=arguments.json)
-    try:
+    with failing_in_one_line("geometry"):
         figures = run(arguments.recording, arguments.robot, arguments.seed, arguments.only, console)
-    except (MapweaveError, OSError) as error:
-        print(f"geometry: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
     console.print(figures)
     if arguments.json:
         print(json.dumps(figures))

@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import sys
 from functools import partial
 from pathlib import Path
 
@@ -24,13 +23,12 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import cv2
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
-from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import command_line, failing_in_one_line, figure_table
 from benchmarks.mapping_run.figures import draw
 from benchmarks.mapping_run.scene import drive
 from benchmarks.mapping_run.score import Figures, figures
-from mapweave.hybridmap.errors import InvalidValue, MapweaveError
+from mapweave.hybridmap.errors import InvalidValue
 
 RUNS = {"line": ("line", False), "person": ("line", True), "arc": ("arc", False), "weave": ("weave", False)}
 """Shape of the drive, and whether a person walks past, by name of the run."""
@@ -42,15 +40,9 @@ def main() -> None:
     arguments = _arguments()
     cv2.setNumThreads(1)
     console = Console(stderr=arguments.json)
-    try:
+    with failing_in_one_line("mapping_run"):
         results, abandoned = _run(arguments, console)
-    except (MapweaveError, OSError) as error:
-        print(f"mapping_run: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
-    table = Table("figure", *results, title=f"seed {arguments.seed}, {arguments.world}")
-    for key in next(iter(results.values())):
-        table.add_row(key, *(_shown(one[key]) for one in results.values()))
-    console.print(table)
+    console.print(figure_table(results, f"seed {arguments.seed}, {arguments.world}", _shown))
     for note in notes(results, abandoned):
         console.print(note)
     console.print(f"pictures are in {arguments.out}")

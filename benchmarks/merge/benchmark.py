@@ -32,7 +32,6 @@ import argparse
 import json
 import os
 import statistics
-import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -44,11 +43,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import command_line, failing_in_one_line
 from benchmarks.merge.robots import kept_links
 from benchmarks.merge.scale import scale
 from mapweave.formats.g2o import G2oGraph, read_g2o
-from mapweave.hybridmap.errors import InvalidValue, MapweaveError
+from mapweave.hybridmap.errors import InvalidValue
 from synthetic.city import HEADING_SIGMAS, draw_grid
 from synthetic.fleet import FleetSettings, draw_fleet
 from synthetic.merge_rivals import MAPWEAVE, RIVALS, error, joined_falsely, oracle, precision_recall
@@ -70,7 +69,7 @@ def main() -> None:
     """Merge, compare and print."""
     arguments = _arguments()
     console = Console(stderr=arguments.json)
-    try:
+    with failing_in_one_line("merge"):
         if arguments.runs < 1 or arguments.split < 2:
             raise InvalidValue("--runs is at least 1, --split at least 2")
         if arguments.scale is not None and (arguments.g2o or arguments.robots):
@@ -92,9 +91,6 @@ def main() -> None:
                 for name, figures in standard_set(title, graph, arguments.split, progress).items():
                     for figure, value in figures.items():
                         found[name].setdefault(figure, {})[title] = value
-    except (MapweaveError, OSError) as problem:
-        print(f"merge: {problem}", file=sys.stderr)
-        raise SystemExit(1) from None
     for figure in found[MAPWEAVE]:
         console.print(_table(figure, found))
     for figure in independent[MAPWEAVE]:

@@ -42,7 +42,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import command_line, figure_table
 from benchmarks.merge_sim.run import MergeRun
 
 SCENARIOS: dict[str, tuple[str, ...]] = {
@@ -199,12 +199,10 @@ def measure(
 
 def table(found: dict[str, Any]) -> Table:
     """A table for people."""
-    names = list(found["runs"])
-    shown = Table("", *names, title=f"merging in the simulator, seed {found['seed']}")
-    for figure in ("runs", *figures([])):
-        values = [found[figure][name] for name in names]
-        shown.add_row(figure, *("-" if value is None else f"{value:.4g}" for value in values))
-    return shown
+    shown = ("runs", *figures([]))
+    columns = {name: {figure: found[figure][name] for figure in shown} for name in found["runs"]}
+    title = f"merging in the simulator, seed {found['seed']}"
+    return figure_table(columns, title, lambda value: "-" if value is None else f"{value:.4g}")
 
 
 def main() -> None:

@@ -18,7 +18,6 @@ import argparse
 import json
 import os
 import statistics
-import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -31,14 +30,14 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import command_line, failing_in_one_line, figure_table
 from benchmarks.navigate.drives import NavigationOutcome, drive
 from benchmarks.navigate.floor import FreeFloor
 from benchmarks.navigate.map import Figures, map_figures
 from benchmarks.navigate.office import TRUTH, Mapped, Office
 from benchmarks.navigate.pictures import draw
 from benchmarks.navigate.plots import draw_plot
-from mapweave.hybridmap.errors import InvalidValue, MapweaveError
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.sim.floorplan import BuildingPlan
 from mapweave.sim.robots import RobotSetup
 
@@ -53,12 +52,9 @@ def main() -> None:
     console = Console(stderr=arguments.json)
     if not console.is_terminal:
         console = Console(stderr=arguments.json, width=WIDTH)
-    try:
+    with failing_in_one_line("navigate"):
         outcomes, mapped, plan, learned = _run(arguments, console)
         pictures = draw(outcomes, mapped, plan, arguments.out)
-    except (MapweaveError, OSError) as error:
-        print(f"navigate: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
     figures = summary(outcomes) | learned
     console.print(_table(outcomes, arguments.seed))
     console.print(_totals(figures, len(mapped.truth)))
@@ -167,7 +163,5 @@ def _table(outcomes: Sequence[NavigationOutcome], seed: int) -> Table:
 
 
 def _totals(figures: Figures, nodes: int) -> Table:
-    table = Table("figure", "value", title=f"{figures['runs']} drives on a map of {nodes} nodes")
-    for name, value in figures.items():
-        table.add_row(name, "-" if value is None else f"{value:g}")
-    return table
+    title = f"{figures['runs']} drives on a map of {nodes} nodes"
+    return figure_table({"value": figures}, title, lambda value: "-" if value is None else f"{value:g}")

@@ -24,9 +24,8 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import command_line, figure_table
 from benchmarks.process_usage import peak_mb, used_by
 from benchmarks.relocalize.distractors import gather
 from benchmarks.relocalize.places import TruePlace, mapped, mapped_sites
@@ -135,10 +134,7 @@ def main() -> None:
         bar.update(task, completed=REAL + DONORS + QUESTIONS)
         found |= {key: round(one, 3) for key, one in start(folder, queries, places, bar).items()}
         found["store_mb"] = round(path.stat().st_size / 1e6, 1)
-    table = Table("", "", title=f"{arguments.nodes} nodes")
-    for key, value in found.items():
-        table.add_row(key, f"{value:g}")
-    console.print(table)
+    console.print(figure_table({"value": found}, f"{arguments.nodes} nodes", "{:g}".format))
     if arguments.json:
         run = {"nodes": arguments.nodes, "seed": seed, "load": round(os.getloadavg()[0], 1)}
         print(json.dumps({**found, **run}))

@@ -28,7 +28,6 @@ from __future__ import annotations
 
 import json
 import os
-import sys
 from pathlib import Path
 from typing import Any
 
@@ -37,7 +36,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import command_line, failing_in_one_line
 from benchmarks.merge_sim.benchmark import SCENARIOS, SEEDS_APART
 from benchmarks.relocalize.fleet import Bench
 from benchmarks.relocalize.score import figures, wrong_by_kind
@@ -55,7 +54,6 @@ from benchmarks.rules.switches import (
 )
 from benchmarks.rules.trials import total, trial
 from mapweave.formats.g2o import read_g2o
-from mapweave.hybridmap.errors import MapweaveError
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 
@@ -101,7 +99,7 @@ def main() -> None:
         parser.error("--runs must be at least 1, all other numbers at least 0")
     console = Console(stderr=True)
     found: dict[str, Any] = {"seed": arguments.seed}
-    try:
+    with failing_in_one_line("rules"):
         graphs = {path.stem: read_g2o(path) for path in arguments.g2o}
         with Progress(console=console) as progress:
             if arguments.fleets:
@@ -138,9 +136,6 @@ def main() -> None:
                     done.append(trial(name, SEEDS_APART * arguments.seed + run))
                     progress.advance(task)
                 found.setdefault("trials", {})[name] = total(done)
-    except (MapweaveError, OSError) as problem:
-        print(f"rules: {problem}", file=sys.stderr)
-        raise SystemExit(1) from None
     console.print_json(data=found)
     if arguments.json:
         print(json.dumps(found))

@@ -22,9 +22,8 @@ from dataclasses import dataclass
 import numpy as np
 from rich.console import Console
 from rich.progress import track
-from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import command_line, figure_table
 from benchmarks.servo.planner import shortest_length
 from benchmarks.servo.rivals import CONTROLLERS
 from benchmarks.servo.world import LEAST_VISIBLE, ROBOT, PoseFilter, Task, Unicycle, draw_task
@@ -135,10 +134,8 @@ def main() -> None:
         trials = list(track(results, "parking", total=arguments.trials, console=console))
     run = [t for t in trials if t is not None]
     figures = {name: summary([t[name] for t in run]) for name in CONTROLLERS} if run else {}
-    table = Table("figure", *figures, title=f"{len(run)} starts, {len(trials) - len(run)} without a path")
-    for key in next(iter(figures.values()), {}):
-        table.add_row(key, *(f"{figures[name][key]:g}" for name in figures))
-    console.print(table)
+    title = f"{len(run)} starts, {len(trials) - len(run)} without a path"
+    console.print(figure_table(figures, title, "{:g}".format))
     if arguments.json:
         ours = figures.pop("servo", {})
         print(json.dumps({"trials": len(run), "left_out": len(trials) - len(run), **ours, "rivals": figures}))

@@ -45,9 +45,8 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import command_line, figure_table
 from benchmarks.shards.askers import PATIENCE, Askers
 from benchmarks.shards.fleet import BuildingFleet, MappingRobot
 from benchmarks.shards.ray_nodes import RayNodes
@@ -244,14 +243,6 @@ def wait_until(condition: Callable[[], object], what: str) -> None:
         time.sleep(0.05)
 
 
-def table(rows: dict[str, dict[str, Any]]) -> Table:
-    """A table for people."""
-    out = Table("figure", *rows)
-    for name in dict.fromkeys(name for row in rows.values() for name in row):
-        out.add_row(name, *(str(row.get(name, "")) for row in rows.values()))
-    return out
-
-
 def summary(rows: dict[str, dict[str, Any]]) -> dict[str, Any]:
     """What all rows together say."""
     sharded = [row for name, row in rows.items() if name != "without"]
@@ -328,7 +319,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
             progress.update(step, description="processes are killed")
             rows["killed"] = killed(fleet, folder / "killed", max(o.shards), cluster, store, reference, o)
         progress.update(step, advance=1)
-    Console(stderr=o.json).print(table(rows))
+    Console(stderr=o.json).print(figure_table(rows))
     report = summary(rows)
     if o.json:
         print(in_json({

@@ -16,9 +16,8 @@ from itertools import product
 
 from rich.console import Console
 from rich.progress import Progress
-from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import command_line, figure_table
 from benchmarks.rules.switches import Switch, switched_off
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
 from synthetic.wrong_geometry import (
@@ -72,9 +71,6 @@ def main() -> None:
         found = measured(
             arguments.seed, arguments.runs, arguments.kinds, arguments.scenes, arguments.queries, progress
         )
-    table = Table("figure", *found, title="three sound robots and one with a fault")
-    for figure in found[WITH]:
-        table.add_row(figure, *(str(one[figure]) for one in found.values()))
-    console.print(table)
+    console.print(figure_table(found, "three sound robots and one with a fault"))
     if arguments.json:
         print(json.dumps({"seed": arguments.seed, "runs": arguments.runs, **found}))
