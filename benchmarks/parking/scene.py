@@ -104,7 +104,7 @@ class ParkingScene:
         return ServerAnswer(question.number, None, "there are no other robots")
 
     def draw_start(self, rng: np.random.Generator) -> Pose2:
-        """A start, `goal_from_robot`, by the issue's rule; whether there is a path is not asked."""
+        """A start, `goal_from_robot`, as the benchmark draws them; whether there is a path is not asked."""
         radius = self.description.radius + ROOM
         here = (self.world_from_goal.x, self.world_from_goal.y)
         for _ in range(10_000):
