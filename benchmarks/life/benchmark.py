@@ -8,7 +8,10 @@ robot goes through both: N stops at newly drawn places, with a full turn at each
 through the server's own merger one by one, with a merge after every drive. Printed are the active
 nodes after each drive; and how many of the views that are taken anywhere in the rooms, and of those that
 are taken again where a drive stopped, are answered rightly (within 0.25 m and 8 degrees of the truth) from
-the map after one drive and after ten, from the map in the end, and from that with its superseded nodes.
+the map after one drive and after ten, from the map in the end, and from that with its superseded nodes. The
+same views are asked each time: `recall_change` is the share that is answered rightly in the end and was not
+after ten drives, less the share that was and is not any more, with the two ends of its interval of 95 %. The
+interval is that of the views; how much lives differ only several seeds tell.
 Between two drives furniture may be moved: a share of the landmarks then is elsewhere for good, and queries
 are taken of the rooms as they are at last. Times are of this process alone. Ten drives take about a minute
 and a half.
@@ -32,6 +35,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -68,6 +72,8 @@ FIFTIETH, SOME = 50, 5
 """The drives with which the last ones are compared are about this one; and how many they are."""
 EARLY = (1, 10)
 """Drives after which the map is asked, too."""
+TWO_SIDED = 1.96
+"""Standard deviations on either side of the middle of an interval of 95 %."""
 LEFT_OUT = Superseded(NodeId("none", 0, 0), 0, 0.0, 0.0)
 """Marks nodes that are left out of a comparison."""
 
@@ -122,6 +128,8 @@ def main() -> None:
     for name, value in figures.items():
         if not isinstance(value, list):
             totals.add_row(name, f"{value:g}")
+        elif name.endswith("_interval"):
+            totals.add_row(name, " to ".join(f"{end:g}" for end in value))
     console.print(totals)
     if a.json:
         print(json.dumps({"seed": a.seed, "drives": a.drives, **figures}))
@@ -194,9 +202,12 @@ def run(
         "components": curve[-1].components,
         "routes_found": routes_found(merged, rng),
     }
-    earlier = {f"after_{count}": driven_through(early, count) for count in EARLY if count < drives}
+    earlier = {f"after_{count}": driven_through(early, count, keep_days) for count in EARLY if count < drives}
+    for name, mapped in earlier.items():
+        figures[f"nodes_{name}"] = len(mapped.merged().poses) - len(mapped.merged().superseded)
     early.close()
     folder.cleanup()
+    answers: dict[str, NDArray[np.bool_]] = {}
     for name, mapped, hide in (
         *((name, mapped, True) for name, mapped in earlier.items()),
         ("after", merger, True),
@@ -205,7 +216,14 @@ def run(
         hidden = frozenset(mapped.merged().superseded) if hide else frozenset[NodeId]()
         for where, asked in (("", views), ("_visited", again)):
             right, wrong = answered(mapped, mapped.merged(), hidden, asked, truth)
-            figures |= {f"recall{where}_{name}": right, f"wrong{where}_{name}": wrong}
+            answers[f"{where}_{name}"] = right
+            shares = round(float(right.mean()), 4), round(float(wrong.mean()), 4)
+            figures |= dict(zip((f"recall{where}_{name}", f"wrong{where}_{name}"), shares, strict=True))
+    for where in ("", "_visited"):
+        if (before := answers.get(f"{where}_after_{EARLY[-1]}")) is not None:
+            difference, least, most = change_of(before, answers[f"{where}_after"])
+            figures[f"recall{where}_change"] = difference
+            figures[f"recall{where}_change_interval"] = [least, most]
     return figures, curve
 
 
@@ -224,13 +242,16 @@ def journal_of(path: Path, map_id: MapId, changes: Sequence[Change], pruned: Con
     return path.stat().st_size
 
 
-def driven_through(store: Store, drives: int) -> Merger:
-    """The first drives again, as a map of their own."""
+def driven_through(store: Store, drives: int, keep_days: float) -> Merger:
+    """The first drives again, as a map of their own that is pruned as on the way."""
     merger = Merger()
     for map_id in sorted(store.maps())[:drives]:
         for change in store.replay(map_id):
             merger.on_change(change)
-        merger.merged()
+        now_ns = round(map_id.epoch * APART * DAY_NS)
+        plan = plan_of(merger.merged(), merger.maps.values(), merger.pruning, now_ns, keep_days)
+        if plan is not None:
+            merger.prune(plan)
     return merger
 
 
@@ -257,22 +278,39 @@ def answered(
     hidden: frozenset[NodeId],
     views: Sequence[tuple[View, Pose2]],
     truth: Mapping[NodeId, Pose2],
-) -> tuple[float, float]:
-    """Shares of views that are answered rightly and wrongly; the others are not answered."""
+) -> tuple[NDArray[np.bool_], NDArray[np.bool_]]:
+    """(N,) which views are answered rightly, and (N,) which wrongly; the others are not answered."""
     shown = replace(merged, superseded=dict.fromkeys(hidden, LEFT_OUT))
     index = PlaceIndex()
     index.extend(node for one in merger.maps.values() for node in one.nodes.values() if node.id not in hidden)
     places = ActiveNodes(index, merger.node, shown)
     relocalizer = Relocalizer(places, places.node, merged)
-    right = wrong = 0
-    for view, world_from_robot in views:
+    right, wrong = np.zeros(len(views), np.bool_), np.zeros(len(views), np.bool_)
+    for k, (view, world_from_robot) in enumerate(views):
         answer = relocalizer.answer(view)
         if answer.certainty is Certainty.FOUND:
             best = answer.candidates[0]
             off = (truth[best.node] @ best.node_from_robot.mean).inverse() @ world_from_robot
             good = off.distance(Pose2()) <= CLOSE and abs(off.heading) <= CLOSE_TURN
-            right, wrong = right + good, wrong + (not good)
-    return round(right / len(views), 4), round(wrong / len(views), 4)
+            right[k], wrong[k] = good, not good
+    return right, wrong
+
+
+def change_of(before: NDArray[np.bool_], after: NDArray[np.bool_]) -> tuple[float, float, float]:
+    """What has come to be answered less what is answered no longer, and its interval of 95 %, as shares.
+
+    The interval is that of Agresti and Min (Simple improved confidence intervals for comparing matched
+    proportions, Statistics in Medicine 24, 2005): half a view is added to each of the four counts.
+
+    Args:
+        before: (N,) whether each view was answered rightly.
+        after: (N,) the same views later.
+    """
+    won, lost, count = int((after & ~before).sum()), int((before & ~after).sum()), len(before)
+    middle = (won - lost) / (count + 2)
+    sigma = math.sqrt((won + lost + 1) / (count + 2) - middle**2) / math.sqrt(count + 2)
+    ends = middle - TWO_SIDED * sigma, middle + TWO_SIDED * sigma
+    return round((won - lost) / count, 4), round(ends[0], 4), round(ends[1], 4)
 
 
 def routes_found(merged: MergedMap, rng: np.random.Generator) -> float:
