@@ -3,7 +3,8 @@
     python -m benchmarks.fleet.agents_process '{"endpoint": ..., "folder": ..., "first": ..., ...}'
 
 It prints `ready` when every agent has handed over its first node, then reads one line with the time of the
-start, and prints one JSON object at the end. Times are those of the system's monotonic clock, s.
+start, prints one JSON object when all is acknowledged, and stays connected until stdin ends: other processes
+may still wait. Times are those of the system's monotonic clock, s.
 """
 
 from __future__ import annotations
@@ -257,6 +258,7 @@ def main() -> None:
         }),
         flush=True,
     )  # fmt: skip
+    sys.stdin.read()
     # Closing a thousand sessions one after the other takes longer than the benchmark.
     os._exit(0)
 

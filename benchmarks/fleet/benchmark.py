@@ -18,11 +18,14 @@ By number of agents: `connected_s` until all have handed over their first node; 
 and `ack_p99_ms` from handing a change over to the journal's note that the server has it; `burst_p99_ms` and
 `burst_s`, until all of the burst is acknowledged; `relocalize_p95_ms`; `unacked` changes at the end. Of one
 core: `server_cpu`, `router_cpu` (Zenoh's threads in the server's process) and `generator_cpu` (all agents).
+`burst_server_ms`, `burst_router_ms` and `burst_generator_ms` are the processor time of each for a change of
+the burst, with all that they do until it is acknowledged: their sum is the cores that 1000 changes a second
+take.
 `disturbers_unacked` are changes of the agents that disturb, at the end, when what was held back or frozen has
 been sent again; `said` is the last that the server's status said of each while they disturbed. `floor_*` is a
-bare Zenoh question, answered after a bare commit of SQLite, in the same run on a router of its own. It ends
-with 1 unless it is `good`: the largest fleet is as fast as `asked`, all is acknowledged, and something is
-said of every agent that disturbs.
+bare Zenoh question, answered after a bare commit of SQLite, in the same run on a router of its own;
+`floor_cpu_ms` is the processor time of the three processes for it. It ends with 1 unless it is `good`: the
+largest fleet is as fast as `asked`, all is acknowledged, and something is said of every agent that disturbs.
 """
 
 from __future__ import annotations
@@ -42,6 +45,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
@@ -182,7 +186,12 @@ def measure_fleet(
         server, pids = children.pid("server"), [generator.pid for generator in generators]
         time.sleep(max(0.0, begin - time.monotonic()))
         usage = Usage(server)
-        before = (*usage.take(), total(pids))
+
+        def used() -> NDArray[np.float64]:
+            """Of the server's own threads, of Zenoh's in its process, and of all agents, s."""
+            return np.array([*usage.take(), total(pids)])
+
+        before = used()
         names = {name_of(number): kind for number, kind in enumerate(disturbers, agents)}
         slow = replace(everyone, first=agents, count=1)
         asked_about = StatusAsker(bus, names, when_behind(slow, begin), end) if disturbers else None
@@ -190,21 +199,20 @@ def measure_fleet(
             time.sleep(min(0.2, max(0.0, end - time.monotonic())))
             usage.take()
             progress.update(step, completed=time.monotonic() - begin)
-        took = time.monotonic() - begin
-        own, zenoh, generated = (
-            (b - a) / took for a, b in zip(before, (*usage.take(), total(pids)), strict=True)
-        )
+        took, mapped = time.monotonic() - begin, used()
         rss = resident_mb(server)
         asking.join()
         said = asked_about.result() if asked_about else {}
         progress.update(step, description=f"{agents} agents wait for acknowledgements", total=None)
         results = [json.loads(generator.line()) for generator in generators]
+        in_burst = used() - mapped
         disturbed = {kind: json.loads(disturber.line()) for kind, disturber in disturbers.items()}
         children.check()
         progress.update(step, description=f"{agents} agents", total=1, completed=1)
     steady = np.array([x for result in results for x in result["steady"]])
     burst = np.array([x for result in results for x in result["burst"]])
     (answers, unanswered), *_ = asked
+    own, zenoh, generated = ((mapped - before) / took).tolist()
     figures: Figures = {
         "connected_s": round(connected, 1),
         "acked_per_s": round(float(np.isfinite(steady).sum()) / options.seconds, 1),
@@ -213,6 +221,10 @@ def measure_fleet(
         "burst": len(burst),
         "burst_p99_ms": milliseconds(burst, 99),
         "burst_s": round(max(result["burst_end"] for result in results) - end, 2) if len(burst) else None,
+        **{
+            f"burst_{who}_ms": round(1e3 * used / len(burst), 2) if len(burst) else None
+            for who, used in zip(("server", "router", "generator"), in_burst.tolist(), strict=True)
+        },
         "unacked": int((~np.isfinite(steady)).sum() + (~np.isfinite(burst)).sum()),
         "relocalize_p95_ms": milliseconds(np.array(answers), 95),
         "unanswered": unanswered,
@@ -336,13 +348,18 @@ def measure_floor(folder: Path, questions: int = 300) -> Figures:
         stack.callback(bus.close)
         if not bus.wait_connected(20.0):
             raise SystemExit("the router of the floor does not listen")
-        times = []
+        times, pids = [], (os.getpid(), process.pid, children.pid("router"))
+        before = total(pids)
         for _ in range(questions):
             asked = time.monotonic()
             if bus.ask(floor_process.KEY, bytes(3000), 5.0):
                 times.append(time.monotonic() - asked)
+        used = total(pids) - before
     took = np.array(times)
-    return {"floor_p50_ms": milliseconds(took, 50), "floor_p99_ms": milliseconds(took, 99)}
+    return {
+        "floor_p50_ms": milliseconds(took, 50), "floor_p99_ms": milliseconds(took, 99),
+        "floor_cpu_ms": round(1e3 * used / questions, 2),
+    }  # fmt: skip
 
 
 def main() -> None:

@@ -7,13 +7,13 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from typing import Any
 
 import numpy as np
 import pytest
 
-from benchmarks.fleet import benchmark
+from benchmarks.fleet import agents_process, benchmark
 from benchmarks.fleet.agents_process import INTERVAL, Orders, Reporter, first_stops, run_schedule
 from benchmarks.fleet.benchmark import (
     BEHIND_AFTER,
@@ -24,6 +24,7 @@ from benchmarks.fleet.benchmark import (
     trouble_of,
     when_behind,
 )
+from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
 from mapweave.wire.bus import Reply
 from mapweave.wire.messages import encode
@@ -90,6 +91,30 @@ def test_agents_stay_until_the_end_of_mapping() -> None:
     assert time.monotonic() >= begin + 0.3
 
 
+def test_agents_stay_connected_until_the_others_are_acknowledged(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Those that have no change in the burst would else leave at its beginning: half of a thousand."""
+    printed: list[str] = []
+
+    class Pipe:
+        def readline(self) -> str:
+            return f"{time.monotonic()}\n"
+
+        def read(self) -> str:
+            printed.append(capsys.readouterr().out)
+            return ""
+
+    orders = Orders("", "", 0, 0, 1, 0.0, 0, 1)
+    monkeypatch.setattr("sys.argv", ["agents_process", json.dumps(asdict(orders))])
+    monkeypatch.setattr("sys.stdin", Pipe())
+    monkeypatch.setattr("os._exit", sys.exit)
+    monkeypatch.setattr(jit, "load", lambda: None)
+    with pytest.raises(SystemExit):
+        agents_process.main()
+    assert [json.loads(out.splitlines()[-1])["burst"] for out in printed] == [[]]
+
+
 def test_a_slow_agent_is_asked_about_behind_each_of_its_nodes() -> None:
     slow = Orders("", "", 9, 1, 9, 30.0, 0, 1)
     (first,) = first_stops(slow, 100.0)
@@ -151,12 +176,22 @@ def test_a_small_fleet_is_measured_as_a_whole() -> None:
     assert ran.returncode == (not report["good"])
     row = report["agents"]["4"]
     assert 0.0 < report["floor_p50_ms"] <= report["floor_p99_ms"]
+    assert report["floor_cpu_ms"] > 0.0
     # All that was sent is acknowledged: a node and its edge every 10 s of each, and the burst.
     assert row["unacked"] == row["disturbers_unacked"] == 0
     assert row["burst"] == 40 and row["burst_s"] > 0.0
     assert 4 <= row["acked_per_s"] * 12 <= 4 * 2 * 2
     assert 0.0 < row["ack_p50_ms"] <= row["ack_p99_ms"] and row["relocalize_p95_ms"] > 0.0
-    for name in ("connected_s", "server_cpu", "router_cpu", "generator_cpu", "server_rss_mb"):
+    for name in (
+        "connected_s",
+        "server_cpu",
+        "router_cpu",
+        "generator_cpu",
+        "server_rss_mb",
+        "burst_server_ms",
+        "burst_router_ms",
+        "burst_generator_ms",
+    ):
         assert row[name] > 0.0, name
     said = report["said"]["4"]
     assert {*said} == {"slow", "frozen", "flooding"}
