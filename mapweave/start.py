@@ -44,7 +44,7 @@ def _open_output() -> None:
         if getattr(sys, name) is None:
             # It was closed when the process began.
             setattr(sys, name, os.fdopen(os.open(os.devnull, os.O_WRONLY), "w"))
-    if sys.stdout.errors == "strict":
+    if sys.stdout.errors in ("strict", "surrogateescape"):
         # A name may have characters that the locale lacks, and the name of a file need not be UTF-8.
         sys.stdout.reconfigure(errors="backslashreplace")  # type: ignore[union-attr]
 

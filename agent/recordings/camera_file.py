@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from os import PathLike
 from pathlib import Path
+from typing import Any
 
 from mapweave.agent.drive_geometry import check_mount
 from mapweave.agent.recordings.geometry_file import FILE_KEYS
@@ -37,6 +39,14 @@ def read_camera(path: str | PathLike[str]) -> tuple[Camera, Distortion]:
             raise ValueError(f"lens {model!r} is not known; it is {' or '.join(LensModel)}")
         return lens_of(camera, LensModel(model), values.get("distortion", ()))
     except KeyError as missing:
-        raise DeviceError(f"{path}: {missing.args[0]!r} is missing") from None
+        raise DeviceError(f"{path}: {missing.args[0]!r} is missing{_where_it_is(values)}") from None
     except (ValueError, TypeError, OverflowError, InvalidValue) as error:
         raise DeviceError(f"{path}: {error}") from None
+
+
+def _where_it_is(values: Mapping[str, Any]) -> str:
+    """What to do about a key that is missing: a robot's settings file has the camera in a table."""
+    robot = values.get("robot")
+    if isinstance(robot, Mapping) and "camera" in robot:
+        return ": this is a settings file; copy what is below [robot.camera] into a file of its own"
+    return "; a camera's file gives width, height, fx, fy, cx, cy (px) and height_m"

@@ -98,6 +98,7 @@ def run_close(arguments: argparse.Namespace) -> int:
     """Close a way."""
     from mapweave.hybridmap.wall_time import local_words, read_time, utc_words
 
+    _check_where(arguments)
     now_ns = time.time_ns()
     times: dict[str, Any] = {}
     for field, text, word in (("begin_ns", arguments.begin, "from"), ("end_ns", arguments.end, "until")):
@@ -126,7 +127,10 @@ def run_prefer(arguments: argparse.Namespace) -> int:
         words = f"{LEAST_FACTOR:g} to 1 prefers a way, 1 to {MOST_FACTOR:g} avoids it, 1 itself does neither"
         raise UsageError(f"--factor {arguments.factor:g}: {words}")
     if arguments.undo:
+        if not (arguments.where or arguments.corners or arguments.name):
+            raise UsageError("say WHERE, or its --name; `mapweave closures` lists them")
         return _withdraw(arguments, "preference")
+    _check_where(arguments)
     with record_of(arguments, changes=True) as record:
         name, fields = _meant(arguments, "preference", record)
         fields["factor"] = arguments.factor
@@ -202,22 +206,27 @@ def _name(where: Sequence[str]) -> str:
     return f"{name[: MAX_NAME - 9]} {hashlib.sha256(name.encode()).hexdigest()[:8]}"
 
 
-def _meant(
-    arguments: argparse.Namespace, kind: str, record: Fleet | OfflineRecord
-) -> tuple[str, dict[str, Any]]:
-    """Name and fields of what WHERE means; the name is that of the entry which it replaces, if there is one.
+def _check_where(arguments: argparse.Namespace) -> None:
+    """Look at WHERE before a server is asked.
 
     Raises:
         UsageError: nothing, or too much, is given.
     """
+    where, fields = arguments.where, area_fields(arguments)
+    if len(where) > 2 or bool(where) == ("corners" in fields) or (len(where) == 2 and "radius" in fields):
+        raise UsageError("give two nodes, or one place, node or position, or --corners")
+    if len(where) == 2 and where[0] == where[1]:
+        raise UsageError(f"{where[0]} twice: an edge joins two different nodes")
+
+
+def _meant(
+    arguments: argparse.Namespace, kind: str, record: Fleet | OfflineRecord
+) -> tuple[str, dict[str, Any]]:
+    """Name and fields of what WHERE means; the name is that of the entry that it replaces, if any."""
     from mapweave.mapserver.annotation_words import AROUND
 
     where, fields = arguments.where, dict[str, Any](area_fields(arguments))
-    if len(where) > 2 or bool(where) == ("corners" in fields) or (len(where) == 2 and "radius" in fields):
-        raise UsageError("give two nodes, or one place, node or position, or --corners")
     if len(where) == 2:
-        if where[0] == where[1]:
-            raise UsageError(f"{where[0]} twice: an edge joins two different nodes")
         fields["edge"] = where
     elif where and record.annotations().last("place", where[0]) is not None:
         fields["place"] = where[0]

@@ -21,7 +21,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "sim batch": ("mapweave sim batch kidnapped --seeds 20",),
     "sim serve": ("mapweave sim serve office --set robots=2",),
     "agent": (
-        "mapweave agent r0 --robot create --connect tcp/192.168.1.10:7447",
+        "mapweave agent r0 --settings robot.toml --connect tcp/192.168.1.10:7447",
         "mapweave agent r0 --settings robot.toml --metrics 9101",
     ),
     "drive": ("mapweave drive r0", "mapweave drive r0 --gamepad"),
@@ -93,7 +93,7 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "map extract": ("mapweave map extract out/agents/r0.sqlite -o maps/",),
     "map import": ("mapweave map import graph.g2o -o optimum.g2o",),
     "map from-photos": ("mapweave map from-photos photos/ --spacing 0.5 -o hall.mapweave",),
-    "record": ("mapweave record r0 --robot create -o drive/",),
+    "record": ("mapweave record r0 --settings robot.toml -o drive/",),
     "replay": ("mapweave replay drive/ --offline", "mapweave replay walk.mp4 --camera camera.toml"),
     "info": ("mapweave info drive/", "mapweave info drive/ --json"),
     "relocalize": ("mapweave relocalize photo.png --camera camera.toml",),

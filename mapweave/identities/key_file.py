@@ -71,6 +71,8 @@ def read_key_file(path: Path) -> KeyFile:
         try:
             table = build(_Table, read_toml(path), str(path))
         except SettingsError as error:
+            if isinstance(error.__context__, OSError):
+                raise  # what cannot be read may be whole
             raise SettingsError(f"{error}; it is no key file, or not whole: copy it once more") from None
         # systemd hands keys over in a folder of the service's own.
         handed_over = os.environ.get("CREDENTIALS_DIRECTORY") == str(path.parent)

@@ -88,18 +88,21 @@ CASES: dict[str, list[tuple[int, str]]] = {
     ],
     "plan remove": [(USAGE, ""), (NO, "office --map {map} -o {out}")],
     "close": [
+        (USAGE, "--connect {at}"), (USAGE, "r0.1.1 r0.1.1 --connect {at}"), (FAILED, "r0.1.1 --connect {at}"),
         (USAGE, "r0.1.1 --until 99:99 --map {map}"), (USAGE, "r0.1.1 r0.1.1 --map {map} -o {out}"),
         (USAGE, "r0.1 --map {map} -o {out}"), (USAGE, "r0.1.1 --name '' --map {map} -o {out}"),
         (NO, "r0.1.1 r0.1.999 --map {map} -o {out}"),
     ],
     "reopen": [(USAGE, ""), (NO, "kitchen --map {map} -o {out}")],
     "prefer": [
+        (USAGE, "--connect {at}"), (USAGE, "--undo --connect {at}"),
         (USAGE, "r0.1.1 r0.1.3 --factor x"), (USAGE, "r0.1.1 r0.1.3 --factor 0.01 --map {map} -o {out}"),
         (USAGE, "r0.1.1 r0.1.3 --factor 2 --map {map} -o {out}"),
         (USAGE, "r0.1.1 --radius 1e4 --map {map} -o {out}"),
         (NO, "r0.1.1 r9.1.3 --map {map} -o {out}"),
     ],
     "avoid": [
+        (USAGE, "--connect {at}"), (USAGE, "--undo --connect {at}"),
         (USAGE, "r0.1.1 r0.1.3 --factor x"), (USAGE, "r0.1.1 r0.1.3 --factor 1e9 --map {map} -o {out}"),
         (USAGE, "r0.1.1 r0.1.3 --factor nan --map {map} -o {out}"),
         (USAGE, "r0.1.1 r0.1.3 --factor 1 --map {map} -o {out}"),

@@ -116,5 +116,6 @@ def test_what_the_user_may_not_do_is_one_line(
     status, output = ended[name]
     (line,) = output.splitlines()
     assert WORDS in line and ADVICE in line and "Errno" not in line, line
+    assert "copy it once more" not in line, "what cannot be read may be whole"
     assert any(str(place) in line for place in places.values())
     assert status == FAILED

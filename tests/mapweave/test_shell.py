@@ -25,6 +25,7 @@ from rich.console import Console
 from rich.table import Table
 
 from mapweave import terminal
+from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.cheat_sheet import as_markdown
 from mapweave.cli import main, parser
 from mapweave.commands.completion import SHELLS
@@ -55,6 +56,8 @@ def test_every_command_says_what_it_does_with_examples_that_parse(words: str) ->
         for option in {"-o", "--out"} & {*arguments}:
             out = Path(arguments[arguments.index(option) + 1])
             assert out.parent == Path(), "where it is pasted there is no folder of that name"
+        if words in ("agent", "record") and (driver := parsed.robot):
+            assert driver == RobotSettings().driver or parsed.settings, "its port stands in a settings file"
 
 
 @pytest.mark.parametrize("words", parsers())
@@ -429,6 +432,7 @@ def test_a_command_whose_stdout_is_closed_does_its_work() -> None:
         (b"B\xfcro.mapweave", "utf-8", r"B\udcfcro.mapweave"),
         ("Büro.mapweave".encode(), "ascii", r"B\xfcro.mapweave"),
         ("Büro.mapweave".encode(), "utf-8", "Büro.mapweave"),
+        ("Büro.mapweave".encode(), "ascii:surrogateescape", r"B\xfcro.mapweave"),  # as of the locale C
     ],
 )
 def test_a_name_that_the_locale_cannot_show_is_shown_by_its_codes(
@@ -436,7 +440,8 @@ def test_a_name_that_the_locale_cannot_show_is_shown_by_its_codes(
 ) -> None:
     path = tmp_path / os.fsdecode(name)
     write_map_file(path, MapFile("merged", "nothing", ()))
-    codec = {"PYTHONIOENCODING": f"{encoding}:strict", "PYTHONUTF8": "1"}
+    encoding, _, errors = encoding.partition(":")
+    codec = {"PYTHONIOENCODING": f"{encoding}:{errors or 'strict'}", "PYTHONUTF8": "1"}
     done = started("map", "show", path, "--no-picture", env=codec, stdout=subprocess.PIPE)
     assert (done.stderr, done.returncode) == (b"", 0)
     assert printed in done.stdout.decode(encoding)

@@ -80,6 +80,17 @@ def folder_with_poses(drive: Drive, folder: Path) -> None:
 CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
 
 
+def test_what_a_camera_file_lacks_is_named_with_what_to_do(tmp_path: Path) -> None:
+    """A robot's settings file was refused as a camera without a width, which it has in a table."""
+    path = tmp_path / "robot.toml"
+    path.write_text(f'[robot]\ndriver = "arduino"\n[robot.camera]\n{CAMERA_TOML}')
+    with pytest.raises(DeviceError, match=r"'width' is missing: .* below \[robot.camera\] into a file"):
+        read_camera(path)
+    path.write_text(CAMERA_TOML.replace("height_m = 0.3\n", ""))
+    with pytest.raises(DeviceError, match=r"'height_m' is missing; .* fx, fy, cx, cy \(px\) and height_m$"):
+        read_camera(path)
+
+
 @pytest.mark.parametrize(
     "write", [kitti, euroc, tum_rgbd, four_seasons, folder_with_poses], ids=lambda f: f.__name__
 )
