@@ -50,6 +50,27 @@ def test_as_much_as_the_limit_is_unpacked_and_no_byte_more(
         bounded(DECOMPRESSORS[kind], whole[:-6])
 
 
+@pytest.mark.parametrize("kind", DECOMPRESSORS)
+def test_what_is_too_large_is_not_unpacked_first(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bounded_decompression, "MOST_BYTES", TOO_SMALL)
+    bomb = PACKED[kind](bytes(20 * ZEROS))
+    asked: list[int] = []
+
+    class Stream:
+        """Notes how much it is to unpack at most."""
+
+        def __init__(self) -> None:
+            self._stream = DECOMPRESSORS[kind]()
+
+        def decompress(self, data: bytes, most: int = -1) -> bytes:
+            asked.append(most)
+            return self._stream.decompress(data, most)
+
+    with pytest.raises(ValueError, match="a chunk is larger"):
+        bounded(Stream, bomb)
+    assert asked == [TOO_SMALL + 1]
+
+
 def ros1(path: Path, kind: Writer1.CompressionFormat) -> Path:
     writer = Writer1(path := path / "a.bag")
     writer.set_compression(kind)
