@@ -7,6 +7,8 @@ import { SUPERSEDED } from "./map_model.js";
 
 const BORDER = 0.35;      // of the window's size, on each side of the bitmap
 const NEAR = 0.1;         // of the window's size, from the border at which a new bitmap is asked for
+const BLUR = 1.5;         // while the scale changes, the bitmap is scaled so much, up or down, before a new one is asked for
+const REST = 120;         // ms without a change of the scale, after which it is sharp again
 const NAMED = 38;         // px a metre, from which on nodes have names
 const RULE = 90;          // px, longest ruler
 const RING = 10;          // px, radius of the ring about the selected node
@@ -18,6 +20,7 @@ export class Painter {
   constructor(canvas, model, viewport) {
     Object.assign(this, { canvas, model, viewport, robots: [], underlays: [], overlays: [], selected: -1, ways: [], robot: "" });
     this.bitmap = this.drawn = null; this.stale = this.waiting = this.asked = false; this.kept = [];
+    this.scale = this.since = this.resting = 0;
     this.worker = new Worker(new URL("map_bitmap.js", import.meta.url));
     this.worker.onmessage = ({ data: { bitmap, view } }) => {
       if (!this.bitmap) requestAnimationFrame(() => performance.mark("map drawn"));
@@ -81,12 +84,21 @@ export class Painter {
   refresh() {
     const { viewport: v, drawn: d, ratio } = this;
     if (this.waiting || !this.model.members || !v.width || !v.height) return;
-    if (!this.stale && d?.scale === v.scale && this.covers(d)) return;
+    if (!this.stale && d && this.covers(d) && (d.scale === v.scale || this.zooms(d))) return;
     const width = v.width * (1 + 2 * BORDER), height = v.height * (1 + 2 * BORDER);
     const wide = width / v.scale, high = height / v.scale;
     this.waiting = true; this.stale = false;
     this.worker.postMessage({ view: { x: v.x, y: v.y, scale: v.scale, ratio, width, height, left: v.x - wide / 2,
       right: v.x + wide / 2, bottom: v.y - high / 2, top: v.y + high / 2 } });
+  }
+  // Whether the scale is changing, and a scaled bitmap does meanwhile: the worker would take a core for itself.
+  zooms(d) {
+    const { viewport: v } = this, now = performance.now();
+    if (v.scale !== this.scale) Object.assign(this, { scale: v.scale, since: now });
+    if (now - this.since >= REST || Math.max(v.scale / d.scale, d.scale / v.scale) > BLUR) return false;
+    clearTimeout(this.resting);
+    this.resting = setTimeout(() => this.ask(), REST);
+    return true;
   }
   covers(d) {
     const { viewport: v } = this, du = NEAR * v.width, dv = NEAR * v.height;

@@ -534,3 +534,24 @@ def test_who_a_robot_waits_for_and_where_it_is_sent_are_said(page: Browser, serv
     eventually(lambda: "r0 alive stepping aside for another robot: r1 is to pass" in person.text("robots"))
     page.run("document.querySelector('#robots button').click()")
     eventually(lambda: "go to kitchen (r0.1.5), running 25" in person.text("selected"))
+
+
+ZOOMED = """
+const p = mapweave.painter, post = p.worker.postMessage, asked = [];
+p.worker.postMessage = message => asked.push(message.view);
+for (let k = 0; k < 50; k++) { mapweave.viewport.zoom(1.01); p.waiting = false; p.refresh(); }
+p.worker.postMessage = post;
+p.waiting = false;
+const { drawn: { scale }, viewport: now } = p;
+return [Math.min(...asked.map(view => view.scale)) / scale, now.scale / scale];
+"""
+"""Zooms in by steps; the first scale at which the worker is asked, and the last, by what is drawn."""
+SHARP = "const p = mapweave.painter; return !p.waiting && p.drawn?.scale === mapweave.viewport.scale"
+
+
+def test_while_the_map_is_zoomed_its_bitmap_is_scaled_and_sharp_at_rest(page: Browser) -> None:
+    """A bitmap was drawn for each step: at 20 000 nodes the worker took a core that the page had need of."""
+    eventually(lambda: page.run(SHARP))
+    first, last = page.run(ZOOMED)
+    assert 1.5 < first < 1.52 and last > 1.6
+    eventually(lambda: page.run(SHARP))
