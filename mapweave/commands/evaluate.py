@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -99,8 +100,6 @@ def _add_output(parser: argparse.ArgumentParser, out: str, also: str = "") -> No
 
 def run_replay(arguments: argparse.Namespace) -> int:
     """Map, score and print."""
-    from rich.table import Table
-
     from mapweave.agent.drivers.replay import Replay
     from mapweave.agent.recordings.incomplete import NoOdometry
     from mapweave.evaluation.replaying import evaluate_replay, rows
@@ -139,21 +138,13 @@ def run_replay(arguments: argparse.Namespace) -> int:
     for written in evaluated.write(out):
         console.print(f"{written}", highlight=False)
     report = evaluated.report()
-    if arguments.json:
-        print(json.dumps(report, allow_nan=False))
-        return 0
-    table = Table("", "", title=str(path))
-    for name, words in rows(report):
-        table.add_row(name, words)
-    plain_or_terminal(stderr=False).print(table)
-    return 0
+    return _print(arguments, report, [("", ""), *rows(report)], str(path))
 
 
 def run(arguments: argparse.Namespace) -> int:
     """Examine and print."""
-    from rich.table import Table
-
     from mapweave.evaluation.relocalization import evaluate_map, evaluate_relocalization
+    from mapweave.evaluation.verdict import shown
     from mapweave.output_folder import check_output
     from mapweave.terminal import plain_or_terminal
 
@@ -172,19 +163,12 @@ def run(arguments: argparse.Namespace) -> int:
     if arguments.out is not None:
         for path in examination.write(arguments.out):
             console.print(f"answers in {path}", highlight=False)
-    if arguments.json:
-        print(json.dumps(report))
-        return 0
     flat = {name: value for name, value in report.items() if not isinstance(value, dict)}
     selections = {name: value for name, value in report.items() if isinstance(value, dict)}
-    table = Table("", str(report["verified"]), *selections, title=f"{arguments.folder}")
+    rows = [("", str(flat.pop("verified")), *selections)]
     for name, value in flat.items():
-        if name != "verified":
-            table.add_row(
-                name, _shown(value), *(_shown(selection.get(name, "")) for selection in selections.values())
-            )
-    plain_or_terminal(stderr=False).print(table)
-    return 0
+        rows.append((name, *map(shown, (value, *(one.get(name, "") for one in selections.values())))))
+    return _print(arguments, report, rows)
 
 
 def run_merge(arguments: argparse.Namespace) -> int:
@@ -192,9 +176,8 @@ def run_merge(arguments: argparse.Namespace) -> int:
     from mapweave.extras import need
 
     need("server", "viz")
-    from rich.table import Table
-
     from mapweave.evaluation.merging import evaluate_merging
+    from mapweave.evaluation.verdict import shown
     from mapweave.output_folder import check_output
     from mapweave.terminal import plain_or_terminal
 
@@ -208,17 +191,27 @@ def run_merge(arguments: argparse.Namespace) -> int:
     out = arguments.out or Path("out/eval-merge") / examination.name
     for path in examination.write(out):
         console.print(f"{path}", highlight=False)
+    rows = [("", "")]
+    for name, value in report.items():
+        inner = value.items() if isinstance(value, dict) else ()
+        rows.append((name, ", ".join(f"{key} {shown(number)}" for key, number in inner) or shown(value)))
+    return _print(arguments, report, rows)
+
+
+def _print(
+    arguments: argparse.Namespace, report: dict[str, Any], rows: Sequence[tuple[str, ...]], title: str = ""
+) -> int:
+    """Print a report as JSON, or as a table of rows, the first its header; the exit status."""
+    from rich.table import Table
+
+    from mapweave.terminal import plain_or_terminal
+
     if arguments.json:
         print(json.dumps(report, allow_nan=False))
         return 0
-    table = Table("", "", title=f"{arguments.folder}")
-    for name, value in report.items():
-        inner = value.items() if isinstance(value, dict) else ()
-        words = ", ".join(f"{key} {_shown(number)}" for key, number in inner)
-        table.add_row(name, words or _shown(value))
+    header, *lines = rows
+    table = Table(*header, title=title or str(arguments.folder))
+    for line in lines:
+        table.add_row(*line)
     plain_or_terminal(stderr=False).print(table)
     return 0
-
-
-def _shown(value: object) -> str:
-    return "unknown" if value is None else f"{value:g}" if isinstance(value, float) else str(value)

@@ -23,6 +23,7 @@ from mapweave.agent.recordings.trajectory_file import TrajectoryFile, tum_line
 from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.map_score import align
 from mapweave.evaluation.truth import Truth
+from mapweave.evaluation.verdict import shown
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId
@@ -244,19 +245,16 @@ def _pipeline(
     return pipeline
 
 
-def rows(report: Mapping[str, Any]) -> list[tuple[str, str]]:
+def rows(report: Mapping[str, Any]) -> list[tuple[str, ...]]:
     """The report for people: each figure beside the wheels' where there is one."""
-    out = []
+    out = list[tuple[str, ...]]()
     for name, value in report.items():
         if name.startswith("wheels_"):
             continue
         if isinstance(value, dict):
             words = "; ".join(f"{count} {reason}" for reason, count in value.items()) or "none"
         else:
-            share = f"{100 * value:g} %" if name == "frames_used" else ""
-            words = share or (
-                "unknown" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
-            )
+            words = f"{100 * value:g} %" if name == "frames_used" else shown(value)
         wheels = report.get(f"wheels_{name}")
         out.append((name, words if wheels is None else f"{words} (wheels alone {wheels:g})"))
     return out

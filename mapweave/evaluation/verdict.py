@@ -104,3 +104,8 @@ def figures(verdicts: Sequence[JudgedAnswer]) -> dict[str, Any]:
 
 def _share(hits: Sequence[bool]) -> float | None:
     return round(sum(hits) / len(hits), 4) if hits else None
+
+
+def shown(value: object) -> str:
+    """A figure for people."""
+    return "unknown" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
