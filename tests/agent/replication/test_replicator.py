@@ -166,14 +166,14 @@ def test_a_change_that_cannot_be_encoded_is_refused_at_once(agent: Agent) -> Non
 
 
 def test_a_flood_of_acknowledgements_holds_up_no_change_and_fills_no_memory(
-    agent: Agent, hub: MemoryHub, monkeypatch: pytest.MonkeyPatch
+    agent: Agent, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Of a server that lies, or of any program without keys: nothing reached the disk while it lasted."""
-    over, again, liar = threading.Event(), Ack(MAP, agent.log_id, 0).encode(), MemoryBus(hub)
+    over, again = threading.Event(), Sample(KEYS.ack("s0", "r0"), Ack(MAP, agent.log_id, 0).encode())
     take, most = agent.replicator._take_ack, [0]
 
     def send() -> None:
-        liar.publish(KEYS.ack("s0", "r0"), again)
+        agent.replicator._hear(again)
         most[0] = max(most[0], agent.replicator._work.qsize())
 
     def take_while_more_come(sample: Sample) -> None:
@@ -191,7 +191,6 @@ def test_a_flood_of_acknowledgements_holds_up_no_change_and_fills_no_memory(
         assert agent.replicator.flush(10.0)
     finally:
         over.set()
-        liar.close()
     assert most[0] <= 18, "and what was submitted"
 
 

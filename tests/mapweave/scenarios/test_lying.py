@@ -100,7 +100,8 @@ def test_the_figures_count_the_ways_that_can_be_found_out() -> None:
         "lies_answers_changed": 3,
     }  # fmt: skip
     assert figures.keys() <= kinds().keys()
-    assert "not in the status" in row(second, bad)
+    assert "not in the status" in row(second, bad) and "in time" not in row(second, bad)
+    assert "not all merged in time" in row(second, replace(bad, alive=False))
 
 
 def test_an_accusation_counts_also_as_the_reason_of_a_split() -> None:
