@@ -258,7 +258,8 @@ class Estimator:
         logs = assumed - np.log(np.clip(heights / height, 1.0 / FARTHEST_FLOOR, FARTHEST_FLOOR))
         logs -= self.vector[P.WHEEL_SCALE]
         sigmas = np.concatenate([floor.sigmas for floor in floors])
-        found = floor_scale(logs, sigmas, off / height, numbers, BLOCK)
+        lane = any(len(self.pairs[k].floor.before) for k in kept)
+        found = floor_scale(logs, sigmas, off / height, numbers, BLOCK, lane)
         if found is None:
             return
         pitch = math.sqrt(self._covariance[P.PITCH, P.PITCH]) * found.flatness

@@ -31,7 +31,11 @@ LEAST_SLOPE, MOST_SLOPE = 0.001, 0.01
 LEAST_SPREAD = 0.4
 """Points of the floor scatter by no less of what is assumed."""
 FLOOR_RANGE = 1.4
-"""Of logarithms of depth ratios over which all else is spread."""
+"""Of logarithms of depth ratios over which all else is spread: one half above the floor, one below."""
+LOGISTIC = 1.702
+"""A logistic curve of a Gaussian's sigmas, so many times as steep, is its integral to within 0.01."""
+NOWHERE = 1e-12
+"""Density of points where neither the floor nor anything else is: far below a floor without false points."""
 FLOOR_FLAT = 0.03
 """Standard deviation of a floor point's logarithm of depth besides its track's: no floor is quite flat."""
 FLOOR_CONTRAST = 3.0
@@ -62,12 +66,15 @@ class FloorScale:
 
 
 def floor_scale(
-    logs: Array, sigmas: Array, flatness: Array, pairs: NDArray[np.int64], block: int
+    logs: Array, sigmas: Array, flatness: Array, pairs: NDArray[np.int64], block: int, lane: bool
 ) -> FloorScale | None:
     """Tell the floor from what stands on it.
 
-    Points of the floor scatter about one ratio, all others are spread evenly: a mixture of two, by
-    expectation maximisation, begun where the density rises: things stand on the floor, nothing is below it.
+    Points of the floor scatter about one ratio. What stands on it is spread evenly from there up, and some
+    points are found wrongly, above or below. A mixture of three, by expectation maximisation, begun where the
+    density rises: things stand on the floor, nothing is below it. In the lane ahead the shares above and
+    below are found along with the floor; held equal, the feet of walls and boxes would count as floor. Beside
+    it lie pavements and verges, from which nothing rises evenly: there they are held equal.
 
     Args:
         logs: (N,) logarithms of the declared over the measured height of the camera.
@@ -76,6 +83,7 @@ def floor_scale(
             nearest place, along the floor, over its height.
         pairs: (N,) number of the pair of images that each belongs to, ascending.
         block: pairs in a row whose errors may go together.
+        lane: whether points were looked for in the lane ahead.
 
     Returns:
         None where no floor can be found.
@@ -91,12 +99,19 @@ def floor_scale(
     mode = float(centres[int((rise * plausible).argmax())])
     numbers, own = np.unique(pairs, return_inverse=True)
     slopes, slope = np.zeros(len(numbers)), SLOPE
-    floor, scale = 0.5, 1.0
+    floor, above, below, scale = 0.5, 0.25, 0.25, 1.0
     for _ in range(FLOOR_STEPS):
         spread, off = scale * sigmas, logs - mode - slopes[own] * flatness
         on = floor * np.exp(-0.5 * (off / spread) ** 2) / (math.sqrt(math.tau) * spread)
-        share = on / (on + (1.0 - floor) / FLOOR_RANGE)
-        floor, pull = float(share.mean()), share / spread**2
+        # Points scatter, those at the foot of a thing too: what begins at the floor begins gradually.
+        begun = 0.5 + 0.5 * np.tanh(0.5 * LOGISTIC * off / spread)
+        over, under = above * begun / (0.5 * FLOOR_RANGE), below * (1.0 - begun) / (0.5 * FLOOR_RANGE)
+        total = on + over + under + NOWHERE
+        share = on / total
+        floor, above, below = (float((part / total).mean()) for part in (on, over, under))
+        if not lane:
+            above = below = 0.5 * (above + below)
+        pull = share / spread**2
         square = (share * (off / sigmas) ** 2).sum() / max(share.sum(), 1e-9)
         # The mode is common, each pair has a slope: its row of the normal equations is eliminated.
         flat = pull * flatness

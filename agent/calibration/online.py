@@ -72,7 +72,7 @@ WORTH = np.full(COUNT, 2.0)
 WORTH[P.WHEEL_SCALE] = 1.0
 """Wheels that go less far than they report are corrected as soon as they are named: by the floor, the height
 counts. Those that go further, as soon as it is sure that it is they, and not the height. Once corrected on
-this drive, they follow the estimate whenever it is a sigma away."""
+this drive, they follow the estimate whenever it is a sigma away, either way."""
 
 NAMED_ONLY = [p for p in Parameter if p not in (P.FORWARD, P.HEADING, P.PITCH, P.DELAY)]
 """Named, but not used by themselves. The wheels' scales and drift are what all else is measured by; a camera
@@ -325,6 +325,7 @@ class OnlineCalibration:
         target = self._next.vector
         off, sigmas = estimate.against(target)
         w = P.WHEEL_SCALE
+        away = off[w] > sigmas[w]
         if estimate.vector[w] > target[w]:
             # What stands on the floor and is taken for it makes the way seem longer, never shorter.
             sigmas[w] = estimate.sigmas[w]
@@ -340,7 +341,7 @@ class OnlineCalibration:
         change &= self._lasting(change, self._changed_since)
         if by_floor and self._used[w] and not self._earlier[w]:
             # What was declared is contradicted already, and few pairs are far off: more know better.
-            change[w] = estimate.shown[w] and settled[w] and off[w] > sigmas[w]
+            change[w] = estimate.shown[w] and settled[w] and away
         if not change.any():
             return
         # What is shown but differs less goes along: the estimates belong together. The wheels' scale brings

@@ -96,8 +96,8 @@ def test_slopes_of_single_pairs_do_not_bend_the_scale():
     logs = 0.03 + slope[numbers] * flatness + rng.normal(0.0, 0.03, len(numbers))
     standing = rng.random(len(numbers)) < 0.2
     logs[standing] = rng.uniform(0.1, 0.8, int(standing.sum()))
-    found = floor_scale(logs, sigmas, flatness, numbers, 4)
-    flat = floor_scale(logs, sigmas, 1e-6 * flatness, numbers, 4)
+    found = floor_scale(logs, sigmas, flatness, numbers, 4, True)
+    flat = floor_scale(logs, sigmas, 1e-6 * flatness, numbers, 4, True)
     assert found is not None
     assert flat is not None
     assert abs(found.log - 0.03) < 3.0 * found.sigma < 0.03
