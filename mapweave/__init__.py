@@ -60,11 +60,11 @@ if TYPE_CHECKING:
     from mapweave.node_table import NodeTable as NodeTable
     from mapweave.offline_merge import merge_map_files as merge_map_files
     from mapweave.offline_relocalization import relocalizer_of as relocalizer_of
-    from mapweave.offline_relocalization import view_of as view_of
     from mapweave.storage.image_file import read_grey as read_grey
     from mapweave.storage.map_file import MapFile as MapFile
     from mapweave.storage.map_file import read_map_file as read_map_file
     from mapweave.storage.map_file import write_map_file as write_map_file
+    from mapweave.view_features import view_of as view_of
 
     __version__: str
 else:
@@ -93,9 +93,10 @@ else:
         "mapweave.mapserver.relocalization.relocalizer": ("Relocalizer",),
         "mapweave.node_table": ("NodeTable",),
         "mapweave.offline_merge": ("merge_map_files",),
-        "mapweave.offline_relocalization": ("relocalizer_of", "view_of"),
+        "mapweave.offline_relocalization": ("relocalizer_of",),
         "mapweave.storage.image_file": ("read_grey",),
         "mapweave.storage.map_file": ("MapFile", "read_map_file", "write_map_file"),
+        "mapweave.view_features": ("view_of",),
     }
     _MODULE_OF = {name: module for module, names in _NAMES.items() for name in names}
     __all__ = [*_MODULE_OF]

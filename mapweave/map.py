@@ -225,8 +225,8 @@ class Map(ABC):
             Refused: there is no such plan.
         """
         from mapweave.agent.recordings.camera_file import read_camera
-        from mapweave.offline_relocalization import view_of
         from mapweave.storage.image_file import read_grey
+        from mapweave.view_features import view_of
         from mapweave.vision.lens import NO_DISTORTION, Distortion
 
         source, distortion = "the camera", NO_DISTORTION

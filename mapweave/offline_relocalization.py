@@ -3,19 +3,13 @@
 from __future__ import annotations
 
 import faiss  # noqa: F401, where it is missing this says so before a map is read
-import numpy as np
-from numpy.typing import NDArray
 
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.query import View
 from mapweave.mapserver.active_nodes import ActiveNodes
 from mapweave.mapserver.map_files import merged_of
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.storage.map_file import MapFile
-from mapweave.vision.lens import NO_DISTORTION, Distortion, Lens
-from mapweave.vision.sift import Sift
 
 
 def relocalizer_of(content: MapFile) -> Relocalizer:
@@ -37,14 +31,3 @@ def relocalizer_in(merged: MergedMap) -> Relocalizer:
     places.put(nodes.values())
     active = ActiveNodes(places, nodes.get, merged)
     return Relocalizer(active, active.node, merged)
-
-
-def view_of(image: NDArray[np.uint8], camera: Camera, distortion: Distortion = NO_DISTORTION) -> View:
-    """The features of an image, for `Relocalizer.answer`.
-
-    Args:
-        image: (H, W) grey, as it comes from the camera.
-        camera: that took it; its mount says where on the robot it is.
-        distortion: of its lens.
-    """
-    return Sift(Lens(camera, distortion)).extract(image).view(camera)

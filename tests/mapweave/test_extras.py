@@ -280,6 +280,33 @@ def test_help_wrong_use_and_version_import_no_library() -> None:
     assert set(ran.stdout.split()) == {"mapweave"}
 
 
+ASK = """
+import sys
+from tests.mapweave.without_libraries import Without
+sys.meta_path[:] = [Without(finder, frozenset(sys.argv[2:])) for finder in sys.meta_path]
+import numpy as np
+import mapweave
+camera, image = mapweave.Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3), np.zeros((240, 320), np.uint8)
+print(len(mapweave.view_of(image, camera).pixels))
+try:
+    mapweave.open(sys.argv[1]).relocalize(image, camera)
+except mapweave.MapweaveError as error:
+    print(error)
+"""
+
+
+def test_python_asks_a_fleet_without_extras_and_a_file_names_the_one_that_it_needs(
+    filled: dict[str, object],
+) -> None:
+    """Both ended with: No module named 'faiss'."""
+    ran = subprocess.run(
+        [sys.executable, "-c", ASK, str(filled["merged"]), *MODULES["server"]],
+        capture_output=True, text=True, check=True, cwd=ROOT, timeout=60,
+    )  # fmt: skip
+    view, file = ran.stdout.splitlines()
+    assert view == "0" and file.startswith('needs the extra "server": ')
+
+
 def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
     with pytest.raises(SystemExit) as ended:
         main(["--version"])

@@ -17,11 +17,12 @@ from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty
-from mapweave.offline_relocalization import relocalizer_of, view_of
+from mapweave.offline_relocalization import relocalizer_of
 from mapweave.sim.camera import CAMERAS
 from mapweave.sim.photographer import walk
 from mapweave.sim.worlds.catalog import world_from_table
 from mapweave.storage.map_file import read_map_file
+from mapweave.view_features import view_of
 from tests.mapweave.command_line import complaint
 
 COUNT, SPACING, RATE, PHONE = 30, 0.1, 10.0, CAMERAS["phone"]
