@@ -28,6 +28,7 @@ $(STAMP): pyproject.toml constraints.txt
 	@echo "installing into $(VENV), 2 GB (a minute or two) ..."
 ifeq ($(EXTRA),dev)
 	@$(PIP) --only-binary :all: pybullet 2>$(VENV)/pip.log || grep -q "connection broken" $(VENV)/pip.log || \
+	  ! grep -q "No matching distribution" $(VENV)/pip.log || \
 	  echo "there is no wheel of pybullet for $$($(BIN)/python -V) on $$(uname -m): compiling it takes ten minutes" \
 	  "or more; with python3.11 on x86-64 it takes seconds, and make EXTRA=test does without the simulator"
 endif

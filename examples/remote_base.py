@@ -1,4 +1,4 @@
-"""A robot base behind two Zenoh keys (docs/wire.md). Needs only eclipse-zenoh and msgpack."""
+"""A robot base behind two Zenoh keys (docs/wire.md). Needs eclipse-zenoh, msgpack, and a router that runs."""
 
 import struct
 import sys

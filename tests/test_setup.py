@@ -26,7 +26,12 @@ esac
 ENVIRONMENT = """
 if test -n "$what"; then echo "$what" >&2; exit 1; fi
 case "$*" in
-  *only-binary*) test -e offline && echo "WARNING: Retrying after connection broken" >&2; test -e wheel;;
+  *install*) if test -e misconfigured; then echo "Configuration file could not be loaded." >&2; exit 1; fi;;
+esac
+case "$*" in
+  *only-binary*)
+    test -e offline && echo "WARNING: Retrying after connection broken" >&2
+    test -e wheel || { echo "ERROR: No matching distribution found for pybullet" >&2; exit 1; };;
   *install*) if test -e offline; then exit 1; fi;;
 esac
 """
@@ -75,6 +80,12 @@ def test_a_missing_network_is_not_taken_for_a_missing_wheel(checkout: Path) -> N
     (checkout / "offline").touch()
     status, said = setup(checkout)
     assert status != 0 and "wheel" not in said, said
+
+
+def test_settings_of_pip_that_cannot_be_read_are_not_taken_for_a_missing_wheel(checkout: Path) -> None:
+    (checkout / "misconfigured").touch()
+    status, said = setup(checkout)
+    assert status != 0 and "could not be loaded" in said and "wheel" not in said, said
 
 
 def test_what_was_skipped_is_said_in_one_line_for_each_reason() -> None:

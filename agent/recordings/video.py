@@ -74,7 +74,8 @@ def _opened(path: Path) -> cv2.VideoCapture:
     Raises:
         DeviceError: its frames are too large to be decoded.
     """
-    capture = cv2.VideoCapture(str(path))
+    # Another reader of OpenCV would try what FFmpeg cannot read, and print lines of its own.
+    capture = cv2.VideoCapture(str(path), cv2.CAP_FFMPEG)
     try:
         check_size(int(capture.get(cv2.CAP_PROP_FRAME_WIDTH)), int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT)))
     except InvalidValue as error:

@@ -179,6 +179,6 @@ def test_a_video_of_too_many_pixels_is_refused_before_a_frame_is_decoded(
         def grab(self) -> bool:
             pytest.fail("it was decoded")
 
-    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Large())
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: Large())
     with pytest.raises(DeviceError, match=r"a\.avi: an image of 16000x16000 px is too large"):
         video_images(tmp_path / "a.avi")

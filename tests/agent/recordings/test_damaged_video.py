@@ -37,7 +37,7 @@ def test_times_that_are_no_numbers_are_none(
     stamp: float, rate: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "a.avi").write_bytes(bytes(100))
-    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Damaged(stamp, rate))
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: Damaged(stamp, rate))
     images = video_images(tmp_path / "a.avi")
     assert images.stamps_ns.tolist() == [round(1e9 * k / ASSUMED_RATE) for k in range(3)]
     assert "assumed" in images.assumed
@@ -45,7 +45,7 @@ def test_times_that_are_no_numbers_are_none(
 
 def test_an_error_of_opencv_ends_the_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.avi").write_bytes(bytes(100))
-    monkeypatch.setattr(cv2, "VideoCapture", lambda path: Damaged(0.0, 10.0, fails_at=3))
+    monkeypatch.setattr(cv2, "VideoCapture", lambda *_: Damaged(0.0, 10.0, fails_at=3))
     images = video_images(tmp_path / "a.avi")
     assert len(images.stamps_ns) == 2
     with pytest.raises(DeviceError, match="frame 2 cannot be decoded"):

@@ -288,6 +288,22 @@ def test_a_video_that_was_cut_off_says_so(
     )
 
 
+def test_a_video_that_ends_within_its_header_is_one_line(
+    drive: Drive, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A second reader of OpenCV, which reads no more of it, added a line of its own."""
+    path = tmp_path / "walk.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 1.0, (320, 240), isColor=True)
+    for image in drive.images:
+        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
+    writer.release()
+    path.write_bytes(path.read_bytes()[:300])
+    with pytest.raises(DeviceError, match="no video that can be read"):
+        video_images(path)
+    # Commands silence OpenCV's log, which is no part of that line.
+    assert "Unexpected element" not in capfd.readouterr().err
+
+
 def test_an_avi_whose_last_frames_cannot_be_read_says_how_long_it_should_be(
     drive: Drive, tmp_path: Path
 ) -> None:
