@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Iterator
 from functools import cached_property
 
 import numpy as np
@@ -17,6 +18,7 @@ from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Pose2
 from synthetic.world import World
 from tests.agent.scripted_fleet import home_map, home_world
+from tests.described import described_once
 from tests.photo_walls import Wall, rendered, two_walls
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
@@ -78,6 +80,13 @@ class PhotoWalls:
         mapper.finish_pending()
         (node,) = mapper.map.nodes.values()
         return node
+
+
+@pytest.fixture(scope="module", autouse=True)
+def described() -> Iterator[None]:
+    """Most drives begin at the same places."""
+    with described_once():
+        yield
 
 
 @pytest.fixture(scope="session")

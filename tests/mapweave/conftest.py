@@ -15,6 +15,7 @@ from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.storage.map_file import write_map_file
 from synthetic.maps import looked_around, merger_of
+from tests.described import described_once
 from tests.examined import examined_once
 from tests.mapweave.command_line import CAMERA
 from tests.simulator import INSTALLED
@@ -23,8 +24,8 @@ from tests.waiting import free_port
 
 @pytest.fixture(scope="module", autouse=True)
 def examined() -> Iterator[None]:
-    """Servers and commands of tests compare the same nodes again and again."""
-    with examined_once():
+    """Servers and commands of tests compare the same nodes, and look at the same images, again and again."""
+    with examined_once(), described_once():
         yield
 
 
