@@ -160,11 +160,12 @@ def _is_covariance(*p: float) -> bool:
     first = p[0] + slack
     if first <= 0.0:
         return False
-    second = p[4] + slack - p[3] ** 2 / first
+    # Quotients first: a power that overflows raises.
+    second = p[4] + slack - p[3] * (p[3] / first)
     if second <= 0.0:
         return False
-    mixed = p[7] - p[6] * p[3] / first
-    return p[8] + slack - p[6] ** 2 / first - mixed**2 / second > 0.0
+    mixed = p[7] - p[6] * (p[3] / first)
+    return p[8] + slack - p[6] * (p[6] / first) - mixed * (mixed / second) > 0.0
 
 
 def averaged(poses: Sequence[PoseGaussian]) -> PoseGaussian:

@@ -97,6 +97,8 @@ def test_mahalanobis_distance_of_samples_has_three_degrees_of_freedom() -> None:
         np.diag([1, 1, -1.0]),
         np.full((3, 3), np.nan),
         np.array([[1, 1, 0], [0, 1, 0], [0, 0, 1.0]]),
+        np.array([[1, 1e200, 0], [1e200, 1, 0], [0, 0, 1.0]]),  # its squares overflow; found by fuzzing
+        np.array([[1, 0, 1e200], [0, 1, 0], [1e200, 0, 1.0]]),
     ],
 )
 def test_invalid_covariances_are_refused(covariance: np.ndarray) -> None:
@@ -116,6 +118,10 @@ def test_the_covariance_check_agrees_with_eigenvalues(seed: int) -> None:
         result = np.linalg.eigvalsh(one)[0] / max(np.abs(one).max(), 1e-12)
         if abs(result + 1e-6) > 1e-8:
             assert accepted(one) == (result > -1e-6)
+
+
+def test_a_covariance_may_be_of_any_size() -> None:
+    assert accepted(1e200 * np.array([[2, 1, 0], [1, 2, 1], [0, 1, 2.0]]))
 
 
 def accepted(covariance: np.ndarray) -> bool:
