@@ -188,7 +188,7 @@ def test_a_flood_of_acknowledgements_holds_up_no_change_and_fills_no_memory(
     try:
         eventually(lambda: most[0] >= 16)
         agent.replicator.submit(bodies(1, 3), 0)
-        assert agent.replicator.flush(10.0)
+        assert agent.replicator.flush(5.0)
     finally:
         over.set()
     assert most[0] <= 18, "and what was submitted"
