@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import argparse
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
@@ -155,9 +155,12 @@ def run_missions(arguments: argparse.Namespace) -> int:
     """List missions."""
     with fleet_of(arguments) as fleet:
         reports = list(fleet.missions(arguments.robot or ""))
+        gone = set[str]()
+        if not arguments.json and any(report.open for report in reports):
+            gone = {entry.robot for entry in fleet.status().robots if not entry.alive}
     if not reports and not arguments.json:
         print("no missions yet")
-    _print(reports, arguments.json)
+    _print(reports, arguments.json, gone)
     return DONE
 
 
@@ -198,10 +201,12 @@ def _late(report: MissionReport, timeout: float) -> str:
     return f"{robot}: not over after {timeout:g} s (--timeout); {on}"
 
 
-def _print(reports: list[MissionReport], as_json: bool) -> None:
+def _print(reports: list[MissionReport], as_json: bool, gone: Collection[str] = ()) -> None:
+    """Print missions; those of robots that are gone go on once their agents are back."""
     if not as_json:
         for report in reports:
-            print(words(report))
+            waits = report.open and report.order.robot in gone
+            print(words(report) + ("; the robot is gone, see `mapweave status`" if waits else ""))
         return
     import json
 

@@ -103,6 +103,11 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
             assert (code, mission["state"], mission["order"]["node"]) == (0, "running", "r0.1.1")
             children.kill("r0")
             robot(alive=False)
+            listed = shell("missions", "r0")[1].splitlines()
+            assert "running" in listed[-1] and listed[-1].endswith(
+                "; the robot is gone, see `mapweave status`"
+            )
+            assert not any("gone" in line for line in listed[:-1])
             start_robot()
             # The server shows the last status before the kill until the next one comes.
             eventually(lambda: robot()["status"]["mission"]["order"] == mission["order"], PATIENCE)
