@@ -129,9 +129,10 @@ class Capture:
                 del os.environ[FFMPEG_OPTIONS]
         if not capture.isOpened():
             capture.release()
-            raise DeviceError(
-                f"camera {source}: cannot be opened; is it connected, and not in use by another program?"
-            )
+            hint = "is it connected, and not in use by another program?"
+            if self._is_file:
+                hint = "it is no video, or one cut off at its start; `mapweave info` says what is in a file"
+            raise DeviceError(f"camera {source}: cannot be opened; {hint}")
         try:
             # Later frames of another size are scaled to the first one's.
             check_size(

@@ -136,7 +136,7 @@ def test_a_frame_of_each_camera_is_saved(tmp_path: Path, capfd: pytest.CaptureFi
     sound = re.fullmatch(rf"{good}: 320x240 px, (\d+) images/s, frame in {out}/camera\d+.png", lines[0])
     assert sound is not None and 20 <= int(sound[1]) <= 26
     assert lines[1].startswith(f"{dark}: 160x120 px") and "the image is dark" in lines[1]
-    assert lines[2].startswith(f"camera {broken}: cannot be opened")
+    assert lines[2].startswith(f"camera {broken}: cannot be opened; it is no video")
     frames = sorted(out.glob("*.png"))
     assert [cv2.imread(str(frame), 0).shape for frame in frames] == [(240, 320), (120, 160)]
 
