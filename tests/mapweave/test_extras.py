@@ -163,14 +163,16 @@ ACTIVATED = os.pathsep.join([str(Path(sys.executable).parent), os.environ.get("P
 
 
 def outcomes(without: Iterable[str], lines: Iterable[str], path: str = ACTIVATED) -> list[Outcome]:
-    """What becomes of commands in a process that lacks the libraries of some extras.
+    """What becomes of commands in a process that lacks the libraries that some extras alone bring.
 
     Args:
         without: the extras.
         lines: commands with their arguments.
         path: where the process looks for programs.
     """
-    missing = sorted({module for extra in without for module in MODULES[extra]})
+    without = set(without)
+    there = {module for extra in MODULES.keys() - without for module in MODULES[extra]}
+    missing = sorted({module for extra in without for module in MODULES[extra]} - there)
     ran = subprocess.run(
         [sys.executable, "-m", "tests.mapweave.without_libraries", *missing],
         input=json.dumps([line.split() for line in lines]),
