@@ -222,8 +222,8 @@ def measure_fleet(
         "burst_p99_ms": milliseconds(burst, 99),
         "burst_s": round(max(result["burst_end"] for result in results) - end, 2) if len(burst) else None,
         **{
-            f"burst_{who}_ms": round(1e3 * used / len(burst), 2) if len(burst) else None
-            for who, used in zip(("server", "router", "generator"), in_burst.tolist(), strict=True)
+            f"burst_{who}_ms": round(1e3 * spent / len(burst), 2) if len(burst) else None
+            for who, spent in zip(("server", "router", "generator"), in_burst.tolist(), strict=True)
         },
         "unacked": int((~np.isfinite(steady)).sum() + (~np.isfinite(burst)).sum()),
         "relocalize_p95_ms": milliseconds(np.array(answers), 95),

@@ -288,15 +288,20 @@ def test_a_video_that_was_cut_off_says_so(
     )
 
 
-def test_a_video_that_ends_within_its_header_is_one_line(
-    drive: Drive, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
-    """A second reader of OpenCV, which reads no more of it, added a line of its own."""
-    path = tmp_path / "walk.avi"
+def written_avi(drive: Drive, path: Path) -> Path:
+    """The images of a drive, one a second, as Motion JPEG."""
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 1.0, (320, 240), isColor=True)
     for image in drive.images:
         writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
     writer.release()
+    return path
+
+
+def test_a_video_that_ends_within_its_header_is_one_line(
+    drive: Drive, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    """A second reader of OpenCV, which reads no more of it, added a line of its own."""
+    path = written_avi(drive, tmp_path / "walk.avi")
     path.write_bytes(path.read_bytes()[:300])
     with pytest.raises(DeviceError, match="no video that can be read"):
         video_images(path)
@@ -308,11 +313,7 @@ def test_an_avi_whose_last_frames_cannot_be_read_says_how_long_it_should_be(
     drive: Drive, tmp_path: Path
 ) -> None:
     """As a card's bad sectors leave it: as long as it was, with an index."""
-    path = tmp_path / "walk.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 1.0, (320, 240), isColor=True)
-    for image in drive.images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
+    path = written_avi(drive, tmp_path / "walk.avi")
     data, half = path.read_bytes(), path.stat().st_size // 2
     path.write_bytes(data[:half] + bytes(len(data) - half))
     images = video_images(path)
