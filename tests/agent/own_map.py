@@ -4,8 +4,6 @@ At the beginning of a drive the robot recognises a place of its map, as one that
 each view is tied to the one before by odometry, and to nodes nearby by loop closures.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

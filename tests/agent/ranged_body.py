@@ -1,7 +1,5 @@
 """A robot among the photographs, with rangers that see invisible walls, and its pipeline."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

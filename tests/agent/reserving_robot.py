@@ -1,7 +1,5 @@
 """A robot that drives by exact wheels and sees nothing, on roads that it shares by reservations."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from mapweave.agent.mission import MayIDrive, ServerAnswer, WhichWay

@@ -1,7 +1,5 @@
 """A navigator, eyes that see known landmarks, and a fleet whose answers are scripted."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Readings of 0 within the blind zone, against the walls of a room that the test knows."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 
@@ -10,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapweave.agent.blind_zone import BlindZone, _within_turn
 from mapweave.agent.observation import Observation, Odometry
+from mapweave.agent.sensor_input import BlindZone, _within_turn
 from mapweave.hybridmap.pose import Pose2
 from tests.agent.ranged_body import BEARINGS, BODY, ROOM, rangers
 
@@ -40,7 +38,7 @@ def drive(
     return pose, raw, filled
 
 
-def test_a_wall_that_was_seen_from_farther_off_is_where_it_was() -> None:
+def test_a_wall_that_was_seen_from_farther_off_is_where_it_was():
     zone = BlindZone(BODY)
     # Ahead the wall is 1.64 m from the robot's edge.
     pose, raw, filled = drive(zone, Pose2(), [(0.03, 0.0)] * 50)
@@ -57,9 +55,7 @@ def test_a_wall_that_was_seen_from_farther_off_is_where_it_was() -> None:
     st.lists(st.tuples(st.floats(0.0, 0.03), st.floats(-0.08, 0.08)), min_size=10, max_size=80),
     st.floats(-math.pi, math.pi),
 )
-def test_nothing_is_filled_in_that_is_farther_than_it_is(
-    steps: list[tuple[float, float]], heading: float
-) -> None:
+def test_nothing_is_filled_in_that_is_farther_than_it_is(steps: list[tuple[float, float]], heading: float):
     zone, pose = BlindZone(BODY), Pose2(0.0, 0.0, heading)
     for step in steps:
         if rangers(pose @ Odometry(*step).motion()).min() < 0.02:
@@ -70,13 +66,13 @@ def test_nothing_is_filled_in_that_is_farther_than_it_is(
         assert (filled[raw == 0.0] <= rangers(pose)[raw == 0.0] + 0.06).all()
 
 
-def test_what_was_never_seen_may_touch() -> None:
+def test_what_was_never_seen_may_touch():
     zone = BlindZone(BODY)
     _, raw, filled = drive(zone, Pose2(ROOM[1] - BODY.radius - 0.1, 0.0), [(0.0, math.tau / 48)] * 48)
     assert raw[AHEAD] == filled[AHEAD] == 0.0
 
 
-def test_where_the_robot_has_just_been_there_is_nothing() -> None:
+def test_where_the_robot_has_just_been_there_is_nothing():
     zone, beside = BlindZone(BODY), np.full(len(BEARINGS), BODY.ranger_reach)
     beside[BEHIND] = 0.0
 
@@ -90,7 +86,7 @@ def test_where_the_robot_has_just_been_there_is_nothing() -> None:
     assert filled[BEHIND] == 0.0
 
 
-def test_sensors_that_measure_down_to_a_touch_are_believed() -> None:
+def test_sensors_that_measure_down_to_a_touch_are_believed():
     zone = BlindZone(BODY)
     pose, _, _ = drive(zone, Pose2(), [(0.03, 0.0)] * 54, rangers)
     assert rangers(pose)[AHEAD] < 0.03
@@ -100,7 +96,7 @@ def test_sensors_that_measure_down_to_a_touch_are_believed() -> None:
     assert zone.fill(Observation(0, Odometry(0.0, 0.0), proximity=touched)).proximity[AHEAD] == 0.0
 
 
-def test_a_robot_that_was_lifted_knows_nothing() -> None:
+def test_a_robot_that_was_lifted_knows_nothing():
     zone = BlindZone(BODY)
     pose, raw, _ = drive(zone, Pose2(), [(0.03, 0.0)] * 50)
     lifted = zone.fill(Observation(0, Odometry(0.0, 0.0), proximity=raw, kidnapped=True))
@@ -109,12 +105,12 @@ def test_a_robot_that_was_lifted_knows_nothing() -> None:
     assert pose.x == pytest.approx(1.5)
 
 
-def test_robots_without_rangers_are_left_alone() -> None:
+def test_robots_without_rangers_are_left_alone():
     observation = Observation(0, Odometry(0.1, 0.0))
     assert BlindZone(BODY).fill(observation) is observation
 
 
-def test_an_angle_is_brought_into_one_turn_as_by_the_remainder() -> None:
+def test_an_angle_is_brought_into_one_turn_as_by_the_remainder():
     angles = np.random.default_rng(6).uniform(-15.0, 15.0, (16, 40))
     angles[0, :5] = 0.0, -1e-20, math.tau, -math.tau, np.nextafter(math.tau, 0.0)
     assert np.array_equal(_within_turn(angles.copy()), angles % math.tau)

@@ -1,7 +1,5 @@
 """A node keeps to its byte budget on the wire, and is the same node for all receivers."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

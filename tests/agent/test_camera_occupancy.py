@@ -1,7 +1,5 @@
 """The camera's occupancy grid against geometry of its own: nothing solid is ever free."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any
@@ -95,7 +93,7 @@ def points_in(box: list[float], inset: float) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_floor_is_free_and_what_is_textured_is_not(seed: int) -> None:
+def test_floor_is_free_and_what_is_textured_is_not(seed: int):
     floor = looked_around(np.random.default_rng(seed), textured=[*WALLS, BOX])
     inner = points_in([-2.2, -2.2, 2.2, 0.5], 0.0)
     assert free(floor, inner).mean() > 0.9
@@ -118,20 +116,20 @@ def test_floor_is_free_and_what_is_textured_is_not(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_what_is_blank_is_not_free_if_it_is_wider_than_the_gap(seed: int) -> None:
+def test_what_is_blank_is_not_free_if_it_is_wider_than_the_gap(seed: int):
     floor = looked_around(np.random.default_rng(seed), textured=WALLS, blank=[BOX])
     assert min(BOX[2] - BOX[0], BOX[3] - BOX[1]) > GAP
     assert not free(floor, points_in(BOX, 0.15)).any()
 
 
-def test_structure_above_the_camera_shows_no_floor() -> None:
+def test_structure_above_the_camera_shows_no_floor():
     floor = looked_around(np.random.default_rng(0), [(0.0, 0.0)], textured=WALLS, low=0.35, high=0.9)
     assert not free(floor, points_in([0.5, -2.0, 2.0, 2.0], 0.0)).any()
     cells = floor.cells(np.array([[2.4, y] for y in np.arange(-1.0, 1.0, 0.1)]))
     assert floor._occupied[cells[:, 0], cells[:, 1]].any(), "low enough to be touched it is in the way"
 
 
-def test_sectors_end_before_the_nearest_landmark_and_where_neighbours_are_apart() -> None:
+def test_sectors_end_before_the_nearest_landmark_and_where_neighbours_are_apart():
     bearings, ranges = np.radians([-20.0, -18.0, -16.0, 0.0]), np.array([2.0, 1.0, 2.0, 2.0])
     edges, ends = free_sectors(bearings, ranges, np.full(4, 0.2), HEIGHT, 0.1)
     assert len(edges) == 4
@@ -139,7 +137,7 @@ def test_sectors_end_before_the_nearest_landmark_and_where_neighbours_are_apart(
     assert free_sectors(bearings[:1], ranges[:1], np.full(1, 0.2), HEIGHT, 0.1)[1].size == 0
 
 
-def test_the_footprint_is_free_and_a_touch_is_not_argued_away() -> None:
+def test_the_footprint_is_free_and_a_touch_is_not_argued_away():
     floor = CameraOccupancyGrid(ROBOT, SETTINGS)
     for x in np.arange(0.0, 1.0, 0.05):
         floor.drive(Pose2(x))
@@ -160,7 +158,7 @@ def test_the_footprint_is_free_and_a_touch_is_not_argued_away() -> None:
     assert free(floor, beyond)[0], "now it was driven over"
 
 
-def test_the_share_of_the_border_behind_which_nothing_is_known() -> None:
+def test_the_share_of_the_border_behind_which_nothing_is_known():
     everywhere = [(x, y) for x in (-1.6, 0.0, 1.6) for y in (-1.6, 0.0, 1.6)]
     rng = np.random.default_rng(1)
     closed = looked_around(rng, everywhere, textured=WALLS)

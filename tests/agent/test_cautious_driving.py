@@ -1,7 +1,5 @@
 """Driving without proximity sensors: touches are recognised, and backed off from."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -64,9 +62,7 @@ class Drive:
         (False, True, "the wheels turn and the image stands"),
     ],
 )
-def test_a_touch_is_recognised_and_backed_off_from(
-    wanted: float, bumper: bool, slips: bool, words: str
-) -> None:
+def test_a_touch_is_recognised_and_backed_off_from(wanted: float, bumper: bool, slips: bool, words: str):
     drive = Drive(bumper, slips)
     said = drive.run(wanted, 45)
     assert said == [words]
@@ -76,7 +72,7 @@ def test_a_touch_is_recognised_and_backed_off_from(
     assert ROOM - abs(drive.x) == pytest.approx(BACK_OFF, abs=0.02)
 
 
-def test_free_driving_turning_and_starting_are_no_touches() -> None:
+def test_free_driving_turning_and_starting_are_no_touches():
     drive = Drive(bumper=True, slips=False)
     assert drive.run(0.05, 60) == []
     assert drive.run(-0.15, 20) == []
@@ -92,11 +88,11 @@ def test_free_driving_turning_and_starting_are_no_touches() -> None:
         assert caution.command(Command(0.0, 0.5), SLOW) == Command(0.0, 0.5)
 
 
-def test_without_a_pose_slipping_wheels_say_nothing() -> None:
+def test_without_a_pose_slipping_wheels_say_nothing():
     assert Drive(bumper=False, slips=True, pose_known=False).run(0.3, 60) == []
 
 
-def test_speeds_are_limited_and_curves_stay() -> None:
+def test_speeds_are_limited_and_curves_stay():
     caution = CautiousDriving(BODY)
     safe = caution.command(Command(0.3, 0.6), ALONG_EDGES)
     assert safe.forward == pytest.approx(ALONG_EDGES)
@@ -105,7 +101,7 @@ def test_speeds_are_limited_and_curves_stay() -> None:
     assert speed_for(1.0) == SLOW
 
 
-def test_who_drives_backs_off_himself() -> None:
+def test_who_drives_backs_off_himself():
     drive = Drive(bumper=True, slips=False)
     drive.run(0.3, 30)
     assert drive.caution.backing_off
@@ -113,7 +109,7 @@ def test_who_drives_backs_off_himself() -> None:
     assert not drive.caution.backing_off
 
 
-def test_a_robot_that_is_only_carried_lacks_nothing() -> None:
+def test_a_robot_that_is_only_carried_lacks_nothing():
     assert lacks_rangers(BODY)
     assert not lacks_rangers(RobotDescription(BODY.camera, max_forward=0.0))
     assert not lacks_rangers(RobotDescription(BODY.camera, ranger_bearings=(0.0,), ranger_reach=1.0))

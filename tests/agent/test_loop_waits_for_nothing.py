@@ -1,7 +1,5 @@
 """The loop of a real robot: it waits for neither disk nor network, and skips images rather than lag."""
 
-from __future__ import annotations
-
 import logging
 import math
 import socket
@@ -77,7 +75,7 @@ def run(robot: Player, bus: Bus, folder: Path) -> Agent:
     return agent
 
 
-def test_a_disk_that_hangs_holds_up_no_tick(walls, description, tmp_path, monkeypatch) -> None:
+def test_a_disk_that_hangs_holds_up_no_tick(walls, description, tmp_path, monkeypatch):
     """Every commit hangs until all ticks are over: a loop that waited for one would never end."""
     ticks_over, waited = threading.Event(), []
     write = Journal.write
@@ -101,9 +99,7 @@ def test_a_disk_that_hangs_holds_up_no_tick(walls, description, tmp_path, monkey
         bus.close()
 
 
-def test_a_status_that_counts_a_node_counts_it_as_unsent_too(
-    walls, description, tmp_path, monkeypatch
-) -> None:
+def test_a_status_that_counts_a_node_counts_it_as_unsent_too(walls, description, tmp_path, monkeypatch):
     """Else the last node of a robot that is switched off then is taken for sent."""
     order: list[str] = []
     submit, report = Replicator.submit, FleetClient.report
@@ -126,7 +122,7 @@ def test_a_status_that_counts_a_node_counts_it_as_unsent_too(
     assert "sc" in ticks and "cc" not in ticks
 
 
-def test_a_disk_that_hangs_holds_up_no_mission() -> None:
+def test_a_disk_that_hangs_holds_up_no_mission():
     """An order comes, and a mission ends, while the disk hangs: the loop goes on, the sender waits."""
     over, kept = threading.Event(), []
 
@@ -155,7 +151,7 @@ def test_a_disk_that_hangs_holds_up_no_mission() -> None:
     assert kept == [True, True]
 
 
-def test_a_dead_network_holds_up_no_tick(walls, description, tmp_path) -> None:
+def test_a_dead_network_holds_up_no_tick(walls, description, tmp_path):
     """A machine that takes connections and never says a word."""
     deaf = socket.create_server(("127.0.0.1", 0))
     bus = ZenohBus(BusSettings(endpoints=(f"tcp/127.0.0.1:{deaf.getsockname()[1]}",)))
@@ -222,7 +218,7 @@ class Fleet:
 )
 def test_statuses_go_out_as_rarely_as_the_servers_want(
     description: RobotDescription, period: float, published: list[int]
-) -> None:
+):
     """Ticks of 0.1 s. With a question to the fleet one goes out at once."""
     slow, fleet = Slow([0.1] * 30, asks_at=2.35), Fleet(period)
     runner = Runner(slow, fleet, fleet, MissionControl("r0"), MappingMonitor(description), clock=slow.clock)
@@ -231,7 +227,7 @@ def test_statuses_go_out_as_rarely_as_the_servers_want(
     assert fleet.published == published
 
 
-def test_a_base_that_does_not_answer_is_reported(description: RobotDescription) -> None:
+def test_a_base_that_does_not_answer_is_reported(description: RobotDescription):
     """`the wheels do not obey: check motor power` was all that a person heard of a port that was gone."""
     slow, fleet = Slow([0.02] * 2), Fleet()
     runner = Runner(slow, fleet, fleet, MissionControl("r0"), MappingMonitor(description), clock=slow.clock)
@@ -240,7 +236,7 @@ def test_a_base_that_does_not_answer_is_reported(description: RobotDescription) 
         assert fleet.silent == words
 
 
-def test_images_that_come_during_a_long_tick_are_skipped_and_counted(description, caplog) -> None:
+def test_images_that_come_during_a_long_tick_are_skipped_and_counted(description, caplog):
     """A gap of the camera's own, in a loop that had waited for it, is no image skipped."""
     stamps = [0.1, 0.2, 0.6, 0.7, 1.5, 1.6, 5.0]
     durations = [0.02, 0.35, 0.02, 0.02, 0.15, 0.15, 0.02]
@@ -255,7 +251,7 @@ def test_images_that_come_during_a_long_tick_are_skipped_and_counted(description
     assert line == "a tick took 350 ms instead of 100: 3 images skipped so far"
 
 
-def test_a_recording_waits_for_the_loop(description, caplog) -> None:
+def test_a_recording_waits_for_the_loop(description, caplog):
     """Before, images that a recording lacks were reported as skipped, if the tick before took long."""
     robot = Player(description, [Observation(round(s * 1e9), Odometry(0.0, 0.0)) for s in (0.1, 0.6, 0.7)])
     slow, fleet = Slow([0.35, 0.35, 0.02]), Fleet()
@@ -266,7 +262,7 @@ def test_a_recording_waits_for_the_loop(description, caplog) -> None:
     assert runner.skipped == 0 and not caplog.messages
 
 
-def test_a_driver_may_reuse_the_memory_of_its_image_and_count_stamps_with_numpy(description) -> None:
+def test_a_driver_may_reuse_the_memory_of_its_image_and_count_stamps_with_numpy(description):
     """Else the last image becomes the next one: the camera is taken for frozen."""
     image = np.zeros((4, 4), np.uint8)
 

@@ -14,7 +14,7 @@ from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.pose import Pose2
 
 
-def test_the_floor_sees_a_node_that_is_put_again_once(walls, description, monkeypatch) -> None:
+def test_the_floor_sees_a_node_that_is_put_again_once(walls, description, monkeypatch):
     """Its image shows no more free floor, nor more obstacles, when its lengths are corrected."""
     node = walls.mapped(Mapper(MapId("r0", 1), description))
     made = MapMaking(MapId("r0", 1), OnlineCalibration(description), AgentSettings())
@@ -29,7 +29,7 @@ def test_the_floor_sees_a_node_that_is_put_again_once(walls, description, monkey
 @pytest.mark.parametrize(("lever_error", "losses"), [(0.0, 1), (10.0, 0)])
 def test_wheels_that_images_contradict_in_a_turn_lose_no_pose_while_the_camera_may_stand_elsewhere(
     lever_error: float, losses: int, walls, description, monkeypatch
-) -> None:
+):
     """As far as it may stand elsewhere by the calibration; whether it does is not its business here."""
     monkeypatch.setattr(OnlineCalibration, "lever_error", lever_error)
     made = MapMaking(MapId("r0", 1), OnlineCalibration(description), AgentSettings())
@@ -43,7 +43,7 @@ def test_wheels_that_images_contradict_in_a_turn_lose_no_pose_while_the_camera_m
     assert made.losses == losses
 
 
-def test_a_drive_by_hand_that_ends_in_the_middle_of_an_episode_leaves_a_node(walls, description) -> None:
+def test_a_drive_by_hand_that_ends_in_the_middle_of_an_episode_leaves_a_node(walls, description):
     """One that has not moved leaves none: it knows no depths."""
     for steps, nodes in ((1, 0), (8, 1)):
         made = MapMaking(MapId("r0", 1), OnlineCalibration(description), AgentSettings())

@@ -1,7 +1,5 @@
 """Causes of no nodes: each is named, by a robot that drives before photographs or has something broken."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -88,7 +86,7 @@ def dead_encoders(seen: Observation) -> Observation:
         ("dead motors", Command(), "the robot stands still"),
     ],
 )
-def test_a_cause_is_named_once(drive, description, broken, command, words) -> None:
+def test_a_cause_is_named_once(drive, description, broken, command, words):
     def other_camera(seen: Observation) -> Observation:
         return replace(seen, image=drive[0].image)
 
@@ -100,13 +98,13 @@ def test_a_cause_is_named_once(drive, description, broken, command, words) -> No
     assert line.startswith(f"no new node for {PATIENCE:.0f} s: ") and words in line
 
 
-def test_what_the_pipeline_says_itself_is_reported(drive, description) -> None:
+def test_what_the_pipeline_says_itself_is_reported(drive, description):
     assert lines(drive, description, working, PATIENCE + 5.0) == [
         f"no new node for {PATIENCE:.0f} s: mapping: 9 tracks"
     ]
 
 
-def test_a_robot_that_explores_says_itself_why_it_stands(drive, description) -> None:
+def test_a_robot_that_explores_says_itself_why_it_stands(drive, description):
     def stands(seen: Observation) -> Observation:
         return replace(dead_encoders(seen), image=drive[0].image)
 
@@ -116,24 +114,24 @@ def test_a_robot_that_explores_says_itself_why_it_stands(drive, description) -> 
     assert line.endswith(": mapping: 9 tracks"), "a person moves in front of it"
 
 
-def test_a_robot_that_is_pushed_has_encoders(drive, description) -> None:
+def test_a_robot_that_is_pushed_has_encoders(drive, description):
     """A person drives it, so it has no commands, and its wheels count."""
     (line,) = lines(drive, description, working, PATIENCE + 5.0, Command())
     assert line.endswith(": mapping: 9 tracks")
 
 
-def test_an_idle_robot_says_that_it_is_idle(drive, description) -> None:
+def test_an_idle_robot_says_that_it_is_idle(drive, description):
     (line,) = lines(drive, description, working, PATIENCE + 5.0, Command(), "idle")
     assert "the mission is idle" in line
 
 
-def test_a_robot_that_maps_or_navigates_reports_nothing(drive, description) -> None:
+def test_a_robot_that_maps_or_navigates_reports_nothing(drive, description):
     assert lines(drive, description, working, PATIENCE + 5.0, nodes_per_s=0.1) == []
     assert lines(drive, description, covered, PATIENCE + 5.0, mission="goto") == []
 
 
 @pytest.mark.parametrize("jump", [3600.0, -0.5])
-def test_a_clock_that_jumps_is_no_time_without_a_node(drive, description, jump: float) -> None:
+def test_a_clock_that_jumps_is_no_time_without_a_node(drive, description, jump: float):
     """There was no new node for 2522887204 s once its clock was set."""
 
     def set_once(seen: Observation) -> Observation:
@@ -145,7 +143,7 @@ def test_a_clock_that_jumps_is_no_time_without_a_node(drive, description, jump: 
     assert line.startswith(f"no new node for {PATIENCE:.0f} s: ")
 
 
-def test_another_cause_is_reported_later(drive, description) -> None:
+def test_another_cause_is_reported_later(drive, description):
     """The lens is covered, and then the camera unplugged."""
 
     def twice(seen: Observation) -> Observation:

@@ -1,9 +1,6 @@
 """Which mission holds: orders that come twice, late or never, robots switched off, servers that go."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -67,7 +64,7 @@ given_orders = st.lists(
 
 
 @given(given_orders, st.data())
-def test_the_newest_order_holds_however_they_come(orders: list[MissionOrder], data: st.DataObject) -> None:
+def test_the_newest_order_holds_however_they_come(orders: list[MissionOrder], data: st.DataObject):
     """Lost, doubled, out of order, with steps of the robot and power failures in between."""
     disk = Disk()
     control, over, arrived = disk.robot(), {}, set()
@@ -106,7 +103,7 @@ FAR_AHEAD = (2 * MOST_APART_NS, MAX_STAMP_NS - 1, MAX_STAMP_NS)
 
 @pytest.mark.parametrize("kind", [MissionKind.GO, MissionKind.EXPLORE, MissionKind.STOP])
 @pytest.mark.parametrize("over", [False, True])
-def test_no_stamp_keeps_a_robot_from_later_orders(kind: MissionKind, over: bool) -> None:
+def test_no_stamp_keeps_a_robot_from_later_orders(kind: MissionKind, over: bool):
     """One clock is wrong then, and the order that comes later holds, also after a restart."""
     disk = Disk()
     control = disk.robot()
@@ -125,7 +122,7 @@ def test_no_stamp_keeps_a_robot_from_later_orders(kind: MissionKind, over: bool)
             assert robot.next(True, 0.0, HOME) in (as_mission(later), None)
 
 
-def test_the_mission_of_a_start_holds_whatever_was_kept() -> None:
+def test_the_mission_of_a_start_holds_whatever_was_kept():
     disk = Disk()
     disk.robot().take(order(MAX_STAMP_NS, MissionKind.EXPLORE))
     control = disk.robot()
@@ -134,7 +131,7 @@ def test_the_mission_of_a_start_holds_whatever_was_kept() -> None:
 
 
 @given(st.integers(0, MAX_STAMP_NS), st.integers(0, MAX_STAMP_NS))
-def test_an_order_that_is_given_now_replaces_the_one_that_holds(now_ns: int, than_ns: int) -> None:
+def test_an_order_that_is_given_now_replaces_the_one_that_holds(now_ns: int, than_ns: int):
     """But for the last stamps that there are."""
     stamp_ns = later_stamp(now_ns, than_ns)
     assert 0 <= stamp_ns <= MAX_STAMP_NS
@@ -142,7 +139,7 @@ def test_an_order_that_is_given_now_replaces_the_one_that_holds(now_ns: int, tha
         assert order(stamp_ns, name="a").replaces(order(than_ns, name="b"))
 
 
-def test_a_goal_that_is_known_not_to_exist_is_refused_and_the_mission_goes_on() -> None:
+def test_a_goal_that_is_known_not_to_exist_is_refused_and_the_mission_goes_on():
     control = Disk().robot()
     control.take(order(1))
     assert control.take(order(2, node=NOWHERE)) == MissionReport(
@@ -151,7 +148,7 @@ def test_a_goal_that_is_known_not_to_exist_is_refused_and_the_mission_goes_on() 
     assert control.report == MissionReport(order(1), MissionState.RUNNING)
 
 
-def test_the_end_is_reported_with_its_reason() -> None:
+def test_the_end_is_reported_with_its_reason():
     for end, state in (
         (status(finished=True), MissionState.DONE),
         (status(given_up=True), MissionState.FAILED),
@@ -166,7 +163,7 @@ def test_the_end_is_reported_with_its_reason() -> None:
         assert control.next(True, 1.0, None) is None, "it holds its place"
 
 
-def test_an_order_that_comes_during_a_tick_is_not_ended_by_what_the_one_before_has_reached() -> None:
+def test_an_order_that_comes_during_a_tick_is_not_ended_by_what_the_one_before_has_reached():
     control = Disk().robot()
     control.take(order(1))
     control.next(True, 0.0, None)
@@ -175,7 +172,7 @@ def test_an_order_that_comes_during_a_tick_is_not_ended_by_what_the_one_before_h
     assert control.report == MissionReport(order(2, node=HOME), MissionState.RUNNING)
 
 
-def test_a_robot_that_is_switched_on_again_goes_on(tmp_path: Path) -> None:
+def test_a_robot_that_is_switched_on_again_goes_on(tmp_path):
     """By the real journal: it seeks the goal that it had, and not one that it has reached."""
 
     def restarted(*ends: Status) -> MissionControl:
@@ -205,7 +202,7 @@ def test_a_robot_that_is_switched_on_again_goes_on(tmp_path: Path) -> None:
     assert again.take(explored.order).state is MissionState.REPLACED
 
 
-def test_a_robot_that_is_switched_on_again_goes_on_from_the_stop_and_the_portal_where_it_was() -> None:
+def test_a_robot_that_is_switched_on_again_goes_on_from_the_stop_and_the_portal_where_it_was():
     """A power failure at any moment of a drive with two stops and a lift."""
     disk, stops = Disk(), (HOME, NodeId("r0", 1, 2))
     portal = PortalWait(PortalStop("lift", PortalMeans.LIFT, HOME, GOAL, "2"))
@@ -236,7 +233,7 @@ def test_a_robot_that_is_switched_on_again_goes_on_from_the_stop_and_the_portal_
         disk.robot().portal_done("bob")
 
 
-def test_a_full_disk_does_not_keep_a_robot_from_stopping() -> None:
+def test_a_full_disk_does_not_keep_a_robot_from_stopping():
     def full(reports) -> None:
         raise InvalidFile("no space left")
 
@@ -246,12 +243,12 @@ def test_a_full_disk_does_not_keep_a_robot_from_stopping() -> None:
     assert control.next(True, 0.0, None) == Idle()
 
 
-def test_an_order_for_another_robot_is_refused() -> None:
+def test_an_order_for_another_robot_is_refused():
     with pytest.raises(InvalidValue, match="a mission of r0 came to r1"):
         MissionControl("r1").take(order(1))
 
 
-def test_many_missions_do_not_fill_the_disk() -> None:
+def test_many_missions_do_not_fill_the_disk():
     control = MissionControl("r0")
     for stamp in range(MAX_KEPT + 20):
         control.take(order(stamp))
@@ -269,7 +266,7 @@ def test_many_missions_do_not_fill_the_disk() -> None:
         (WithoutServer.HOME, None, Idle(), "stands: no map server for 10 s"),
     ],
 )
-def test_a_robot_whose_server_is_gone_does_as_it_is_set(setting, home, does, reason) -> None:
+def test_a_robot_whose_server_is_gone_does_as_it_is_set(setting, home, does, reason):
     control = Disk().robot(setting)
     control.take(order(1, MissionKind.EXPLORE))
     assert control.next(True, 0.0, home) == Explore()
@@ -295,9 +292,7 @@ DRIVING = Status("driving", "to r0.1.4", 0, 0, Pose2(), False, "goto")
         (WithoutServer.GO_ON, DRIVING, "driving", "to r0.1.4"),
     ],
 )
-def test_a_robot_that_stands_or_goes_home_says_that_it_is_for_the_server(
-    setting, status, doing, detail
-) -> None:
+def test_a_robot_that_stands_or_goes_home_says_that_it_is_for_the_server(setting, status, doing, detail):
     control = Disk().robot(setting)
     control.take(order(1))
     control.next(True, 0.0, HOME)
@@ -310,7 +305,7 @@ def test_a_robot_that_stands_or_goes_home_says_that_it_is_for_the_server(
 
 
 @pytest.mark.parametrize("setting", [WithoutServer.STAND, WithoutServer.HOME])
-def test_a_robot_that_was_stopped_stands_for_that_and_not_for_the_server(setting: WithoutServer) -> None:
+def test_a_robot_that_was_stopped_stands_for_that_and_not_for_the_server(setting: WithoutServer):
     control = Disk().robot(setting)
     control.take(order(1, MissionKind.STOP))
     assert control.next(True, 0.0, HOME) == Idle()
@@ -320,7 +315,7 @@ def test_a_robot_that_was_stopped_stands_for_that_and_not_for_the_server(setting
     assert control.report is not None and control.report.reason == "no mission; no camera"
 
 
-def test_a_robot_that_has_parked_stays_parked_while_the_server_is_gone_and_after() -> None:
+def test_a_robot_that_has_parked_stays_parked_while_the_server_is_gone_and_after():
     control = Disk().robot(WithoutServer.STAND)
     control.take(order(1))
     assert isinstance(control.next(True, 0.0, HOME), GoTo)
@@ -329,7 +324,7 @@ def test_a_robot_that_has_parked_stays_parked_while_the_server_is_gone_and_after
         assert control.next(linked, now, HOME) is None, "it stands already, and knows where"
 
 
-def test_a_stop_ends_the_drive_home_of_a_robot_whose_server_is_gone() -> None:
+def test_a_stop_ends_the_drive_home_of_a_robot_whose_server_is_gone():
     control = Disk().robot(WithoutServer.HOME)
     control.take(order(1))
     control.next(True, 0.0, HOME)
@@ -340,7 +335,7 @@ def test_a_stop_ends_the_drive_home_of_a_robot_whose_server_is_gone() -> None:
     assert control.report is not None and control.report.state is MissionState.DONE
 
 
-def test_a_recording_takes_no_orders() -> None:
+def test_a_recording_takes_no_orders():
     control = MissionControl("r0", refusal="a recording takes no orders")
     control.begin(MissionKind.CARRIED)
     report = control.take(order(2**62, MissionKind.STOP))

@@ -1,7 +1,5 @@
 """Asking: a busy server is asked again when it said, and a robot's patience has an end. And moving."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -40,7 +38,7 @@ def ask(
             answers = answers if answer is None else (answer,)
 
 
-def test_a_busy_server_is_asked_again_at_its_time() -> None:
+def test_a_busy_server_is_asked_again_at_its_time():
     def fleet(n: int, question: Question) -> ServerAnswer:
         pauses = (0.8, 2.0)
         if n < len(pauses):
@@ -55,13 +53,13 @@ def test_a_busy_server_is_asked_again_at_its_time() -> None:
     assert asked[2] - asked[1] == pytest.approx(2.1, abs=0.11)
 
 
-def test_a_server_that_stays_busy_is_left_with_its_retry_time() -> None:
+def test_a_server_that_stays_busy_is_left_with_its_retry_time():
     answer, asked = ask(lambda _, question: ServerAnswer(question.number, None, "busy", 1.5), patience=50)
     assert (answer.content, answer.error, answer.retry_after) == (None, "busy", 1.5)
     assert len(asked) == 4
 
 
-def test_another_refusal_is_final_and_silence_is_waited_for() -> None:
+def test_another_refusal_is_final_and_silence_is_waited_for():
     answer, asked = ask(lambda _, question: ServerAnswer(question.number, None, "no such node"))
     assert (answer.error, len(asked)) == ("no such node", 1)
     answer, asked = ask(lambda *_: None, patience=7)
@@ -79,7 +77,7 @@ BEARINGS = tuple(np.linspace(-math.pi, math.pi, 8, endpoint=False).tolist())
         ([0.3, 0.3, 2, 2, 2, 2.5, 3, 2], 0.5, 2),
     ],
 )
-def test_it_goes_where_there_is_most_room_or_enough(readings, most, freest) -> None:
+def test_it_goes_where_there_is_most_room_or_enough(readings, most, freest):
     motion = MotionPrimitives(RobotDescription(BODY.camera, ranger_bearings=BEARINGS, ranger_reach=3.0))
     motion.take_in(Observation(0, Odometry(0.0, 0.0), None, np.array(readings, dtype=float)), ())
     way, direction = motion.freest(most)
@@ -88,13 +86,13 @@ def test_it_goes_where_there_is_most_room_or_enough(readings, most, freest) -> N
     assert all(min(motion.room(bearing), most) <= way for bearing in BEARINGS)
 
 
-def test_without_rangers_there_is_no_room() -> None:
+def test_without_rangers_there_is_no_room():
     motion = MotionPrimitives(BODY)
     motion.take_in(Observation(0, Odometry(0.0, 0.0), None), ())
     assert motion.freest() == (0.0, 0.0)
 
 
-def test_a_robot_that_cannot_turn_gives_up() -> None:
+def test_a_robot_that_cannot_turn_gives_up():
     motion = MotionPrimitives(BODY)
     motion.take_in(Observation(0, Odometry(0.0, 0.0), None), ())
     assert len(list(motion.turn(0.6, 0.6))) <= 32

@@ -1,7 +1,5 @@
 """Surprises that once bent a map: a wall much nearer than expected, and a place that looks like another."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import numpy as np

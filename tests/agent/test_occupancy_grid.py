@@ -1,7 +1,5 @@
 """The floor against geometry of its own, and its ways against another search."""
 
-from __future__ import annotations
-
 import math
 
 import networkx as nx

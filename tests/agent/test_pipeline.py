@@ -1,7 +1,5 @@
 """The whole pipeline on photographs hung on walls: the same again, without any of its inputs, and safe."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

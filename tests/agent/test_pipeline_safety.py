@@ -1,7 +1,5 @@
 """The whole pipeline never drives into what it sees, nor on and on against what it does not see."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The codec of bases behind the bus, and the driver's patience."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -79,10 +77,7 @@ reals = st.floats(-1e3, 1e3)
     st.booleans(),
     st.randoms(use_true_random=False),
 )
-def test_an_observation_survives_exactly(
-    stamp: int, odometry: tuple[float, float], shape: tuple[int, int] | None,
-    proximity: list[float], bumped: bool, kidnapped: bool, random: Any,
-) -> None:  # fmt: skip
+def test_an_observation_survives_exactly(stamp, odometry, shape, proximity, bumped, kidnapped, random):
     image = None
     if shape is not None:
         image = np.frombuffer(random.randbytes(shape[0] * shape[1]), np.uint8).reshape(shape)
@@ -91,24 +86,24 @@ def test_an_observation_survives_exactly(
 
 
 @given(st.integers(1, 2**53), reals, reals)
-def test_a_step_survives_exactly(sequence: int, forward: float, turn: float) -> None:
+def test_a_step_survives_exactly(sequence: int, forward: float, turn: float):
     step = StepRequest(sequence, Command(forward, turn))
     assert decode_step(encode_step(step)) == step
 
 
-def test_a_description_survives_exactly() -> None:
+def test_a_description_survives_exactly():
     for description in (DESCRIPTION, FISHEYE):
         assert decode_description(encode_description(description)) == description
 
 
-def test_a_sliced_image_is_sent_correctly() -> None:
+def test_a_sliced_image_is_sent_correctly():
     image = np.arange(100, dtype=np.uint8).reshape(10, 10)[::2, ::3]
     decoded = decode_observation(encode_observation(an_observation(image))).image
     assert decoded is not None
     np.testing.assert_array_equal(decoded, image)
 
 
-def test_a_decoded_image_works_with_opencv_though_it_is_read_only() -> None:
+def test_a_decoded_image_works_with_opencv_though_it_is_read_only():
     rng = np.random.default_rng(5)
     image = cv2.resize(rng.integers(0, 256, (30, 40), dtype=np.uint8), (320, 240))
     decoded = decode_observation(encode_observation(an_observation(np.asarray(image, np.uint8)))).image
@@ -119,7 +114,7 @@ def test_a_decoded_image_works_with_opencv_though_it_is_read_only() -> None:
 
 
 @pytest.mark.parametrize(("encoding", "suffix", "error"), [("png", ".png", 0), ("jpeg", ".jpg", 3)])
-def test_a_compressed_image_is_decoded(encoding: str, suffix: str, error: int) -> None:
+def test_a_compressed_image_is_decoded(encoding: str, suffix: str, error: int):
     y, x = np.mgrid[:48, :64]
     image = (2 * x + y).astype(np.uint8)
     data = encode_observation(an_observation(image))
@@ -142,7 +137,7 @@ def test_a_compressed_image_is_decoded(encoding: str, suffix: str, error: int) -
         {"encoding": "png"}, {"encoding": "jpeg"}, {"encoding": "png", "i": b""}, {"encoding": 1},
     ],
 )  # fmt: skip
-def test_a_wrong_observation_is_refused(fields: dict[str, object]) -> None:
+def test_a_wrong_observation_is_refused(fields: dict[str, object]):
     data = encode_observation(an_observation(np.zeros((10, 10), np.uint8)))
     decode_observation(changed(data))
     with pytest.raises(InvalidMessage):
@@ -157,13 +152,13 @@ def test_a_wrong_observation_is_refused(fields: dict[str, object]) -> None:
         {"tick": 0.0}, {"tick": "soon"},
     ],
 )  # fmt: skip
-def test_a_wrong_description_is_refused(fields: dict[str, object]) -> None:
+def test_a_wrong_description_is_refused(fields: dict[str, object]):
     with pytest.raises(InvalidMessage):
         decode_description(changed(encode_description(DESCRIPTION), **fields))
 
 
 @pytest.mark.parametrize("fields", [{"q": 0}, {"q": 1.5}, {"c": [0.0]}, {"c": [0.0, float("nan")]}])
-def test_a_wrong_step_is_refused(fields: dict[str, object]) -> None:
+def test_a_wrong_step_is_refused(fields: dict[str, object]):
     with pytest.raises(InvalidMessage):
         decode_step(changed(encode_step(StepRequest(1, Command())), **fields))
 
@@ -180,7 +175,7 @@ MESSAGES: list[tuple[bytes, Callable[[bytes], object]]] = [
 @given(st.sampled_from(MESSAGES), st.data())
 def test_damaged_bytes_decode_or_are_refused_but_never_fail_otherwise(
     message: tuple[bytes, Callable[[bytes], object]], data: st.DataObject
-) -> None:
+):
     encoded, decode = message
     damaged = bytearray(encoded)
     for _ in range(data.draw(st.integers(1, 4))):
@@ -193,7 +188,7 @@ def test_damaged_bytes_decode_or_are_refused_but_never_fail_otherwise(
             assert "\n" not in str(error)
 
 
-def test_an_image_of_another_type_is_not_sent() -> None:
+def test_an_image_of_another_type_is_not_sent():
     with pytest.raises(InvalidValue, match="uint8"):
         encode_observation(an_observation(np.zeros((4, 4, 3), np.uint8)))
 
@@ -236,7 +231,7 @@ def bus(hub: MemoryHub) -> Iterator[MemoryBus]:
     made.close()
 
 
-def test_commands_are_clipped_and_travel_with_the_next_step(body: Body, bus: MemoryBus) -> None:
+def test_commands_are_clipped_and_travel_with_the_next_step(body: Body, bus: MemoryBus):
     robot = RemoteRobot(bus, "test", "r0")
     assert robot.describe() == DESCRIPTION
     observation = robot.sense()
@@ -257,8 +252,8 @@ def test_commands_are_clipped_and_travel_with_the_next_step(body: Body, bus: Mem
 
 
 def test_silence_and_a_busy_bus_are_asked_again_under_the_same_number(
-    body: Body, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    body: Body, bus: MemoryBus, monkeypatch
+):
     monkeypatch.setattr("mapweave.agent.drivers.remote.ASK_TIMEOUT", 0.05)
     body.answers = [reply, silence, lambda r: r.refuse(f"too busy, {AGAIN}"), reply]
     robot = RemoteRobot(bus, "test", "r0")
@@ -267,7 +262,7 @@ def test_silence_and_a_busy_bus_are_asked_again_under_the_same_number(
     assert [step.sequence for step in body.steps] == [1, 2, 2, 2]
 
 
-def test_a_step_that_failed_is_asked_again_under_its_own_number(body: Body, bus: MemoryBus) -> None:
+def test_a_step_that_failed_is_asked_again_under_its_own_number(body: Body, bus: MemoryBus):
     body.answers = [lambda r: r.refuse("broken wheel"), reply]
     robot = RemoteRobot(bus, "test", "r0")
     with pytest.raises(DeviceError, match="robot/r0/step: refused: broken wheel"):
@@ -281,9 +276,8 @@ def reported(caplog: pytest.LogCaptureFixture) -> list[str]:
 
 
 def test_a_base_that_vanishes_is_reported_and_stands_when_it_is_back(
-    hub: MemoryHub, body: Body, bus: MemoryBus,
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
-) -> None:  # fmt: skip
+    hub: MemoryHub, body: Body, bus: MemoryBus, monkeypatch, caplog
+):
     monkeypatch.setattr("mapweave.agent.drivers.remote.ASK_TIMEOUT", 0.2)
     robot = RemoteRobot(bus, "test", "r0")
     robot.sense()
@@ -305,8 +299,8 @@ def test_a_base_that_vanishes_is_reported_and_stands_when_it_is_back(
 
 
 def test_a_slow_simulation_is_not_taken_for_a_base_that_is_gone(
-    body: Body, bus: MemoryBus, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+    body: Body, bus: MemoryBus, monkeypatch, caplog
+):
     monkeypatch.setattr("mapweave.agent.drivers.remote.ASK_TIMEOUT", 0.05)
     robot = RemoteRobot(bus, "test", "r0")
     robot.sense()
@@ -321,12 +315,12 @@ def test_a_slow_simulation_is_not_taken_for_a_base_that_is_gone(
     ]
 
 
-def test_the_end_of_the_simulation_is_no_failure(body: Body, bus: MemoryBus) -> None:
+def test_the_end_of_the_simulation_is_no_failure(body: Body, bus: MemoryBus):
     body.answers = [lambda r: r.refuse(ENDED)]
     assert RemoteRobot(bus, "test", "r0").sense() is None
 
 
-def test_a_broken_answer_is_a_device_error(body: Body, bus: MemoryBus) -> None:
+def test_a_broken_answer_is_a_device_error(body: Body, bus: MemoryBus):
     body.answers = [lambda r: r.reply(b"\x80")] * 2
     with pytest.raises(DeviceError, match="robot/r0/step: observation: Object missing required field `v`"):
         RemoteRobot(bus, "test", "r0").sense()
@@ -349,7 +343,7 @@ def far_away(request: Request) -> None:
 )
 def test_an_impossible_observation_is_retried_once_then_refused_in_one_line(
     body: Body, bus: MemoryBus, answer: Callable[[Request], None], reason: str
-) -> None:
+):
     robot = RemoteRobot(bus, "test", "r0")
     body.answers = [answer, reply]
     observation = robot.sense()
@@ -362,7 +356,7 @@ def test_an_impossible_observation_is_retried_once_then_refused_in_one_line(
     assert [step.sequence for step in body.steps] == [1, 1, 2, 2]
 
 
-def test_a_base_that_is_there_and_silent_is_not_said_to_be_missing(body: Body, bus: MemoryBus) -> None:
+def test_a_base_that_is_there_and_silent_is_not_said_to_be_missing(body: Body, bus: MemoryBus):
     """A simulated one waits for the agents of its other robots. Before, a person was sent to start it."""
     robot = RemoteRobot(bus, "test", "r0", patience=0.2)
     robot.describe()
@@ -371,7 +365,7 @@ def test_a_base_that_is_there_and_silent_is_not_said_to_be_missing(body: Body, b
         robot.sense()
 
 
-def test_a_missing_base_is_reported_in_one_line(bus: MemoryBus) -> None:
+def test_a_missing_base_is_reported_in_one_line(bus: MemoryBus):
     begin = time.monotonic()
     with pytest.raises(DeviceError, match=r"robot/r0/describe: no answer .*mapweave sim") as error:
         RemoteRobot(bus, "test", "r0", patience=0.2).describe()
@@ -379,7 +373,7 @@ def test_a_missing_base_is_reported_in_one_line(bus: MemoryBus) -> None:
     assert "\n" not in str(error.value)
 
 
-def test_stopping_while_waiting_is_not_reported_as_the_end_of_a_simulation(bus: MemoryBus) -> None:
+def test_stopping_while_waiting_is_not_reported_as_the_end_of_a_simulation(bus: MemoryBus):
     robot = RemoteRobot(bus, "test", "r0", patience=20.0)
     stop = threading.Timer(0.1, robot.close)
     stop.start()
@@ -388,18 +382,18 @@ def test_stopping_while_waiting_is_not_reported_as_the_end_of_a_simulation(bus: 
     stop.join()
 
 
-def test_a_simulated_base_that_waits_for_another_robot_is_not_given_up() -> None:
+def test_a_simulated_base_that_waits_for_another_robot_is_not_given_up():
     assert simulator.PATIENCE + ASK_TIMEOUT < PATIENCE
 
 
-def test_two_bases_of_one_name_are_refused(hub: MemoryHub, body: Body, bus: MemoryBus) -> None:
+def test_two_bases_of_one_name_are_refused(hub: MemoryHub, body: Body, bus: MemoryBus):
     second = Body(hub)
     with pytest.raises(DeviceError, match="2 bases answer"):
         RemoteRobot(bus, "test", "r0").sense()
     second.bus.close()
 
 
-def test_a_base_that_starts_late_is_found(hub: MemoryHub, bus: MemoryBus) -> None:
+def test_a_base_that_starts_late_is_found(hub: MemoryHub, bus: MemoryBus):
     made: list[Body] = []
     late = threading.Timer(0.2, lambda: made.append(Body(hub)))
     late.start()
@@ -408,14 +402,14 @@ def test_a_base_that_starts_late_is_found(hub: MemoryHub, bus: MemoryBus) -> Non
     made[0].bus.close()
 
 
-def test_a_closed_robot_senses_nothing(body: Body, bus: MemoryBus) -> None:
+def test_a_closed_robot_senses_nothing(body: Body, bus: MemoryBus):
     robot = RemoteRobot(bus, "test", "r0")
     robot.close()
     assert robot.sense() is None
     assert body.steps == []
 
 
-def test_a_second_simulator_ends_before_it_disturbs_the_first() -> None:
+def test_a_second_simulator_ends_before_it_disturbs_the_first():
     """Its base would answer as well, and the agent that drives the first one ends then."""
     hub = MemoryHub()
     first, second = MemoryBus(hub), MemoryBus(hub)

@@ -1,7 +1,5 @@
 """Recordings: a small one is written here, then read right, or refused in one line."""
 
-from __future__ import annotations
-
 import csv
 import math
 import shutil

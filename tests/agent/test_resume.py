@@ -1,7 +1,5 @@
 """Agents that are killed, moved, driven or carried off map on in the simulator, and the map stays true."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path
@@ -146,9 +144,7 @@ def again(begun: Begun, tmp_path_factory: pytest.TempPathFactory) -> tuple[Life,
 
 
 @pytest.mark.slow
-def test_an_agent_that_was_killed_goes_on_with_its_map(
-    begun: Begun, again: tuple[Life, dict[NodeId, Pose2]]
-) -> None:
+def test_an_agent_that_was_killed_goes_on_with_its_map(begun: Begun, again: tuple[Life, dict[NodeId, Pose2]]):
     life, truth = again
     check_resumed(begun, life, truth)
     assert life.said[0] == "looking for a place of its own map"
@@ -161,7 +157,7 @@ def test_an_agent_that_was_killed_goes_on_with_its_map(
 
 
 @pytest.mark.slow
-def test_the_journal_replays_to_the_resumed_map(again: tuple[Life, dict[NodeId, Pose2]]) -> None:
+def test_the_journal_replays_to_the_resumed_map(again: tuple[Life, dict[NodeId, Pose2]]):
     life, _ = again
     kept, now = HybridMap(RetainedMap.of(life.journal, MapId(ROBOT, 1)).contents), life.pipeline.map
     assert list(kept.nodes) == list(now.nodes)
@@ -177,8 +173,8 @@ def test_the_journal_replays_to_the_resumed_map(again: tuple[Life, dict[NodeId, 
 
 @pytest.mark.slow
 def test_resuming_again_is_the_same_to_the_last_bit(
-    begun: Begun, again: tuple[Life, dict[NodeId, Pose2]], tmp_path: Path
-) -> None:
+    begun: Begun, again: tuple[Life, dict[NodeId, Pose2]], tmp_path
+):
     once, twice = again[0], resumed(begun, tmp_path, begun.standing, LOOKS)[0]
     one, two = ([encode_body(b) for b in life.pipeline.map.contents()] for life in (once, twice))
     assert one == two
@@ -196,7 +192,7 @@ def moved(begun: Begun) -> Pose2:
 
 
 @pytest.mark.slow
-def test_an_agent_that_was_killed_and_moved(begun: Begun, tmp_path: Path) -> None:
+def test_an_agent_that_was_killed_and_moved(begun: Begun, tmp_path):
     """The time until two views agree is luck; that they do, and are right, is not."""
     life, _ = resumed(begun, tmp_path, moved(begun), 1.0)
     life.map_on(90.0)
@@ -204,7 +200,7 @@ def test_an_agent_that_was_killed_and_moved(begun: Begun, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_nothing_is_appended_where_nothing_is_recognised(begun: Begun, tmp_path: Path) -> None:
+def test_nothing_is_appended_where_nothing_is_recognised(begun: Begun, tmp_path):
     """It starts in a room that it has never seen, turns there, and adds nothing."""
     rooms = [
         r for r in begun.world.plan.rooms if math.hypot(r.x - begun.standing.x, r.y - begun.standing.y) > 3
@@ -221,7 +217,7 @@ def test_nothing_is_appended_where_nothing_is_recognised(begun: Begun, tmp_path:
 
 
 @pytest.mark.slow
-def test_after_a_drive_to_a_goal_it_maps_on(begun: Begun, tmp_path: Path) -> None:
+def test_after_a_drive_to_a_goal_it_maps_on(begun: Begun, tmp_path):
     life, _ = resumed(begun, tmp_path, begun.standing, 1.0)
     life.pipeline.set_mission(GoTo(NodeId("r1", 1, 1)))
     life.live(3.0)
@@ -236,7 +232,7 @@ def test_after_a_drive_to_a_goal_it_maps_on(begun: Begun, tmp_path: Path) -> Non
 
 
 @pytest.mark.slow
-def test_a_kidnapped_explorer_maps_on_and_adds_no_false_edge(begun: Begun, tmp_path: Path) -> None:
+def test_a_kidnapped_explorer_maps_on_and_adds_no_false_edge(begun: Begun, tmp_path):
     """It knows where it is, drives on, and is put down elsewhere between two ticks, turned around."""
     life, _ = resumed(begun, tmp_path, begun.standing, 1.0)
     life.map_on(60.0)
@@ -254,7 +250,7 @@ def test_a_kidnapped_explorer_maps_on_and_adds_no_false_edge(begun: Begun, tmp_p
     "seed",
     [pytest.param(s, marks=pytest.mark.slow if s < 6 else pytest.mark.scenario) for s in range(4, 9)],
 )
-def test_kidnapped_again_and_again(tmp_path: Path, seed: int) -> None:
+def test_kidnapped_again_and_again(tmp_path, seed: int):
     world, rng = make_world("office", seed, rooms=3), np.random.default_rng(seed)
     life = Life(world, Journal(tmp_path / "r0.sqlite", ROBOT))
     for _ in range(6):

@@ -1,7 +1,5 @@
 """A robot lets superseded nodes go while it maps or rests: only those that the fleet can do without."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -51,7 +49,7 @@ def retired(pipeline: Pipeline, days: int) -> list[NodeId]:
     return gone
 
 
-def test_it_does_so_while_it_rests_and_not_on_a_drive_to_a_goal(own: SurveyedMap) -> None:
+def test_it_does_so_while_it_rests_and_not_on_a_drive_to_a_goal(own: SurveyedMap):
     contents = tuple(own.map.contents())
     resting = Pipeline(MAP, DESCRIPTION, None, contents, 1000)
     assert not retired(resting, 10), "too soon"
@@ -71,7 +69,7 @@ def agent(own: SurveyedMap, tmp_path: Path) -> Iterator[tuple[Agent, MemoryBus]]
     agent.close()
 
 
-def test_what_a_server_has_it_must_have_let_go(own: SurveyedMap, agent: tuple[Agent, MemoryBus]) -> None:
+def test_what_a_server_has_it_must_have_let_go(own: SurveyedMap, agent: tuple[Agent, MemoryBus]):
     robot, server = agent
     old, new = NodeId(*MAP, 1), NodeId(*MAP, 2)
     assert robot._released(old, new), "no server knows it"
@@ -98,9 +96,7 @@ def test_what_a_server_has_it_must_have_let_go(own: SurveyedMap, agent: tuple[Ag
     serving.close()
 
 
-def test_a_map_that_it_has_left_goes_when_its_server_has_pruned_all_of_it(
-    own: SurveyedMap, tmp_path: Path
-) -> None:
+def test_a_map_that_it_has_left_goes_when_its_server_has_pruned_all_of_it(own: SurveyedMap, tmp_path):
     journal = Journal(tmp_path / "r0.sqlite", "r0")
     journal.open_map(1)
     journal.append(MAP, own.map.contents(), 0)

@@ -1,7 +1,5 @@
 """Other robots in the image: where they may stand is no place for landmarks."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -60,7 +58,7 @@ def other(x: float, y: float, sigma: float = 0.02, age: float = 0.0, speed: floa
 @given(
     st.floats(0.8, 4.5), st.floats(-2.0, 2.0), st.floats(0.0, 0.1), st.floats(0.0, 1.0), st.integers(0, 2**32)
 )
-def test_wherever_the_other_may_be_its_body_is_in_the_region(x, y, sigma, age, seed) -> None:
+def test_wherever_the_other_may_be_its_body_is_in_the_region(x, y, sigma, age, seed):
     regions = Eyes(other(x, y, sigma, age)).seen
     assume(len(regions))
     random = np.random.default_rng(seed)
@@ -74,7 +72,7 @@ def test_wherever_the_other_may_be_its_body_is_in_the_region(x, y, sigma, age, s
     assert inside.all()
 
 
-def test_a_region_grows_with_age_until_it_is_given_up() -> None:
+def test_a_region_grows_with_age_until_it_is_given_up():
     def area(box: np.ndarray) -> float:
         return float(np.prod(box[2:] - box[:2]))
 
@@ -89,21 +87,21 @@ def test_a_region_grows_with_age_until_it_is_given_up() -> None:
     assert len(Eyes(other(3.0, 0.0, age=OLDEST + 0.1)).seen) == 0
 
 
-def test_what_is_too_uncertain_aside_behind_or_far_leaves_the_image_as_it_is() -> None:
+def test_what_is_too_uncertain_aside_behind_or_far_leaves_the_image_as_it_is():
     assert len(Eyes(other(1.5, 0.0)).seen) == 1
     for x, y, sigma in ((1.5, 0.0, 0.6), (1.5, 4.0, 0.02), (-1.5, 0.0, 0.02), (9.0, 0.0, 0.02)):
         assert len(Eyes(other(x, y, sigma)).seen) == 0
     assert len(Eyes(other(1.5, 0.0), other(3.0, 1.0)).seen) == 2
 
 
-def test_half_of_the_image_is_left_whatever_a_server_says() -> None:
+def test_half_of_the_image_is_left_whatever_a_server_says():
     claimed = [other(2.0, -1.0 + 0.125 * k, 0.05) for k in range(16)]
     regions = Eyes(*claimed).seen
     area = float(np.prod(regions[:, 2:] - regions[:, :2], axis=1).sum())
     assert 1 < len(regions) < 16 and area < 0.5 * CAMERA.width * CAMERA.height
 
 
-def test_the_region_goes_with_the_robots_own_motion() -> None:
+def test_the_region_goes_with_the_robots_own_motion():
     turned = Eyes(other(2.0, 0.0, speed=0.0))
     (box,) = turned.step(0.1, Odometry(0.0, math.radians(10.0)))
     middle = CAMERA.project(np.array([2.0 * math.cos(-0.1745), 2.0 * math.sin(-0.1745), 0.1]))
@@ -114,7 +112,7 @@ def test_the_region_goes_with_the_robots_own_motion() -> None:
     assert np.allclose(box, same)
 
 
-def test_a_robot_behind_a_wall_is_hidden() -> None:
+def test_a_robot_behind_a_wall_is_hidden():
     def wall(x: float, count: int = 6) -> LandmarkEstimates:
         points = np.column_stack([np.full(count, x), np.linspace(-0.05, 0.05, count), np.full(count, 0.28)])
         return LandmarkEstimates(
@@ -129,7 +127,7 @@ def test_a_robot_behind_a_wall_is_hidden() -> None:
     assert len(eyes.step(landmarks=nowhere)) == 1
 
 
-def test_it_asks_seldom_while_no_other_can_be_near() -> None:
+def test_it_asks_seldom_while_no_other_can_be_near():
     def due_after(eyes: Eyes) -> float:
         waited = 0.0
         while not eyes.others.due:
@@ -152,7 +150,7 @@ def test_it_asks_seldom_while_no_other_can_be_near() -> None:
     assert lost.due, "the question was lost; another one may get through"
 
 
-def test_a_node_has_no_landmark_where_another_robot_may_stand(node, walls, description) -> None:
+def test_a_node_has_no_landmark_where_another_robot_may_stand(node, walls, description):
     region = np.array([[60.0, 40.0, 200.0, 140.0]])
 
     def share(landmarks: Landmarks) -> float:
@@ -170,7 +168,7 @@ def test_a_node_has_no_landmark_where_another_robot_may_stand(node, walls, descr
     assert len(kept_out.landmarks) > 0.8 * len(node.landmarks), "others take their place"
 
 
-def test_the_pipeline_asks_once_it_is_on_its_map_and_marks_the_image(walls) -> None:
+def test_the_pipeline_asks_once_it_is_on_its_map_and_marks_the_image(walls):
     pipeline = on(Explore())
     seen: list[Observation] = []
     mapper_step = pipeline.mapper.step
@@ -194,7 +192,7 @@ def test_the_pipeline_asks_once_it_is_on_its_map_and_marks_the_image(walls) -> N
     assert there.distance(pipeline.mapper.map_from_robot.mean) < 0.05
 
 
-def test_a_robot_beside_this_one_is_named() -> None:
+def test_a_robot_beside_this_one_is_named():
     eyes = Eyes(other(0.5, 0.0), replace(other(0.4, -0.4), robot="r2"), replace(other(3.0, 0.0), robot="r3"))
 
     def words() -> str:

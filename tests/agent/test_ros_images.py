@@ -1,7 +1,5 @@
 """Images of ROS messages that are none: refused in one way, whatever is wrong with them."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any
 
@@ -19,7 +17,7 @@ def image(**changed: Any) -> SimpleNamespace:
 
 @pytest.mark.parametrize("encoding", CHANNELS)
 @pytest.mark.parametrize("size", [{"height": 0}, {"width": 0}, {"width": 0, "height": 2**32 - 1, "step": 0}])
-def test_an_empty_image_is_refused(encoding: str, size: dict[str, int]) -> None:
+def test_an_empty_image_is_refused(encoding: str, size: dict[str, int]):
     """One in colour ended an agent, or the replay of a bag, with a traceback of OpenCV."""
     assert grey_of(image(encoding=encoding)).shape == (3, 4)
     with pytest.raises(DeviceError, match=r"an image of \d+x\d+ px has 48 bytes"):
@@ -36,6 +34,6 @@ def test_an_empty_image_is_refused(encoding: str, size: dict[str, int]) -> None:
         (image(encoding="32FC1"), "are not supported"),
     ],
 )
-def test_what_is_no_image_is_refused_in_words(wrong: SimpleNamespace, words: str) -> None:
+def test_what_is_no_image_is_refused_in_words(wrong: SimpleNamespace, words: str):
     with pytest.raises(DeviceError, match=words):
         grey_of(wrong)

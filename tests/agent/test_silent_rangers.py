@@ -1,7 +1,5 @@
 """A robot whose proximity sensors are not read stands, says so, and goes on when they are."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np
@@ -104,7 +102,7 @@ def test_a_robot_that_promises_none_is_not_held_back_by_their_silence(walls):
     assert any(step.command != Command() for step in drive.run(20, NONE))
 
 
-def test_a_single_sensor_is_named() -> None:
+def test_a_single_sensor_is_named():
     monitor = RangerMonitor(RobotDescription(BODY.camera, ranger_bearings=(0.0,), ranger_reach=1.0))
     assert monitor.fault == ""
     monitor.see(np.zeros(0), Odometry(0.0, 0.0))

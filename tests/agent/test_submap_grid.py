@@ -1,7 +1,5 @@
 """A grid of submaps against a grid that was drawn with the true poses."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Teleoperation, the robot's side: the newest command, the dead man, who may drive."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -53,20 +51,20 @@ def robot(clock: Clock) -> Teleoperation:
 
 
 @given(st.integers(0, 2**53), SPEED, SPEED, st.integers(0, 2**63 - 1), st.booleans())
-def test_a_request_survives_the_wire(session, forward, turn, answer_ns, release) -> None:
+def test_a_request_survives_the_wire(session, forward, turn, answer_ns, release):
     request = DriveRequest(session, forward, turn, answer_ns, release)
     assert decode(encode(request), DriveRequest) == request
 
 
 @pytest.mark.parametrize("wrong", [{"forward": 1e7}, {"turn": math.nan}, {"session": -1}, {"answer_ns": -5}])
-def test_a_request_that_is_none_is_refused(wrong: dict[str, float]) -> None:
+def test_a_request_that_is_none_is_refused(wrong: dict[str, float]):
     good = {"v": 1, "session": 1, "forward": 0.1, "turn": 0.0, "answer_ns": 0, "release": False}
     assert decode(msgpack.packb(good), DriveRequest) == DriveRequest(1, 0.1)
     with pytest.raises(InvalidMessage, match="drive request: "):
         decode(msgpack.packb(good | wrong), DriveRequest)
 
 
-def test_the_newest_command_holds_for_half_a_second(robot: Teleoperation, clock: Clock) -> None:
+def test_the_newest_command_holds_for_half_a_second(robot: Teleoperation, clock: Clock):
     assert robot.driven() is None
     answer = robot.take(DriveRequest(1, 0.1, 0.2))
     assert robot.driven() == Driven(Command()), "a first request follows no answer: it stops"
@@ -84,7 +82,7 @@ def test_the_newest_command_holds_for_half_a_second(robot: Teleoperation, clock:
 
 
 @pytest.mark.parametrize("delay", [0.9, 1.1])
-def test_a_command_that_was_held_up_stops(robot: Teleoperation, clock: Clock, delay: float) -> None:
+def test_a_command_that_was_held_up_stops(robot: Teleoperation, clock: Clock, delay: float):
     answer = robot.take(DriveRequest(1, 0.0, 0.0))
     clock.wait(delay)
     robot.take(DriveRequest(1, 0.2, 0.0, answer))
@@ -93,7 +91,7 @@ def test_a_command_that_was_held_up_stops(robot: Teleoperation, clock: Clock, de
     assert robot.driven() == Driven(Command()), "an answer of the future is none of this agent"
 
 
-def test_one_drives_and_gives_the_wheels_back(robot: Teleoperation, clock: Clock) -> None:
+def test_one_drives_and_gives_the_wheels_back(robot: Teleoperation, clock: Clock):
     answer = robot.take(DriveRequest(1, 0.0, 0.0))
     answer = robot.take(DriveRequest(1, 0.2, 0.0, answer))
     with pytest.raises(InvalidValue, match="another"):
@@ -106,7 +104,7 @@ def test_one_drives_and_gives_the_wheels_back(robot: Teleoperation, clock: Clock
     assert robot.driven() is None
 
 
-def test_the_fleet_client_answers_with_its_status_and_a_mission_ends_the_wait(clock: Clock) -> None:
+def test_the_fleet_client_answers_with_its_status_and_a_mission_ends_the_wait(clock: Clock):
     hub = MemoryHub()
     bus, person, robot = MemoryBus(hub), MemoryBus(hub), Teleoperation(clock)
     link = FleetClient(
@@ -132,7 +130,7 @@ def test_the_fleet_client_answers_with_its_status_and_a_mission_ends_the_wait(cl
         bus.close()
 
 
-def test_who_drives_is_in_the_status(clock: Clock) -> None:
+def test_who_drives_is_in_the_status(clock: Clock):
     """The name in the key holds, and a drive that has ended is still there."""
     hub = MemoryHub()
     bus, person = MemoryBus(hub), MemoryBus(hub)
@@ -153,7 +151,7 @@ def test_who_drives_is_in_the_status(clock: Clock) -> None:
         bus.close()
 
 
-def test_no_one_drives_a_recording(clock: Clock) -> None:
+def test_no_one_drives_a_recording(clock: Clock):
     recording = Teleoperation(clock, "a recording takes no orders")
     with pytest.raises(InvalidValue, match="a recording takes no orders"):
         recording.take(DriveRequest(1, 0.2, 0.0))

@@ -1,7 +1,5 @@
 """A robot without proximity sensors: it stands and says why, is driven, or explores by its camera."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -44,7 +42,7 @@ class Life:
         return self.steps[-1]
 
 
-def test_it_stands_and_says_why(walls) -> None:
+def test_it_stands_and_says_why(walls):
     life = Life(walls, on(Explore(), body=BARE))
     step = life.go(30)
     assert {step.command for step in life.steps} == {Command()}
@@ -55,7 +53,7 @@ def test_it_stands_and_says_why(walls) -> None:
     assert not step.status.finished
 
 
-def test_it_announces_what_it_will_not_do() -> None:
+def test_it_announces_what_it_will_not_do():
     refused, allowed = (announcement(BARE, "r5", explores) for explores in (False, True))
     assert [len(refused), len(allowed)] == [3, 3]
     assert "does not stop before obstacles" in refused[0]
@@ -67,7 +65,7 @@ def test_it_announces_what_it_will_not_do() -> None:
 
 
 @pytest.mark.parametrize("mission", [Explore(), Carried()])
-def test_a_person_drives_it_and_it_maps(walls, mission: Mission) -> None:
+def test_a_person_drives_it_and_it_maps(walls, mission: Mission):
     life = Life(walls, on(mission, body=BARE))
     life.go(3)
     step = life.go(30, Driven(Command(0.2, 0.0)))
@@ -83,7 +81,7 @@ def test_a_person_drives_it_and_it_maps(walls, mission: Mission) -> None:
 
 
 @pytest.mark.slow
-def test_a_persons_command_comes_before_the_mission_and_behind_the_guard(walls) -> None:
+def test_a_persons_command_comes_before_the_mission_and_behind_the_guard(walls):
     life = Life(walls, on(Explore(), body=BODY), BODY)
     life.go(5)
     step = life.go(1, Driven(Command(0.0, 0.3)))
@@ -98,7 +96,7 @@ def test_a_persons_command_comes_before_the_mission_and_behind_the_guard(walls) 
 
 
 @pytest.mark.slow
-def test_where_it_may_explore_it_creeps_backs_off_from_a_touch_and_maps(walls) -> None:
+def test_where_it_may_explore_it_creeps_backs_off_from_a_touch_and_maps(walls):
     pipeline = on(Explore(), ALLOWED, BARE)
     life = Life(walls, pipeline, end=0.1)
     step = life.go(60)

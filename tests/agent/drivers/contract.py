@@ -3,8 +3,6 @@
 The limits in time are the contract's; a busy machine gets what `SLACK` says on top.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -151,7 +149,7 @@ class RobotContract:
         yield robot
         robot.close()
 
-    def test_odometry_is_in_metres_and_radians(self, robot: Robot, emulator: Any) -> None:
+    def test_odometry_is_in_metres_and_radians(self, robot: Robot, emulator: Any):
         robot.sense()
         start = emulator.wheels.way()
         axle = robot.describe().axle
@@ -174,7 +172,7 @@ class RobotContract:
         eventually(lambda: known() or seen.extend(drive(robot, Command(), 0.1)))
         assert driven()[0] > 0.15
 
-    def test_stamps_are_nanoseconds_that_rise_with_the_images(self, robot: Robot) -> None:
+    def test_stamps_are_nanoseconds_that_rise_with_the_images(self, robot: Robot):
         seen = drive(robot, Command(), 1.5)
         now, tick = time.time_ns(), robot.describe().tick
         stamps = [observation.stamp_ns for observation in seen]
@@ -186,7 +184,7 @@ class RobotContract:
         assert sum(image is not None for image in images) >= len(images) - 2
         assert all(i.shape == (HEIGHT, WIDTH) and i.dtype == np.uint8 for i in images if i is not None)
 
-    def test_act_returns_what_the_wheels_do(self, robot: Robot, emulator: Any) -> None:
+    def test_act_returns_what_the_wheels_do(self, robot: Robot, emulator: Any):
         description = robot.describe()
         axle = description.axle
         for wanted in (Command(0.1234, 0.321), Command(-0.05, 0.1), Command(99.0, -99.0)):
@@ -208,7 +206,7 @@ class RobotContract:
         with pytest.raises(InvalidValue, match="finite"):
             robot.act(Command(float("nan"), 0.0))
 
-    def test_wheels_stop_when_commands_cease(self, robot: Robot, emulator: Any) -> None:
+    def test_wheels_stop_when_commands_cease(self, robot: Robot, emulator: Any):
         drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
         last = time.monotonic()
         until(lambda: emulator.wheels.speeds == (0.0, 0.0), 1.5)
@@ -216,13 +214,13 @@ class RobotContract:
         # It drives on with the next command.
         drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
 
-    def test_wheels_stop_when_it_is_closed(self, robot: Robot, emulator: Any) -> None:
+    def test_wheels_stop_when_it_is_closed(self, robot: Robot, emulator: Any):
         drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
         robot.close()
         until(lambda: emulator.wheels.speeds == (0.0, 0.0), STOPS_WITHIN)
         assert robot.sense() is None
 
-    def test_wheels_stop_when_the_process_hangs_or_dies(self, settings: Path, emulator: Any) -> None:
+    def test_wheels_stop_when_the_process_hangs_or_dies(self, settings: Path, emulator: Any):
         child = subprocess.Popen(
             [sys.executable, "-c", self.CHILD, str(settings)], stdout=subprocess.PIPE, cwd=ROOT,
             env={**os.environ, "PYTHONPATH": str(ROOT)},
@@ -242,7 +240,7 @@ class RobotContract:
             child.kill()
             child.communicate()
 
-    def test_it_comes_back_when_the_port_has_vanished(self, robot: Robot, emulator: Any) -> None:
+    def test_it_comes_back_when_the_port_has_vanished(self, robot: Robot, emulator: Any):
         drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
         emulator.unplug()
         gone = drive(robot, Command(0.2, 0.0), 0.8)
@@ -253,7 +251,7 @@ class RobotContract:
         back = drive_way(robot, Command(0.2, 0.0), 0.05)
         assert len(back[-1].proximity) == len(robot.describe().ranger_bearings)
 
-    def test_a_stalled_line_holds_up_nothing(self, robot: Robot, emulator: Any) -> None:
+    def test_a_stalled_line_holds_up_nothing(self, robot: Robot, emulator: Any):
         drive(robot, Command(0.1, 0.0), 0.3)
         emulator.stalled = True
         tick, acts, senses = robot.describe().tick, [], []

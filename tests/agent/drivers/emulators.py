@@ -3,8 +3,6 @@
 The bytes are written by hand from the manuals; nothing here knows a driver.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import pty

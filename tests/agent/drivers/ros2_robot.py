@@ -1,7 +1,5 @@
 """A robot of ROS 2 topics, on the second implementation of the wire format."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -1,7 +1,5 @@
 """The driver for any Arduino against the protocol of docs/arduino.md at the end of a pseudo-terminal."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -22,13 +20,13 @@ class TestArduino(RobotContract):
         "radius": 0.12, "axle": 0.15, "ranger_bearings_deg": [45.0, 0.0, -45.0], "ranger_reach": 1.5,
     }  # fmt: skip
 
-    def test_distances_and_bumper(self, robot: Robot, emulator: Any) -> None:
+    def test_distances_and_bumper(self, robot: Robot, emulator: Any):
         emulator.bumped = 1
         seen = drive(robot, Command(), 0.3)[-1]
         # 200 cm are beyond the reach, -1 is nothing.
         np.testing.assert_allclose(seen.proximity, [1.5, 1.5, 0.15])
         assert seen.bumped
 
-    def test_lines_that_are_no_lines_are_passed_over(self, robot: Robot, emulator: Any) -> None:
+    def test_lines_that_are_no_lines_are_passed_over(self, robot: Robot, emulator: Any):
         emulator.say(b"S 12 x\nrubbish\n\n")
         drive_until(robot, Command(0.1, 0.0), lambda: emulator.wheels.speeds[0] > 0.05)

@@ -1,7 +1,5 @@
 """OpenCV capture: the newest frame, stamped when it was taken."""
 
-from __future__ import annotations
-
 import socket
 import threading
 import time
@@ -43,7 +41,7 @@ def clip(tmp_path: Path) -> str:
     return str(path)
 
 
-def test_a_file_plays_at_its_own_pace_and_gives_its_newest_frame(clip: str) -> None:
+def test_a_file_plays_at_its_own_pace_and_gives_its_newest_frame(clip: str):
     camera = Capture(settings(clip))
     first = camera.newer(0, 2.0)
     assert first is not None
@@ -59,7 +57,7 @@ def test_a_file_plays_at_its_own_pace_and_gives_its_newest_frame(clip: str) -> N
     camera.close()
 
 
-def test_after_the_end_of_a_file_nothing_comes(clip: str) -> None:
+def test_after_the_end_of_a_file_nothing_comes(clip: str):
     camera = Capture(settings(clip))
     time.sleep(2.5)
     last = camera.newer(0, 0.1)
@@ -71,7 +69,7 @@ def test_after_the_end_of_a_file_nothing_comes(clip: str) -> None:
     camera.close()
 
 
-def test_a_known_delay_is_subtracted(clip: str) -> None:
+def test_a_known_delay_is_subtracted(clip: str):
     camera = Capture(settings(clip, delay=5.0))
     frame = camera.newer(0, 2.0)
     assert frame is not None
@@ -83,7 +81,7 @@ def test_a_known_delay_is_subtracted(clip: str) -> None:
     ("source", "words"),
     [("/nowhere/film.avi", "no such file"), ("63", "camera 63: cannot be opened")],
 )
-def test_a_source_that_is_not_there(source: str, words: str) -> None:
+def test_a_source_that_is_not_there(source: str, words: str):
     with pytest.raises(DeviceError, match=words):
         Capture(settings(source))
 
@@ -114,7 +112,7 @@ def stream() -> Iterator[Stream]:
     made.close()
 
 
-def test_a_stream_over_http_is_no_more_than_two_frames_behind(stream: Stream) -> None:
+def test_a_stream_over_http_is_no_more_than_two_frames_behind(stream: Stream):
     camera = Capture(settings(stream.url))
     behind = []
     frame = camera.newer(0, 5.0)
@@ -179,7 +177,7 @@ def raw_stream() -> Iterator[OneAtATime]:
     made.close()
 
 
-def test_images_without_a_container_begin_with_that_of_now(raw_stream: OneAtATime) -> None:
+def test_images_without_a_container_begin_with_that_of_now(raw_stream: OneAtATime):
     """They were five seconds old, with the stamp of now."""
     camera = Capture(settings(raw_stream.url))
     frame = camera.newer(0, 5.0)
@@ -188,7 +186,7 @@ def test_images_without_a_container_begin_with_that_of_now(raw_stream: OneAtATim
     camera.close()
 
 
-def test_a_stream_that_serves_one_program_after_the_other_is_waited_for(raw_stream: OneAtATime) -> None:
+def test_a_stream_that_serves_one_program_after_the_other_is_waited_for(raw_stream: OneAtATime):
     """As `mapweave doctor` opens the camera twice."""
     for _ in range(2):
         camera = Capture(settings(raw_stream.url))
@@ -196,7 +194,7 @@ def test_a_stream_that_serves_one_program_after_the_other_is_waited_for(raw_stre
         camera.close()
 
 
-def test_a_stream_that_ends_is_opened_again(stream: Stream) -> None:
+def test_a_stream_that_ends_is_opened_again(stream: Stream):
     camera = Capture(settings(stream.url))
     frame = camera.newer(0, 5.0)
     assert frame is not None
@@ -252,9 +250,7 @@ class Unusable(Device):
         return True, np.zeros((HEIGHT, WIDTH, 2), np.uint8)
 
 
-def test_a_device_with_images_of_another_format_is_reported_once(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_device_with_images_of_another_format_is_reported_once(monkeypatch, caplog):
     """Before, its thread ended with a traceback, and a camera without images was logged each second."""
     opened: list[object] = []
     monkeypatch.setattr("cv2.VideoCapture", lambda *arguments: opened.append(arguments) or Unusable(True))
@@ -266,9 +262,7 @@ def test_a_device_with_images_of_another_format_is_reported_once(
     assert line.startswith("camera /dev/video2 delivers no images (") and line.endswith("; opening it again")
 
 
-def test_a_source_of_too_many_pixels_is_refused_before_a_frame_is_decoded(
-    clip: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_source_of_too_many_pixels_is_refused_before_a_frame_is_decoded(clip: str, monkeypatch):
     device = Device(True)
     device.properties |= {cv2.CAP_PROP_FRAME_WIDTH: 16_000.0, cv2.CAP_PROP_FRAME_HEIGHT: 16_000.0}
     monkeypatch.setattr("cv2.VideoCapture", lambda *_: device)
@@ -279,9 +273,7 @@ def test_a_source_of_too_many_pixels_is_refused_before_a_frame_is_decoded(
 
 
 @pytest.mark.parametrize("locks", [True, False])
-def test_a_device_is_stamped_by_its_driver_and_its_exposure_locked(
-    locks: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_device_is_stamped_by_its_driver_and_its_exposure_locked(locks: bool, monkeypatch, caplog):
     device, opened = Device(locks), []
     monkeypatch.setattr("cv2.VideoCapture", lambda *arguments: opened.append(arguments) or device)
     monkeypatch.setattr("mapweave.agent.drivers.camera.SETTLING", 0.2)

@@ -1,7 +1,5 @@
 """Each mistake of a driver's author is one line at the first observation that shows it."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable
@@ -83,19 +81,19 @@ def good(**changes: Any) -> Observation:
         ((GOOD,), r"sense\(\) must return an Observation or None, not tuple"),
     ],
 )
-def test_a_wrong_observation(seen: Any, words: str) -> None:
+def test_a_wrong_observation(seen: Any, words: str):
     with pytest.raises(DeviceError, match=f"^driver: {words}") as error:
         checked(seen).sense()
     assert "\n" not in str(error.value)
 
 
-def test_five_readings_and_no_bearings() -> None:
+def test_five_readings_and_no_bearings():
     robot = checked(GOOD, description=replace(DESCRIPTION, ranger_bearings=()))
     with pytest.raises(DeviceError, match=r"5 readings, but describe\(\) gives 0 ranger_bearings"):
         robot.sense()
 
 
-def test_bearings_in_degrees() -> None:
+def test_bearings_in_degrees():
     robot = checked(GOOD, description=replace(DESCRIPTION, ranger_bearings=(0.0, 45.0, 90.0)))
     with pytest.raises(DeviceError, match="ranger_bearings are radians, not degrees: 45"):
         robot.sense()
@@ -109,7 +107,7 @@ def test_bearings_in_degrees() -> None:
         ({"tick": 0.0}, r"gives no robot description: Expected `float` >= 0.0001 - at `\$.tick`"),
     ],
 )
-def test_a_wrong_description(changes: dict[str, Any], words: str) -> None:
+def test_a_wrong_description(changes: dict[str, Any], words: str):
     with pytest.raises(DeviceError, match=rf"^driver: describe\(\) {words}"):
         checked(description=replace(DESCRIPTION, **changes)).describe()
 
@@ -139,8 +137,8 @@ class Raises(Scripted):
     ],
 )
 def test_an_error_of_the_drivers_own_code_names_its_file_and_line(
-    call: Callable[[CheckedRobot], object], words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    call: Callable[[CheckedRobot], object], words: str, monkeypatch
+):
     if "KeyError" not in words:
         monkeypatch.setattr(Raises, "describe", lambda self: DESCRIPTION)
     with pytest.raises(DeviceError, match=rf"^driver: {__file__}, line \d+: {words}") as error:
@@ -148,19 +146,19 @@ def test_an_error_of_the_drivers_own_code_names_its_file_and_line(
     assert "\n" not in str(error.value)
 
 
-def test_a_driver_that_fails_to_close_is_logged(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_driver_that_fails_to_close_is_logged(caplog):
     CheckedRobot(Raises()).close()
     assert [record.getMessage().partition(": OSError")[2] for record in caplog.records] == [": no port"]
 
 
-def test_a_mistake_of_this_package_is_not_blamed_on_the_driver() -> None:
+def test_a_mistake_of_this_package_is_not_blamed_on_the_driver():
     robot = checked(GOOD)
     robot._robot = None  # type: ignore[assignment]
     with pytest.raises(AttributeError):
         robot.describe()
 
 
-def test_a_description_that_is_none() -> None:
+def test_a_description_that_is_none():
     with pytest.raises(DeviceError, match=r"describe\(\) must return a RobotDescription, not dict"):
         checked(description={}).describe()
 
@@ -173,21 +171,21 @@ def test_a_description_that_is_none() -> None:
         (NOW_NS + 100, "stamp_ns rises by 100 in a tick of 0.1 s; it must be nanoseconds"),
     ],
 )
-def test_stamps_that_do_not_rise_as_they_should(second: int, words: str) -> None:
+def test_stamps_that_do_not_rise_as_they_should(second: int, words: str):
     robot = checked(GOOD, good(stamp_ns=second))
     robot.sense()
     with pytest.raises(DeviceError, match=words):
         robot.sense()
 
 
-def test_a_clock_that_fails_later_is_for_the_pipeline_to_say() -> None:
+def test_a_clock_that_fails_later_is_for_the_pipeline_to_say():
     stamps = [*(NOW_NS + k * 100_000_000 for k in range(FIRST + 1)), NOW_NS, NOW_NS, NOW_NS + 3600 * 10**9]
     robot = checked(*(good(stamp_ns=stamp) for stamp in stamps))
     assert [robot.sense().stamp_ns for _ in stamps] == stamps  # type: ignore[union-attr]
 
 
 @pytest.mark.parametrize("in_a_second", [1.0, 1e3, 1e6])
-def test_a_clock_since_the_start_passes_other_units_since_1970(in_a_second: float) -> None:
+def test_a_clock_since_the_start_passes_other_units_since_1970(in_a_second: float):
     """After 1795 s, or 21 days, a count of nanoseconds is that of milli- or microseconds since 1970.
 
     Before, the agent of a robot with such a clock ended half an hour after the start.
@@ -198,7 +196,7 @@ def test_a_clock_since_the_start_passes_other_units_since_1970(in_a_second: floa
     assert [robot.sense().stamp_ns for _ in stamps] == stamps  # type: ignore[union-attr]
 
 
-def test_seconds_since_the_start_are_no_nanoseconds() -> None:
+def test_seconds_since_the_start_are_no_nanoseconds():
     robot = checked(good(stamp_ns=0), good(stamp_ns=1))
     robot.sense()
     with pytest.raises(DeviceError, match="must be nanoseconds"):
@@ -217,7 +215,7 @@ def at(tick: int, forward: float, turn: float = 0.0) -> Observation:
         (Odometry(0.0, -4.5), "-4.5 rad in 0.1 s, but .* at most 0.8 rad/s"),  # degrees
     ],
 )
-def test_odometry_in_another_unit_shows_when_the_robot_first_moves(motion: Odometry, words: str) -> None:
+def test_odometry_in_another_unit_shows_when_the_robot_first_moves(motion: Odometry, words: str):
     robot = checked(at(0, 0.0), *(at(k, 0.0) for k in range(1, 40)), replace(at(40, 0.0), odometry=motion))
     for _ in range(40):
         robot.sense()
@@ -225,13 +223,13 @@ def test_odometry_in_another_unit_shows_when_the_robot_first_moves(motion: Odome
         robot.sense()
 
 
-def test_encoders_that_jump_later_are_for_the_pipeline_to_say() -> None:
+def test_encoders_that_jump_later_are_for_the_pipeline_to_say():
     seen = [*(at(k, 0.01) for k in range(FIRST + 1)), at(FIRST + 1, 30.0)]
     robot = checked(*seen)
     assert [robot.sense() for _ in seen] == seen
 
 
-def test_a_robot_that_is_pushed_or_late_moves_as_it_may() -> None:
+def test_a_robot_that_is_pushed_or_late_moves_as_it_may():
     """The way of a minute without an observation, and a robot without limits, which is carried."""
     seen = [at(0, 0.0), at(1, 0.4, 0.8), at(601, 30.0)]
     robot = checked(*seen)
@@ -249,7 +247,7 @@ def test_a_robot_that_is_pushed_or_late_moves_as_it_may() -> None:
         (Command(math.nan, 0.0), "is not finite"),
     ],
 )
-def test_act_without_an_answer(applied: Any, words: str) -> None:
+def test_act_without_an_answer(applied: Any, words: str):
     with pytest.raises(DeviceError, match=rf"^driver: act\(\) .*{words}"):
         checked(applied=applied).act(Command())
 
@@ -265,7 +263,7 @@ class ClosedMeanwhile(Scripted):
         raise OSError(9, "Bad file descriptor")
 
 
-def test_a_driver_that_fails_as_it_is_closed_has_ended() -> None:
+def test_a_driver_that_fails_as_it_is_closed_has_ended():
     driver = ClosedMeanwhile()
     driver.robot = CheckedRobot(driver)
     with pytest.raises(DeviceError, match="Bad file descriptor"):
@@ -274,7 +272,7 @@ def test_a_driver_that_fails_as_it_is_closed_has_ended() -> None:
     assert driver.robot.act(Command(0.1, 0.0)) == Command()
 
 
-def test_a_good_robot_passes_through() -> None:
+def test_a_good_robot_passes_through():
     blind = good(stamp_ns=NOW_NS + 100_000_000, image=None, proximity=np.zeros(0))
     later = good(stamp_ns=np.int64(NOW_NS + 200_000_000), proximity=np.full(5, np.nan))
     robot = checked(GOOD, blind, later, None, applied=Command(0.1, 0.0))
@@ -283,7 +281,7 @@ def test_a_good_robot_passes_through() -> None:
     assert robot.act(Command(0.5, 0.0)) == Command(0.1, 0.0)
 
 
-def test_a_simulation_that_begins_at_zero_is_no_mistake() -> None:
+def test_a_simulation_that_begins_at_zero_is_no_mistake():
     robot = CheckedRobot(Scripted(*(good(stamp_ns=k * 100_000_000) for k in range(50))))
     for _ in range(50):
         assert robot.sense() is not None

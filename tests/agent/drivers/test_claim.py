@@ -1,7 +1,5 @@
 """A second agent for a robot is refused before it moves anything."""
 
-from __future__ import annotations
-
 import threading
 import time
 
@@ -16,7 +14,7 @@ KEYS = Keys("test")
 
 
 @pytest.mark.slow
-def test_the_second_is_refused_and_the_first_stays(hub: MemoryHub) -> None:
+def test_the_second_is_refused_and_the_first_stays(hub: MemoryHub):
     first, second = MemoryBus(hub), MemoryBus(hub)
     claim = Claim(first, KEYS, "r0")
     with pytest.raises(DeviceError, match="another agent drives r0; stop it"):
@@ -34,7 +32,7 @@ def test_the_second_is_refused_and_the_first_stays(hub: MemoryHub) -> None:
     second.close()
 
 
-def test_one_that_leaves_is_waited_for(hub: MemoryHub) -> None:
+def test_one_that_leaves_is_waited_for(hub: MemoryHub):
     first, second = MemoryBus(hub), MemoryBus(hub)
     Claim(first, KEYS, "r0")
     dying = threading.Timer(0.8, first.close)
@@ -44,7 +42,7 @@ def test_one_that_leaves_is_waited_for(hub: MemoryHub) -> None:
     second.close()
 
 
-def test_of_two_at_the_same_time_exactly_one_stays(hub: MemoryHub) -> None:
+def test_of_two_at_the_same_time_exactly_one_stays(hub: MemoryHub):
     buses = [MemoryBus(hub) for _ in range(2)]
     claims: list[Claim] = []
     refused: list[str] = []

@@ -1,8 +1,5 @@
 """The Create 2's driver against its Open Interface at the end of a pseudo-terminal."""
 
-from __future__ import annotations
-
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -21,32 +18,32 @@ class TestCreate(RobotContract):
     SPEED_STEP = 0.001
     COUNT = 0.45e-3 + 0.002
 
-    def test_it_drives_on_after_it_was_lifted(self, robot: Robot, emulator: Any) -> None:
+    def test_it_drives_on_after_it_was_lifted(self, robot: Robot, emulator: Any):
         drive(robot, Command(0.1, 0.0), 0.3)
         emulator.lift()
         until(lambda: emulator.wheels.speeds == (0.0, 0.0), 0.5)
         drive_until(robot, Command(0.1, 0.0), lambda: emulator.wheels.speeds[0] > 0.05)
         assert emulator.mode == 2
 
-    def test_the_bumper_is_the_two_lowest_bits(self, robot: Robot, emulator: Any) -> None:
+    def test_the_bumper_is_the_two_lowest_bits(self, robot: Robot, emulator: Any):
         for bumps, bumped in ((0b0000, False), (0b0001, True), (0b0010, True), (0b1100, False)):
             emulator.bumps = bumps
             seen = drive(robot, Command(), 0.3)
             assert seen[-1].bumped is bumped
 
-    def test_both_wheels_drop_when_it_is_lifted(self, robot: Robot, emulator: Any) -> None:
+    def test_both_wheels_drop_when_it_is_lifted(self, robot: Robot, emulator: Any):
         """Before, it did not say so, and the agent mapped on from where it had been."""
         for drops, lifted in ((0b0000, False), (0b0100, False), (0b1000, False), (0b1100, True), (0, False)):
             emulator.bumps = drops
             seen = drive(robot, Command(), 0.3)
             assert seen[-1].kidnapped is lifted
 
-    def test_the_battery_is_a_share_of_its_capacity(self, robot: Robot, emulator: Any) -> None:
+    def test_the_battery_is_a_share_of_its_capacity(self, robot: Robot, emulator: Any):
         assert drive(robot, Command(), 0.3)[-1].battery == pytest.approx(0.75)
         emulator.charge = 2700  # a new battery holds a little more than it says
         assert drive(robot, Command(), 0.3)[-1].battery == 1.0
 
-    def test_counters_wrap_around(self, robot: Robot, emulator: Any) -> None:
+    def test_counters_wrap_around(self, robot: Robot, emulator: Any):
         # 65536 counts are 29 m; a second before that.
         with emulator.wheels._lock:
             way = 65530 * 3.141592653589793 * 72e-3 / 508.8
@@ -57,7 +54,7 @@ class TestCreate(RobotContract):
         assert sum(o.odometry.forward for o in seen) < 0.15
 
 
-def test_a_device_that_is_no_create_is_named(tmp_path: Path) -> None:
+def test_a_device_that_is_no_create_is_named(tmp_path):
     """Ten bytes of whatever it sends were taken for encoders."""
     board = ArduinoSketch(tmp_path)
     board.take = lambda data: None  # type: ignore[method-assign]

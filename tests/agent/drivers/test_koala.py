@@ -1,7 +1,5 @@
 """The Koala's driver against a Koala of each generation at the end of a pseudo-terminal."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 
@@ -18,7 +16,7 @@ class TestKoalaSilver(RobotContract):
     SPEED_STEP = 0.0045
     COUNT = 0.045e-3 + 0.002
 
-    def test_infrared_values_become_distances(self, robot: Robot, emulator: Any) -> None:
+    def test_infrared_values_become_distances(self, robot: Robot, emulator: Any):
         emulator.infrared = [0, 1023, 80, 20] + [5] * 12
         for _ in range(3):
             seen = robot.sense()
@@ -36,7 +34,7 @@ class TestKoala25(RobotContract):
     SPEED_STEP = 0.0012
     COUNT = 1.2e-5 + 0.002
 
-    def test_ultrasonic_values_become_distances(self, robot: Robot, emulator: Any) -> None:
+    def test_ultrasonic_values_become_distances(self, robot: Robot, emulator: Any):
         # Manual, 4.1: 0 below 25 cm, 25 to 250 cm, 1000 for nothing, 2000 for a sensor that is off.
         emulator.ultrasonic = [0, 25, 130, 250, 1000, 2000, 1000, 1000, 1000]
         for _ in range(3):
@@ -45,13 +43,13 @@ class TestKoala25(RobotContract):
         np.testing.assert_allclose(seen.proximity[:5], [0.0, 0.25, 1.3, 2.5, 2.5])
         assert math.isnan(seen.proximity[5])
 
-    def test_the_first_sensors_are_on_the_left(self, robot: Robot) -> None:
+    def test_the_first_sensors_are_on_the_left(self, robot: Robot):
         bearings = np.degrees(robot.describe().ranger_bearings)
         # Manual, command G: left rear, left front, front left, front, ... back right, back left.
         assert (bearings[:3] > 0).all()
         assert bearings[3] == 0.0
         assert (bearings[4:8] < 0).all()
 
-    def test_wheels_stand_before_the_first_command(self, robot: Robot, emulator: Any) -> None:
+    def test_wheels_stand_before_the_first_command(self, robot: Robot, emulator: Any):
         until(lambda: b"D,0,0" in emulator.heard, 1.0)
         assert emulator.wheels.way() == (0.0, 0.0)

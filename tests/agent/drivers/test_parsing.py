@@ -1,7 +1,5 @@
 """Whatever comes over a line is numbers within bounds, or nothing."""
 
-from __future__ import annotations
-
 import json
 import math
 
@@ -25,18 +23,18 @@ noise = st.one_of(st.text(), st.text("0123456789,- _SE+.\ufffd"), many_digits)
 
 
 @given(st.lists(ints, min_size=1, max_size=16))
-def test_numbers_of_a_koala(numbers: list[int]) -> None:
+def test_numbers_of_a_koala(numbers: list[int]):
     assert parse_numbers(",".join(map(str, numbers))) == numbers
 
 
 @given(noise)
-def test_noise_to_a_koala(text: str) -> None:
+def test_noise_to_a_koala(text: str):
     numbers = parse_numbers(text)
     assert numbers is None or all(abs(n) < 10**10 for n in numbers)
 
 
 @given(st.lists(st.integers(-(10**9), 10**9), min_size=16, max_size=16))
-def test_distances_are_within_reach_or_missing(values: list[int]) -> None:
+def test_distances_are_within_reach_or_missing(values: list[int]):
     for generation, count in ((SILVER, 16), (KOALA_2_5, 9)):
         reach = generation.geometry.ranger_reach
         assert reach is not None
@@ -45,13 +43,13 @@ def test_distances_are_within_reach_or_missing(values: list[int]) -> None:
 
 
 @given(ints, ints, st.booleans(), st.lists(st.integers(-1, 999), max_size=8))
-def test_a_state_of_an_arduino(left: int, right: int, bumped: bool, distances: list[int]) -> None:
+def test_a_state_of_an_arduino(left: int, right: int, bumped: bool, distances: list[int]):
     numbers = [left, right, int(bumped), *distances]
     assert parse_state("S " + " ".join(map(str, numbers))) == numbers
 
 
 @given(st.one_of(noise, noise.map(lambda text: "S " + text)))
-def test_noise_to_an_arduino(line: str) -> None:
+def test_noise_to_an_arduino(line: str):
     numbers = parse_state(line)
     assert numbers is None or (len(numbers) >= 3 and all(abs(n) < 10**10 for n in numbers))
 
@@ -64,7 +62,7 @@ json_values = st.recursive(
 
 
 @given(st.dictionaries(st.sampled_from(["L", "R", "odl", "odr", "v"]), json_values))
-def test_anything_that_a_waveshare_may_say(fields: dict[str, object]) -> None:
+def test_anything_that_a_waveshare_may_say(fields: dict[str, object]):
     info = parse_info(json.dumps({"T": 1001, **fields}))
     if info is not None:
         assert all(abs(speed) <= 5.0 for speed in info.speeds)
@@ -72,11 +70,11 @@ def test_anything_that_a_waveshare_may_say(fields: dict[str, object]) -> None:
 
 
 @given(noise)
-def test_noise_to_a_waveshare(text: str) -> None:
+def test_noise_to_a_waveshare(text: str):
     assert parse_info(text) is None
 
 
-def test_what_a_waveshare_says() -> None:
+def test_what_a_waveshare_says():
     info = parse_info('{"T":1001,"L":0.1,"R":-0.2,"v":11.9,"odl":120,"odr":-30}')
     assert info is not None
     assert info.speeds == (0.1, -0.2)
@@ -111,6 +109,6 @@ def test_what_a_waveshare_says() -> None:
         ("waveshare", {"port": "x"}, r"no \[robot.camera\]"),
     ],
 )
-def test_options_that_cannot_be(driver: str, options: dict[str, object], words: str) -> None:
+def test_options_that_cannot_be(driver: str, options: dict[str, object], words: str):
     with pytest.raises(SettingsError, match=words):
         find_driver(driver)(RobotSettings(options=options))

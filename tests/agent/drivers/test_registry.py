@@ -1,7 +1,5 @@
 """Drivers are found: shipped ones, another package's, a class in a file; what is wrong is one line."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -27,14 +25,14 @@ class Rover:
 """
 
 
-def test_shipped_drivers_are_listed_with_what_they_drive() -> None:
+def test_shipped_drivers_are_listed_with_what_they_drive():
     listed = {robot.name: robot for robot in listing()}
     assert {"koala", "create", "waveshare", "arduino", "remote"} <= listed.keys()
     assert "Koala" in listed["koala"].line
     assert not any(robot.missing or robot.error for robot in listed.values())
 
 
-def test_a_driver_of_another_package_is_found_and_what_it_lacks_is_said(tmp_path: Path) -> None:
+def test_a_driver_of_another_package_is_found_and_what_it_lacks_is_said(tmp_path):
     (tmp_path / "rover.py").write_text(CLASS)
     (tmp_path / "legs.py").write_text("import a_library_that_is_not_there\n" + CLASS)
     (tmp_path / "broken.py").write_text("1 / 0\n")
@@ -58,7 +56,7 @@ def test_a_driver_of_another_package_is_found_and_what_it_lacks_is_said(tmp_path
     assert len(lines) == len(SHIPPED) + 3
 
 
-def test_a_class_in_a_file(tmp_path: Path) -> None:
+def test_a_class_in_a_file(tmp_path):
     path = tmp_path / "rover.py"
     path.write_text(CLASS)
     settings = RobotSettings(options={"port": "x"})
@@ -66,7 +64,7 @@ def test_a_class_in_a_file(tmp_path: Path) -> None:
     assert robot.settings is settings  # type: ignore[attr-defined]
 
 
-def test_a_class_in_a_file_with_a_dataclass_for_its_options(tmp_path: Path) -> None:
+def test_a_class_in_a_file_with_a_dataclass_for_its_options(tmp_path):
     """Written as the drivers of this package are. Before, it ended in an error from within `dataclasses`."""
     path = tmp_path / "rover.py"
     path.write_text(
@@ -91,9 +89,7 @@ def test_a_class_in_a_file_with_a_dataclass_for_its_options(tmp_path: Path) -> N
         ("", "cannot be loaded: AttributeError: .* has no attribute 'Rover'"),
     ],
 )
-def test_a_driver_of_another_package_that_cannot_be_loaded(
-    text: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_driver_of_another_package_that_cannot_be_loaded(text: str, words: str, tmp_path, monkeypatch):
     """Before, an agent with it ended in a traceback."""
     (tmp_path / "a_rover.py").write_text(text)
     monkeypatch.syspath_prepend(tmp_path)
@@ -103,7 +99,7 @@ def test_a_driver_of_another_package_that_cannot_be_loaded(
         find_driver("rover")
 
 
-def test_a_class_that_tells_no_signature(tmp_path: Path) -> None:
+def test_a_class_that_tells_no_signature(tmp_path):
     """Classes of compiled libraries often tell none."""
     path = tmp_path / "rover.py"
     text = CLASS.replace("class Rover:", "class Rover(str):")
@@ -123,7 +119,7 @@ def test_a_class_that_tells_no_signature(tmp_path: Path) -> None:
         ("Rover = 7\n", "Rover", "needs a class"),
     ],
 )
-def test_a_file_that_is_no_driver(text: str | None, name: str, words: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_driver(text: str | None, name: str, words: str, tmp_path):
     path = tmp_path / "rover.py"
     if text is not None:
         path.write_text(text)
@@ -145,14 +141,14 @@ def test_a_file_that_is_no_driver(text: str | None, name: str, words: str, tmp_p
         ),
     ],
 )
-def test_a_constructor_that_fails(text: str, words: str, tmp_path: Path) -> None:
+def test_a_constructor_that_fails(text: str, words: str, tmp_path):
     path = tmp_path / "rover.py"
     path.write_text(text)
     with pytest.raises(DeviceError, match=words):
         find_driver(f"{path}:Rover")(RobotSettings())
 
 
-def test_a_wheeled_robot_without_the_constructor_of_its_base_class(tmp_path: Path) -> None:
+def test_a_wheeled_robot_without_the_constructor_of_its_base_class(tmp_path):
     """Before, the agent ended with a traceback from its `close`."""
     path = tmp_path / "rover.py"
     path.write_text(
@@ -165,7 +161,7 @@ def test_a_wheeled_robot_without_the_constructor_of_its_base_class(tmp_path: Pat
         find_driver(f"{path}:Rover")(RobotSettings())
 
 
-def test_the_example_says_which_option_it_lacks() -> None:
+def test_the_example_says_which_option_it_lacks():
     example = Path(__file__).parents[3] / "examples" / "own_robot.py"
     with pytest.raises(
         SettingsError, match=r'^\[robot.options\] lacks the port; give port = "/dev/ttyUSB0"$'
@@ -173,7 +169,7 @@ def test_the_example_says_which_option_it_lacks() -> None:
         find_driver(f"{example}:OwnRobot")(RobotSettings())
 
 
-def test_an_unknown_name() -> None:
+def test_an_unknown_name():
     with pytest.raises(SettingsError, match="did you mean 'koala'"):
         find_driver("koalla")
     with pytest.raises(SettingsError, match="there are arduino, create"):
@@ -189,7 +185,7 @@ CAMERA = CameraSettings(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3, forward_m=0.1)
 KNOWN = Geometry(radius=0.2, axle=0.25, max_forward=0.3, max_turn=0.8)
 
 
-def test_settings_go_over_what_the_driver_knows() -> None:
+def test_settings_go_over_what_the_driver_knows():
     given = Geometry(axle=0.31, ranger_bearings_deg=(90.0,), ranger_reach=1.0)
     description = RobotSettings(camera=CAMERA, geometry=given).describe(KNOWN)
     assert (description.axle, description.radius) == (0.31, 0.2)
@@ -213,7 +209,7 @@ def test_settings_go_over_what_the_driver_knows() -> None:
         ('[robot]\ndrivr = "koala"', "'drivr'; did you mean 'driver'"),
     ],
 )
-def test_wrong_values_are_one_line(text: str, words: str, tmp_path: Path) -> None:
+def test_wrong_values_are_one_line(text: str, words: str, tmp_path):
     (tmp_path / "robot.toml").write_text(text)
     with pytest.raises(SettingsError) as error:
         load_settings(tmp_path / "robot.toml")
@@ -227,6 +223,6 @@ def test_wrong_values_are_one_line(text: str, words: str, tmp_path: Path) -> Non
         (RobotSettings(camera=CAMERA), Geometry(), "radius is missing"),
     ],
 )
-def test_settings_that_lack_something(settings: RobotSettings, known: Geometry, words: str) -> None:
+def test_settings_that_lack_something(settings: RobotSettings, known: Geometry, words: str):
     with pytest.raises(SettingsError, match=words):
         settings.describe(known)

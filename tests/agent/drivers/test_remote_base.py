@@ -1,7 +1,5 @@
 """The driver `remote` against a base that is written from docs/wire.md by hand, over a real router."""
 
-from __future__ import annotations
-
 import json
 import struct
 import threading
@@ -182,7 +180,7 @@ class TestRemote(RobotContract):
             robot.close()
             bus.close()
 
-    def test_it_comes_back_when_the_port_has_vanished(self, robot: Robot, emulator: Any) -> None:
+    def test_it_comes_back_when_the_port_has_vanished(self, robot: Robot, emulator: Any):
         """The base has the last command no more; the driver does not give it again, but lets it stand."""
         drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
         emulator.unplug()
@@ -203,7 +201,7 @@ class TestRemote(RobotContract):
         back = drive_way(robot, Command(0.2, 0.0), 0.05)
         assert len(back[-1].proximity) == len(robot.describe().ranger_bearings)
 
-    def test_a_stalled_line_holds_up_nothing(self, robot: Robot, emulator: Any) -> None:
+    def test_a_stalled_line_holds_up_nothing(self, robot: Robot, emulator: Any):
         """Nothing but the next observation: commands are taken, the wheels stop, and it can be closed."""
         drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)
         emulator.stalled = True

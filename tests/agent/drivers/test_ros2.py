@@ -1,7 +1,5 @@
 """The ROS 2 driver against an emulated robot of a second implementation of the wire format."""
 
-from __future__ import annotations
-
 import logging
 import math
 import re
@@ -95,7 +93,7 @@ def last(robot: CheckedRobot, ticks: int = 3) -> Observation:
     return seen
 
 
-def test_the_camera_is_what_the_robot_says(start: Start) -> None:
+def test_the_camera_is_what_the_robot_says(start: Start):
     emulator = Ros2Robot(lens={"lens": (0.1, -0.02, 0.001, 0.002, 0.003)})
     described = start(emulator).describe()
     camera = described.camera
@@ -106,7 +104,7 @@ def test_the_camera_is_what_the_robot_says(start: Start) -> None:
     assert camera.mount_height == pytest.approx(0.26)
 
 
-def test_a_fisheye_lens_is_taken_from_camera_info(start: Start) -> None:
+def test_a_fisheye_lens_is_taken_from_camera_info(start: Start):
     emulator = Ros2Robot(lens={"model": "equidistant", "lens": (0.01, -0.002, 0.0, 0.0)})
     lens = start(emulator).describe().distortion
     assert isinstance(lens, Equidistant)
@@ -120,7 +118,7 @@ def test_a_fisheye_lens_is_taken_from_camera_info(start: Start) -> None:
 @pytest.mark.parametrize("bridge", first_quick([None, "/bot1"], 1))
 def test_other_odometry_compressed_images_and_stamped_commands(
     start: Start, odometry: str, more: dict[str, Any], bridge: str | None
-) -> None:
+):
     emulator = Ros2Robot(stamped=True, bridge=bridge)
     robot = start(emulator, image="camera/image_raw/compressed", odometry=odometry, **more)
     robot.sense()
@@ -138,7 +136,7 @@ def test_other_odometry_compressed_images_and_stamped_commands(
     assert sum(o.image is not None for o in seen) > len(seen) - 3
 
 
-def test_a_scan_is_free_room_from_the_robots_edge(start: Start) -> None:
+def test_a_scan_is_free_room_from_the_robots_edge(start: Start):
     emulator = Ros2Robot()
     robot = start(emulator, ranges=["scan"])
     described = robot.describe()
@@ -158,7 +156,7 @@ def test_a_scan_is_free_room_from_the_robots_edge(start: Start) -> None:
     assert sorted(seen.values())[3] == 3.5
 
 
-def test_bearings_near_to_each_other_have_rays_of_their_own() -> None:
+def test_bearings_near_to_each_other_have_rays_of_their_own():
     ranges = [2.0] * 360
     ranges[10] = 0.5
     data = peer.scan(0, "laser", 0.0, math.radians(1.0), 0.1, 3.5, ranges).bytes()
@@ -172,7 +170,7 @@ def test_bearings_near_to_each_other_have_rays_of_their_own() -> None:
     assert (ranger.distances(few, np.radians(np.arange(0.0, 340.0, 5.0))) < 1.0).all()
 
 
-def test_range_and_infrared_sensors(start: Start) -> None:
+def test_range_and_infrared_sensors(start: Start):
     emulator = Ros2Robot()
     # At 10 cm in front of a bright surface the Create 3's sensor says 3500 exp(-26.8 * 0.1).
     emulator.infrared = [("ir_intensity_left", 239), ("ir_intensity_right", 5)]
@@ -192,7 +190,7 @@ def test_range_and_infrared_sensors(start: Start) -> None:
     until(lambda: not len(last(robot, 1).proximity), 5.0)
 
 
-def test_touch_and_being_lifted_are_reported(start: Start) -> None:
+def test_touch_and_being_lifted_are_reported(start: Start):
     emulator = Ros2Robot()
     robot = start(emulator)
     assert not last(robot).bumped
@@ -209,7 +207,7 @@ def test_touch_and_being_lifted_are_reported(start: Start) -> None:
     until(lambda: last(robot, 1).battery == 0.625, 5.0)
 
 
-def test_another_clock_is_translated(start: Start) -> None:
+def test_another_clock_is_translated(start: Start):
     emulator = Ros2Robot()
     emulator.clock_ns = -1_700_000_000 * 10**9
     robot = start(emulator)
@@ -240,8 +238,8 @@ def test_another_clock_is_translated(start: Start) -> None:
     ],
 )  # fmt: skip
 def test_what_is_wrong_is_said_in_one_line(
-    start: Start, given: dict[str, Any], options: dict[str, Any], line: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    start: Start, given: dict[str, Any], options: dict[str, Any], line: str, monkeypatch
+):
     monkeypatch.setattr("mapweave.agent.drivers.wheeled.PATIENCE", 0.1)
     monkeypatch.setattr("mapweave.agent.drivers.wheeled.RETRY", 0.05)
     monkeypatch.setattr("mapweave.agent.drivers.ros2.PATIENCE", 0.3)
@@ -257,7 +255,7 @@ def test_what_is_wrong_is_said_in_one_line(
     until(said, 10.0)
 
 
-def test_odometry_without_orientation_is_refused() -> None:
+def test_odometry_without_orientation_is_refused():
     """Its heading was taken for 0."""
     zeros = SimpleNamespace(x=0.0, y=0.0, z=0.0, w=0.0)
     message = SimpleNamespace(pose=SimpleNamespace(pose=SimpleNamespace(position=zeros, orientation=zeros)))
@@ -265,14 +263,14 @@ def test_odometry_without_orientation_is_refused() -> None:
         WheelOdometry(0.25, None, ("left", "right")).update(ODOMETRY_TYPE, message, 0)
 
 
-def test_settings_are_checked_before_anything_moves(start: Start) -> None:
+def test_settings_are_checked_before_anything_moves(start: Start):
     with pytest.raises(SettingsError, match="axle is missing"):
         Ros2(RobotSettings("ros2", {}, geometry=Geometry(radius=0.15)))
     with pytest.raises(SettingsError, match="endpoint"):
         Ros2(RobotSettings("ros2", {"endpoint": "robot.local"}))
 
 
-def test_without_a_router_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_router_one_line_says_so(monkeypatch):
     monkeypatch.setattr("mapweave.agent.drivers.wheeled.PATIENCE", 1.0)
     monkeypatch.setattr("mapweave.agent.drivers.ros2.PATIENCE", 0.3)
     robot = Ros2(RobotSettings("ros2", {"endpoint": "tcp/127.0.0.1:9"}, None, Geometry(0.15, 0.25)))
@@ -297,8 +295,8 @@ def test_without_a_router_one_line_says_so(monkeypatch: pytest.MonkeyPatch) -> N
     ),
 )
 def test_what_is_not_taken_into_account_of_a_camera_is_said(
-    start: Start, caplog: pytest.LogCaptureFixture, degrees: float, lens: dict[str, Any], words: str
-) -> None:
+    start: Start, caplog, degrees: float, lens: dict[str, Any], words: str
+):
     """Its heading was said alone, and the pitch of recordings."""
     half = math.radians(degrees) / 2.0
     robot = start(Ros2Robot(camera=(0.0, math.sin(half), 0.0, math.cos(half)), lens=lens))
@@ -309,7 +307,7 @@ def test_what_is_not_taken_into_account_of_a_camera_is_said(
     assert all(line.startswith("/camera/camera_info: ") and words in line for line in lines)
 
 
-def test_that_odometry_has_two_publishers_is_said(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+def test_that_odometry_has_two_publishers_is_said(start: Start, caplog):
     """The steps between their poses were taken for slip, or the robot for one that stands."""
     emulator = Ros2Robot()
     robot = start(emulator)
@@ -325,7 +323,7 @@ def test_that_odometry_has_two_publishers_is_said(start: Start, caplog: pytest.L
     assert line.startswith("/odom has 2 publishers, whose poses are mixed")
 
 
-def test_that_no_node_listens_is_said_once(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+def test_that_no_node_listens_is_said_once(start: Start, caplog):
     emulator = Ros2Robot()
     robot = start(emulator, command="drive")
     with caplog.at_level(logging.WARNING):
@@ -338,8 +336,8 @@ def test_that_no_node_listens_is_said_once(start: Start, caplog: pytest.LogCaptu
 
 @pytest.mark.parametrize("bridge", first_quick([None, "/bot1"], 1))
 def test_a_second_agent_of_one_robot_is_refused_and_says_nothing_to_the_wheels(
-    start: Start, bridge: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    start: Start, bridge: str | None, monkeypatch
+):
     """Agents of two names drove one robot, each against the other."""
     emulator = Ros2Robot(bridge=bridge)
     first = start(emulator)
@@ -379,7 +377,7 @@ def test_a_second_agent_of_one_robot_is_refused_and_says_nothing_to_the_wheels(
     until(described, 30.0)
 
 
-def test_others_who_publish_commands_are_named(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+def test_others_who_publish_commands_are_named(start: Start, caplog):
     """A person's teleoperation, or Nav2: no reason to refuse."""
     emulator = Ros2Robot()
     robot = start(emulator)

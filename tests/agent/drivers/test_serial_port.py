@@ -1,12 +1,9 @@
 """Errors of a serial port are DeviceErrors of one line, whichever call meets them first."""
 
-from __future__ import annotations
-
 import os
 import pty
 import tty
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
@@ -36,7 +33,7 @@ def ends() -> Iterator[tuple[int, SerialPort]]:
         lambda port: port.line_waiting(),
     ],
 )
-def test_a_port_that_vanishes_is_a_device_error(call: Callable[[SerialPort], object]) -> None:
+def test_a_port_that_vanishes_is_a_device_error(call: Callable[[SerialPort], object]):
     master, slave = pty.openpty()
     port = SerialPort(os.ttyname(slave), 115200)
     os.close(slave)
@@ -46,7 +43,7 @@ def test_a_port_that_vanishes_is_a_device_error(call: Callable[[SerialPort], obj
     port.close()
 
 
-def test_lines_end_by_either_character_and_empty_ones_are_skipped(ends: tuple[int, SerialPort]) -> None:
+def test_lines_end_by_either_character_and_empty_ones_are_skipped(ends: tuple[int, SerialPort]):
     master, port = ends
     os.write(master, b"\r\none\r\n\n\r two\rthr")
     assert [port.line(), port.line()] == ["one", "two"]
@@ -62,7 +59,7 @@ def test_lines_end_by_either_character_and_empty_ones_are_skipped(ends: tuple[in
 )
 def test_bytes_that_are_no_answer_ask_for_the_baud_rate(
     ends: tuple[int, SerialPort], read: Callable[[SerialPort], object]
-) -> None:
+):
     """A wrong baud rate, or a mouse at the port, is no robot that is switched off."""
     master, port = ends
     os.write(master, bytes(range(128, 140)))
@@ -72,12 +69,12 @@ def test_bytes_that_are_no_answer_ask_for_the_baud_rate(
         read(port)
 
 
-def test_a_port_is_opened_once(ends: tuple[int, SerialPort]) -> None:
+def test_a_port_is_opened_once(ends: tuple[int, SerialPort]):
     with pytest.raises(DeviceError, match="is in use by another process"):
         SerialPort(ends[1].path, 115200)
 
 
-def test_a_port_that_is_not_there(tmp_path: Path) -> None:
+def test_a_port_that_is_not_there(tmp_path):
     with pytest.raises(DeviceError, match="there is no such port"):
         SerialPort(str(tmp_path / "ttyUSB7"), 115200)
     with pytest.raises(DeviceError, match=f"^{tmp_path}: "):

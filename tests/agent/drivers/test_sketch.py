@@ -1,7 +1,5 @@
 """The sketch of docs/arduino.md, compiled for this machine, at the far end of a pseudo-terminal."""
 
-from __future__ import annotations
-
 import os
 import pty
 import re
@@ -118,7 +116,7 @@ def program(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_the_sketch_drives_counts_and_stops_by_itself(program: Path, video: Path) -> None:
+def test_the_sketch_drives_counts_and_stops_by_itself(program: Path, video: Path):
     master, slave = pty.openpty()
     tty.setraw(slave)
     board = subprocess.Popen([program, str(master)], pass_fds=[master], stdout=subprocess.PIPE, text=True)

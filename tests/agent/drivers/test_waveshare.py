@@ -1,7 +1,5 @@
 """The Waveshare UGV's driver over a pseudo-terminal and over HTTP."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty
@@ -32,18 +30,18 @@ class TestUgvSerial(RobotContract):
     # Speeds are summed: a change of speed between two answers is half seen.
     COUNT = 0.02
 
-    def test_it_shortens_the_watchdog_before_it_drives(self, robot: Robot, emulator: Any) -> None:
+    def test_it_shortens_the_watchdog_before_it_drives(self, robot: Robot, emulator: Any):
         drive(robot, Command(0.1, 0.0), 0.2)
         sent = [json.loads(line) for line in emulator.heard.splitlines()]
         moves = [k for k, command in enumerate(sent) if command["T"] == 1 and command["L"]]
         assert {"T": 136, "cmd": 300} in sent[: moves[0]]
 
-    def test_a_line_that_is_cut_off_is_passed_over(self, robot: Robot, emulator: Any) -> None:
+    def test_a_line_that_is_cut_off_is_passed_over(self, robot: Robot, emulator: Any):
         emulator.say(b'{"T":1001,"L":0.1\r\n\xff\xfe{}\r\n')
         drive_until(robot, Command(0.1, 0.0), lambda: emulator.wheels.speeds[0] > 0.05)
 
 
-def test_odometers_go_before_speeds(tmp_path: Path, video: Path) -> None:
+def test_odometers_go_before_speeds(tmp_path, video: Path):
     """Firmware ugv_base_ros: `odl`, `odr` in centimetres."""
     ugv = UgvSerial(tmp_path, odometers=True)
     camera = CameraSettings(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3, source=str(video))
@@ -58,7 +56,7 @@ def test_odometers_go_before_speeds(tmp_path: Path, video: Path) -> None:
     ugv.close()
 
 
-def test_a_base_that_streams_something_else_is_named(tmp_path: Path) -> None:
+def test_a_base_that_streams_something_else_is_named(tmp_path):
     """Before, its lines were read for ever, and no command went out."""
     master, slave = pty.openpty()
     tty.setraw(slave)
@@ -83,12 +81,12 @@ def test_a_base_that_streams_something_else_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("port", ["http://", "http://127.0.0.1:abc", "https://192.168.4.1", "http://h:99999"])
-def test_an_address_that_is_none(port: str) -> None:
+def test_an_address_that_is_none(port: str):
     with pytest.raises(SettingsError, match="neither a serial device nor http://ADDRESS"):
         Waveshare(RobotSettings(options={"port": port}))
 
 
-def test_an_address_where_no_robot_is() -> None:
+def test_an_address_where_no_robot_is():
     address = f"http://127.0.0.1:{free_port()}"
     with pytest.raises(
         DeviceError, match=f"^{address}: Connection refused; is the robot switched on, and this"
@@ -96,7 +94,7 @@ def test_an_address_where_no_robot_is() -> None:
         HttpLine(address).feedback()
 
 
-def test_a_second_driver_at_an_address_is_refused_and_leaves_the_wheels_alone(tmp_path: Path) -> None:
+def test_a_second_driver_at_an_address_is_refused_and_leaves_the_wheels_alone(tmp_path):
     """By any name that the address has. Agents of other names would each drive the robot."""
     ugv = UgvHttp(tmp_path)
     first, second = WaveshareBase(ugv.path), WaveshareBase(ugv.path.replace("127.0.0.1", "localhost"))
@@ -115,7 +113,7 @@ def test_a_second_driver_at_an_address_is_refused_and_leaves_the_wheels_alone(tm
         ugv.close()
 
 
-def test_a_driver_in_another_process_is_refused_until_the_first_has_ended(tmp_path: Path) -> None:
+def test_a_driver_in_another_process_is_refused_until_the_first_has_ended(tmp_path):
     ugv = UgvHttp(tmp_path)
     holder = subprocess.Popen(
         [sys.executable, "-c",

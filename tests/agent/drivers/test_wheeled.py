@@ -1,7 +1,5 @@
 """A base and a camera as one robot: odometry at the time of the image, whatever fails."""
 
-from __future__ import annotations
-
 import sys
 import threading
 import time
@@ -107,7 +105,7 @@ def robot(base: EvenBase, camera: LateCamera) -> Iterator[CheckedRobot]:
     robot.close()
 
 
-def test_odometry_is_that_of_the_time_between_the_images(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_odometry_is_that_of_the_time_between_the_images(monkeypatch):
     """The wheels' way is that of the middle of the base's answer. Time passes with its answers alone."""
     passed = [10**15]
 
@@ -136,7 +134,7 @@ def test_odometry_is_that_of_the_time_between_the_images(monkeypatch: pytest.Mon
     robot.close()
 
 
-def test_a_touch_between_two_observations_is_not_lost(robot: CheckedRobot, base: EvenBase) -> None:
+def test_a_touch_between_two_observations_is_not_lost(robot: CheckedRobot, base: EvenBase):
     quiet = robot.sense()
     base.touches, base.reads = 1, 0
     eventually(lambda: base.reads >= 3)  # The last two touch nothing.
@@ -148,9 +146,7 @@ def test_a_touch_between_two_observations_is_not_lost(robot: CheckedRobot, base:
     assert [seen.kidnapped for seen in (quiet, touched, after)] == [False, True, False]
 
 
-def test_ticks_without_image_and_images_after_them(
-    robot: CheckedRobot, base: EvenBase, camera: LateCamera
-) -> None:
+def test_ticks_without_image_and_images_after_them(robot: CheckedRobot, base: EvenBase, camera: LateCamera):
     # Else what a busy machine does between the reading and the clock would count.
     base.stamped, base.reads = True, 0
     eventually(lambda: base.reads >= 3)
@@ -170,7 +166,7 @@ def test_ticks_without_image_and_images_after_them(
     assert sum(o.odometry.forward for o in observations[1:]) == pytest.approx(whole, abs=1e-3)
 
 
-def test_neither_image_nor_wheels(robot: CheckedRobot, base: EvenBase, camera: LateCamera) -> None:
+def test_neither_image_nor_wheels(robot: CheckedRobot, base: EvenBase, camera: LateCamera):
     robot.sense()
     camera.silent = base.failing = True
     begin = time.monotonic()
@@ -189,8 +185,8 @@ def test_neither_image_nor_wheels(robot: CheckedRobot, base: EvenBase, camera: L
 
 
 def test_a_base_that_waits_on_for_an_answer_is_called_silent(
-    robot: CheckedRobot, base: EvenBase, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+    robot: CheckedRobot, base: EvenBase, monkeypatch, caplog
+):
     monkeypatch.setattr(wheeled, "SILENT", 0.3)
     base.answers.clear()
     with caplog.at_level("WARNING"):
@@ -208,7 +204,7 @@ def test_a_base_that_waits_on_for_an_answer_is_called_silent(
     ]
 
 
-def test_a_driver_that_fails_is_not_driven_on(robot: CheckedRobot, base: EvenBase) -> None:
+def test_a_driver_that_fails_is_not_driven_on(robot: CheckedRobot, base: EvenBase):
     robot.sense()
     base.broken = True
     with pytest.raises(DeviceError, match=rf"^driver: {__file__}, line \d+: ValueError: a mistake"):
@@ -242,8 +238,8 @@ class Reads(EvenBase):
     ],
 )
 def test_a_base_that_reads_wrongly_from_the_start(
-    read: Callable[[], Any], words: str, camera: LateCamera, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    read: Callable[[], Any], words: str, camera: LateCamera, monkeypatch
+):
     # It is not waited for: that would take longer than any test may.
     monkeypatch.setattr(wheeled, "PATIENCE", 600.0)
     robot = CheckedRobot(WheeledRobot(Reads(read), SETTINGS, camera))
@@ -254,9 +250,7 @@ def test_a_base_that_reads_wrongly_from_the_start(
     robot.close()
 
 
-def test_a_base_that_cannot_be_closed_is_not_forgotten(
-    base: EvenBase, camera: LateCamera, monkeypatch
-) -> None:
+def test_a_base_that_cannot_be_closed_is_not_forgotten(base: EvenBase, camera: LateCamera, monkeypatch):
     monkeypatch.setattr(base, "close", lambda: {}["port"])
     base.failing = True
     robot = WheeledRobot(base, SETTINGS, camera)
@@ -265,9 +259,7 @@ def test_a_base_that_cannot_be_closed_is_not_forgotten(
     robot.close()
 
 
-def test_a_base_that_never_answers_is_not_called_closed(
-    camera: LateCamera, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_base_that_never_answers_is_not_called_closed(camera: LateCamera, monkeypatch):
     monkeypatch.setattr("mapweave.agent.drivers.wheeled.PATIENCE", 0.2)
     ended = threading.Event()
     robot = WheeledRobot(Reads(ended.wait), SETTINGS, camera)
@@ -277,7 +269,7 @@ def test_a_base_that_never_answers_is_not_called_closed(
     robot.close()
 
 
-def test_a_base_without_a_method_or_a_class_is_refused(camera: LateCamera, monkeypatch) -> None:
+def test_a_base_without_a_method_or_a_class_is_refused(camera: LateCamera, monkeypatch):
     with pytest.raises(DeviceError, match=r"^driver: base is the class EvenBase; it must be an object"):
         WheeledRobot(EvenBase, SETTINGS, camera)  # type: ignore[arg-type]
     monkeypatch.delattr(EvenBase, "read")
@@ -286,8 +278,8 @@ def test_a_base_without_a_method_or_a_class_is_refused(camera: LateCamera, monke
 
 
 def test_speeds_geometry_and_frames_of_another_type(
-    base: EvenBase, robot: CheckedRobot, camera: LateCamera, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    base: EvenBase, robot: CheckedRobot, camera: LateCamera, monkeypatch
+):
     monkeypatch.setattr(base, "nearest", lambda speeds: tuple(speeds))
     with pytest.raises(DeviceError, match=r"^driver: nearest\(\) must be Wheels, not tuple"):
         robot.act(Command(0.1, 0.0))
@@ -304,7 +296,7 @@ def test_speeds_geometry_and_frames_of_another_type(
     other.close()
 
 
-def test_a_base_that_is_not_there_is_one_line(base: EvenBase, camera: LateCamera, monkeypatch) -> None:
+def test_a_base_that_is_not_there_is_one_line(base: EvenBase, camera: LateCamera, monkeypatch):
     monkeypatch.setattr("mapweave.agent.drivers.wheeled.PATIENCE", 0.5)
     base.failing = True
     robot = WheeledRobot(base, SETTINGS, camera)
@@ -313,7 +305,7 @@ def test_a_base_that_is_not_there_is_one_line(base: EvenBase, camera: LateCamera
     robot.close()
 
 
-def test_a_counter_that_wraps_or_is_set_back() -> None:
+def test_a_counter_that_wraps_or_is_set_back():
     counter = WheelCounter(0.001, bits=16, fastest=1.0)
     ways = [counter.update(count, 0.1 * k) for k, count in enumerate([65500, 65530, 24, 54, 10, 40, 65530])]
     assert ways == pytest.approx([0.0, 0.030, 0.060, 0.090, 0.046, 0.076, 0.030])

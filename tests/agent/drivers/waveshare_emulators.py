@@ -1,7 +1,5 @@
 """Emulators of Waveshare's UGV, by serial line and HTTP."""
 
-from __future__ import annotations
-
 import contextlib
 import http.server
 import json

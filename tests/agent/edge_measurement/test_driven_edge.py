@@ -1,7 +1,5 @@
 """A drive writes back what it measured: how surely, how often, and what becomes of drives that disagree."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

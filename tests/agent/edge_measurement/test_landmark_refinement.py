@@ -1,7 +1,5 @@
 """Depths refined by drives: nearer to the truth, with honest sigmas, sent where it pays."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

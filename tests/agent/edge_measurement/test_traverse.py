@@ -1,7 +1,5 @@
 """Which drives are measurements, and how precise: for a robot whose pose is given, with noise."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

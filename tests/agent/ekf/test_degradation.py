@@ -112,7 +112,7 @@ def undisturbed(number: int) -> MappingFilter:
 )
 def test_without_landmarks_the_uncertainty_grows_and_is_reported(
     number: int, run: MappingRun, fault: Fault, named: Health, share: float, growth: float
-) -> None:
+):
     filter_, health, traces, distances = drive(run, fault)
     during = health[FIRST:LAST]
     assert during.count(named) >= share * len(during)
@@ -126,7 +126,7 @@ def test_without_landmarks_the_uncertainty_grows_and_is_reported(
 
 
 @pytest.mark.parametrize("fault", [silent_encoders, spiking_encoder])
-def test_wheels_that_lie_are_named_and_the_image_holds_the_pose(run: MappingRun, fault: Fault) -> None:
+def test_wheels_that_lie_are_named_and_the_image_holds_the_pose(run: MappingRun, fault: Fault):
     filter_, health, _, distances = drive(run, fault)
     lies = [
         k
@@ -144,7 +144,7 @@ def test_wheels_that_lie_are_named_and_the_image_holds_the_pose(run: MappingRun,
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.02])
-def test_standing_or_turning_is_reported_until_the_robot_drives(turn: float) -> None:
+def test_standing_or_turning_is_reported_until_the_robot_drives(turn: float):
     run = draw_run(np.random.default_rng(5), "line", 100)
     filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, FilterSettings(pixel_sigma=run.pixel_sigma))
     ids, rng = np.arange(30), np.random.default_rng(6)
@@ -164,7 +164,7 @@ def test_standing_or_turning_is_reported_until_the_robot_drives(turn: float) -> 
     assert filter_.health == (Health.GOOD, "")
 
 
-def test_a_blind_filter_is_lost_slowly_and_found_again() -> None:
+def test_a_blind_filter_is_lost_slowly_and_found_again():
     """Six seconds without an image on a drive that turns: the wheels alone, then landmarks again."""
     run = draw_run(np.random.default_rng(9), "weave", END)
     blind = replace(run, pixels=run.pixels.copy())
@@ -177,7 +177,7 @@ def test_a_blind_filter_is_lost_slowly_and_found_again() -> None:
 
 
 @pytest.mark.slow
-def test_pixels_worse_than_nominal_are_detected(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pixels_worse_than_nominal_are_detected(monkeypatch):
     """The image is blurred: pixels err three times as much as the tracker knows."""
     apart = []
     for seed in range(8):

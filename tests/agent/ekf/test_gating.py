@@ -16,11 +16,11 @@ def joint(n: int, shared: float, rng: np.random.Generator) -> tuple[np.ndarray, 
 
 
 @pytest.mark.parametrize("probability", [0.9, 0.99, 0.999])
-def test_gate_is_the_chi_square_quantile(probability: float) -> None:
+def test_gate_is_the_chi_square_quantile(probability: float):
     assert pixel_gate(probability) == pytest.approx(chdtri(2, 1 - probability))
 
 
-def test_leave_one_out_distances() -> None:
+def test_leave_one_out_distances():
     rng = np.random.default_rng(0)
     innovations, s = joint(7, 5.0, rng)
     given_others = leave_one_out(innovations, whiten(s))
@@ -33,14 +33,14 @@ def test_leave_one_out_distances() -> None:
         assert given_others[i] == pytest.approx(left @ np.linalg.solve(spread, left))
 
 
-def test_a_shared_error_is_no_outlier() -> None:
+def test_a_shared_error_is_no_outlier():
     rng = np.random.default_rng(1)
     gate = pixel_gate(0.999)
     kept = [select_inliers(*joint(20, 30.0, rng), gate)[0].mean() for _ in range(50)]
     assert np.mean(kept) > 0.99
 
 
-def test_outliers_hidden_by_a_shared_error_are_found() -> None:
+def test_outliers_hidden_by_a_shared_error_are_found():
     rng = np.random.default_rng(2)
     gate = pixel_gate(0.999)
     for _ in range(30):
@@ -57,7 +57,7 @@ def test_outliers_hidden_by_a_shared_error_are_found() -> None:
         np.testing.assert_allclose(white, np.eye(len(chosen)), atol=1e-8)
 
 
-def test_consensus_is_that_of_the_best_single_landmark() -> None:
+def test_consensus_is_that_of_the_best_single_landmark():
     """The vectorised hypotheses against one conditional distribution at a time."""
     rng = np.random.default_rng(3)
     innovations, s = joint(9, 10.0, rng)
@@ -78,7 +78,7 @@ def test_consensus_is_that_of_the_best_single_landmark() -> None:
     assert one_point_consensus(innovations, s, gate).sum() == best
 
 
-def test_nothing_plausible_means_nothing_accepted() -> None:
+def test_nothing_plausible_means_nothing_accepted():
     innovations = np.full((4, 2), 100.0) * np.array([[1, 1], [-1, 1], [1, -1], [-1, -1]])
     accepted, whitening, _ = select_inliers(innovations, np.eye(8), pixel_gate(0.999))
     assert not accepted.any()

@@ -53,7 +53,7 @@ def dense_inputs(wheel_root: np.ndarray, side_slip: float) -> np.ndarray:
 
 @settings(deadline=None)
 @given(sizes)
-def test_propagate(size: tuple[int, int]) -> None:
+def test_propagate(size: tuple[int, int]):
     n, _ = size
     rng, state = scene(*size)
     blocks, by_input = rng.normal(size=(n + 1, 3, 3)), rng.normal(size=(3 + 3 * n, 3))
@@ -71,7 +71,7 @@ def test_propagate(size: tuple[int, int]) -> None:
 @given(sizes, steps, st.booleans())
 def test_a_step_is_linearised_where_it_is_asked(
     size: tuple[int, int], step: tuple[float, float, float], elsewhere: bool
-) -> None:
+):
     """The exact motion there, and its derivatives from there to what the wheels say."""
     n, _ = size
     rng, state = scene(*size)
@@ -103,7 +103,7 @@ def test_a_step_is_linearised_where_it_is_asked(
 @example((12, 8437))
 @example((40, 5))
 @example((70, 5))
-def test_the_update_agrees_with_the_textbook(size: tuple[int, int]) -> None:
+def test_the_update_agrees_with_the_textbook(size: tuple[int, int]):
     n, _ = size
     rng, state = scene(*size)
     covariance = state.covariance
@@ -135,7 +135,7 @@ def test_the_update_agrees_with_the_textbook(size: tuple[int, int]) -> None:
 
 @settings(deadline=None)
 @given(sizes)
-def test_the_wheels_errors_are_estimated_from_an_image(size: tuple[int, int]) -> None:
+def test_the_wheels_errors_are_estimated_from_an_image(size: tuple[int, int]):
     """Against the posterior of the errors as two more states of a textbook filter."""
     n, _ = size
     rng, state = scene(*size)
@@ -157,7 +157,7 @@ def test_the_wheels_errors_are_estimated_from_an_image(size: tuple[int, int]) ->
 
 @settings(deadline=None)
 @given(sizes)
-def test_an_image_is_examined(size: tuple[int, int]) -> None:
+def test_an_image_is_examined(size: tuple[int, int]):
     n, _ = size
     rng, state = scene(*size)
     slots, variances = some_slots(rng, n), rng.uniform(0.2, 2.0, 2)
@@ -176,7 +176,7 @@ def test_an_image_is_examined(size: tuple[int, int]) -> None:
 
 @settings(deadline=None)
 @given(sizes)
-def test_landmarks_vote_on_the_turn(size: tuple[int, int]) -> None:
+def test_landmarks_vote_on_the_turn(size: tuple[int, int]):
     """A turn that all of them see is the vote, unless the wheels forbid it; a quarter may be wrong."""
     n, _ = size
     rng, state = scene(*size)
@@ -189,7 +189,7 @@ def test_landmarks_vote_on_the_turn(size: tuple[int, int]) -> None:
     assert turn_by_image(rays, slots, slopes, root, 4.0) == pytest.approx(np.clip(turn, -limit, limit))
 
 
-def test_a_scattered_vote_counts_as_much_as_its_variance_allows() -> None:
+def test_a_scattered_vote_counts_as_much_as_its_variance_allows():
     """Against a thousand repeated draws: weighed by their variances, vote and wheels err less than either."""
     rng, m = np.random.default_rng(3), 24
     rays, slots = np.zeros((m, 3)), np.arange(m)
@@ -207,7 +207,7 @@ def test_a_scattered_vote_counts_as_much_as_its_variance_allows() -> None:
 
 @settings(deadline=None)
 @given(sizes, st.booleans())
-def test_visible_landmarks(size: tuple[int, int], in_order: bool) -> None:
+def test_visible_landmarks(size: tuple[int, int], in_order: bool):
     """Against dictionaries: which landmarks are held and seen, and what is reported of all that was given."""
     n, _ = size
     rng, _ = scene(*size)
@@ -237,7 +237,7 @@ def test_visible_landmarks(size: tuple[int, int], in_order: bool) -> None:
 
 @settings(deadline=None)
 @given(sizes)
-def test_the_step_is_linearised_at_the_turn_of_the_image(size: tuple[int, int]) -> None:
+def test_the_step_is_linearised_at_the_turn_of_the_image(size: tuple[int, int]):
     n, _ = size
     rng, state = scene(*size)
     slots, root = some_slots(rng, n), rng.normal(size=(2, 2)) * 0.01
@@ -257,7 +257,7 @@ def test_the_step_is_linearised_at_the_turn_of_the_image(size: tuple[int, int]) 
 
 
 @pytest.mark.parametrize("size", [1, 2, 5, LEAF, LEAF + 1, 60, 150])
-def test_whitening_of_any_size(size: int) -> None:
+def test_whitening_of_any_size(size: int):
     rng = np.random.default_rng(size)
     root = rng.normal(size=(size, 2 * size))
     whitening = whiten(root @ root.T)
@@ -265,7 +265,7 @@ def test_whitening_of_any_size(size: int) -> None:
     assert not np.triu(whitening, 1).any()
 
 
-def test_invalid_covariances_are_refused() -> None:
+def test_invalid_covariances_are_refused():
     with pytest.raises(np.linalg.LinAlgError):
         whiten(np.zeros((4, 4)))
     with pytest.raises(np.linalg.LinAlgError):

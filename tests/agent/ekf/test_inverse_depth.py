@@ -27,7 +27,7 @@ def derivative(function, at: np.ndarray, h: float = 1e-6) -> np.ndarray:  # type
 
 
 @given(poses, mounts, seeds)
-def test_predictions_agree_with_the_camera(pose_vector: np.ndarray, mount: float, seed: int) -> None:
+def test_predictions_agree_with_the_camera(pose_vector: np.ndarray, mount: float, seed: int):
     camera = Camera(320, 240, 277.0, 250.0, 160.0, 120.0, 0.3, mount)
     points = some_points(seed)
     rays, _ = rays_of_points(points, mount, 0.3)
@@ -42,7 +42,7 @@ def test_predictions_agree_with_the_camera(pose_vector: np.ndarray, mount: float
 
 
 @given(poses, mounts, seeds)
-def test_jacobians_of_the_projection(pose_vector: np.ndarray, mount: float, seed: int) -> None:
+def test_jacobians_of_the_projection(pose_vector: np.ndarray, mount: float, seed: int):
     rays, _ = rays_of_points(some_points(seed), mount, 0.3)
     view = project_anchored(pose_vector, rays, mount)
     clear = view.scale > 0.1
@@ -54,7 +54,7 @@ def test_jacobians_of_the_projection(pose_vector: np.ndarray, mount: float, seed
 
 
 @given(mounts, seeds)
-def test_points_and_rays_are_each_others_inverse(mount: float, seed: int) -> None:
+def test_points_and_rays_are_each_others_inverse(mount: float, seed: int):
     points = some_points(seed)
     rays, by_point = rays_of_points(points, mount, 0.3)
     back, by_ray = points_of_rays(rays, mount, 0.3)
@@ -64,6 +64,6 @@ def test_points_and_rays_are_each_others_inverse(mount: float, seed: int) -> Non
     np.testing.assert_allclose(by_point[0], numeric, rtol=1e-5, atol=1e-7)
 
 
-def test_a_ray_that_may_be_at_infinity_has_no_point() -> None:
+def test_a_ray_that_may_be_at_infinity_has_no_point():
     points, _ = points_of_rays(np.array([[0.1, 0.1, 0.0], [0.1, 0.1, -0.2]]), 0.0, 0.3)
     assert np.isnan(points).all()

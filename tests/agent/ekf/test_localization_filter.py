@@ -72,7 +72,7 @@ def off(filter_: LocalizationFilter, world: World) -> np.ndarray:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, AHEAD])
-def test_from_a_metre_and_a_radian_wrong(camera: Camera) -> None:
+def test_from_a_metre_and_a_radian_wrong(camera: Camera):
     world = World(0, camera)
     prior = PoseGaussian.from_sigmas(world.true @ Pose2(-0.7, 0.9, 1.1), *NOWHERE)
     filter_ = world.filter(prior)
@@ -85,14 +85,14 @@ def test_from_a_metre_and_a_radian_wrong(camera: Camera) -> None:
 
 
 @pytest.mark.slow
-def test_converges_consistently_over_random_starts() -> None:
+def test_converges_consistently_over_random_starts():
     starts = [try_start(np.random.default_rng([6, k]), steps=40) for k in range(50)]
     assert np.mean([start.converged for start in starts]) >= 0.98
     # 150 degrees of freedom: 99.8 % of the averages lie in 2.0 to 4.2.
     assert 2.0 < np.mean([start.nees for start in starts]) < 4.2
 
 
-def test_driving_makes_the_map_better() -> None:
+def test_driving_makes_the_map_better():
     world = World(1)
     filter_ = world.filter(world.near())
     before = np.linalg.norm(world.mapped - world.points, axis=1)
@@ -112,7 +112,7 @@ def test_driving_makes_the_map_better() -> None:
 
 
 @pytest.mark.slow
-def test_the_error_of_the_maps_own_pixels_is_not_averaged_away() -> None:
+def test_the_error_of_the_maps_own_pixels_is_not_averaged_away():
     """The vertical slopes are the same in each image: as white noise they made the pose's NEES 60."""
     nees = []
     for seed in range(12):
@@ -123,7 +123,7 @@ def test_the_error_of_the_maps_own_pixels_is_not_averaged_away() -> None:
     assert np.mean(nees) < 6.5
 
 
-def test_landmarks_met_on_the_way() -> None:
+def test_landmarks_met_on_the_way():
     world = World(2)
     filter_ = world.filter(world.near(), take=slice(0, 12))
     world.drive(filter_, 30)
@@ -144,7 +144,7 @@ def test_landmarks_met_on_the_way() -> None:
     assert not behind.any()
 
 
-def test_seeing_nothing_grows_the_covariance_and_ends_health() -> None:
+def test_seeing_nothing_grows_the_covariance_and_ends_health():
     world = World(5)
     filter_ = world.filter(world.near())
     world.drive(filter_, 20)
@@ -160,7 +160,7 @@ def test_seeing_nothing_grows_the_covariance_and_ends_health() -> None:
     assert filter_.healthy
 
 
-def test_a_few_good_among_wrong_tracks_are_named() -> None:
+def test_a_few_good_among_wrong_tracks_are_named():
     world = World(6)
     filter_ = world.filter(world.near())
     world.drive(filter_, 10)
@@ -177,7 +177,7 @@ def test_a_few_good_among_wrong_tracks_are_named() -> None:
     assert filter_.state is before
 
 
-def test_kidnapped_while_blind_is_found_again() -> None:
+def test_kidnapped_while_blind_is_found_again():
     world = World(7)
     filter_ = world.filter(world.near())
     world.drive(filter_, 20)
@@ -188,7 +188,7 @@ def test_kidnapped_while_blind_is_found_again() -> None:
     assert filter_.pose.mahalanobis2(world.true) < 20.0
 
 
-def test_wrong_tracks_do_not_move_the_pose() -> None:
+def test_wrong_tracks_do_not_move_the_pose():
     world = World(8)
     clean, spoiled = world.filter(world.near()), None
     spoiled = world.filter(clean.pose)
@@ -206,14 +206,14 @@ def test_wrong_tracks_do_not_move_the_pose() -> None:
     assert off(spoiled, world)[:2].max() < off(clean, world)[:2].max() + 0.01
 
 
-def test_ids_come_only_once() -> None:
+def test_ids_come_only_once():
     world = World(9)
     filter_ = world.filter(world.near())
     with pytest.raises(InvalidValue):
         filter_.add(np.array([0]), world.mapped[:1], world.covariances[:1])
 
 
-def test_prior_keeps_its_convention() -> None:
+def test_prior_keeps_its_convention():
     """A right perturbation round-trips for any heading."""
     prior = PoseGaussian(
         Pose2(1.0, 2.0, 2.2), np.array([[0.04, 0.01, 0.0], [0.01, 0.02, 0.003], [0.0, 0.003, 0.01]])

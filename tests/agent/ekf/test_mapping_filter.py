@@ -36,7 +36,7 @@ def a_run(shape: str = "arc", seed: int = 0, steps: int = 120, camera: Camera = 
 
 
 @pytest.mark.parametrize("camera", [CAMERA, AHEAD])
-def test_prediction_is_the_dense_form(camera: Camera) -> None:
+def test_prediction_is_the_dense_form(camera: Camera):
     run = a_run(camera=camera)
     filter_ = start(run)
     drive(filter_, run, last=60)
@@ -56,7 +56,7 @@ def test_prediction_is_the_dense_form(camera: Camera) -> None:
     np.testing.assert_allclose(filter_.state.pose_vector, pose_vector)
 
 
-def test_side_slip_moves_robot_and_landmarks_together() -> None:
+def test_side_slip_moves_robot_and_landmarks_together():
     """Against samples: robots that slip aside by chance, each with the landmarks as it then sees them."""
     run, step, share = a_run(), Odometry(0.05, 0.1), 0.2
     filter_ = start(run, side_slip=share)
@@ -75,7 +75,7 @@ def test_side_slip_moves_robot_and_landmarks_together() -> None:
     np.testing.assert_allclose(more, np.cov(np.array(samples).T), atol=0.06 * np.abs(more).max())
 
 
-def test_update_is_the_textbook_kalman_update(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_update_is_the_textbook_kalman_update(monkeypatch):
     """Without a step before it there is nothing to linearise again: a plain linear update."""
     run = a_run()
     monkeypatch.setattr(pixel_noise, "ADAPTATION", 0.0)
@@ -104,7 +104,7 @@ def test_update_is_the_textbook_kalman_update(monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.mark.parametrize("camera", [CAMERA, AHEAD])
-def test_there_and_back_is_where_it_was(camera: Camera, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_there_and_back_is_where_it_was(camera: Camera, monkeypatch):
     monkeypatch.setattr(motion, "WHEEL_FLOOR", 0.0)
     run = a_run(camera=camera)
     filter_ = MappingFilter(camera, AXLE, 0.0)
@@ -117,7 +117,7 @@ def test_there_and_back_is_where_it_was(camera: Camera, monkeypatch: pytest.Monk
     np.testing.assert_allclose(filter_.state.covariance, before.covariance, atol=1e-10)
 
 
-def test_reanchoring_marginalises_the_old_anchor() -> None:
+def test_reanchoring_marginalises_the_old_anchor():
     """One filter that goes on from its first anchor, one that is reanchored on the way: same landmarks."""
     run = a_run()
     plain, moved = start(run), start(run)
@@ -137,7 +137,7 @@ def test_reanchoring_marginalises_the_old_anchor() -> None:
     assert plain.pose.mahalanobis2(whole) < 3.0
 
 
-def test_pose_covariance_is_perturbed_on_the_right() -> None:
+def test_pose_covariance_is_perturbed_on_the_right():
     run = a_run("weave", steps=40)
     filter_ = start(run)
     drive(filter_, run)
@@ -150,7 +150,7 @@ def test_pose_covariance_is_perturbed_on_the_right() -> None:
     np.testing.assert_allclose(np.cov(right.T), expected, atol=0.08 * np.abs(expected).max())
 
 
-def test_landmark_covariances_are_those_of_samples() -> None:
+def test_landmark_covariances_are_those_of_samples():
     run = a_run(camera=AHEAD)
     filter_ = start(run)
     drive(filter_, run)
@@ -166,7 +166,7 @@ def test_landmark_covariances_are_those_of_samples() -> None:
 
 
 @pytest.mark.parametrize("turn", [0.0, 0.02])
-def test_standing_or_turning_gives_no_depth(turn: float) -> None:
+def test_standing_or_turning_gives_no_depth(turn: float):
     run = a_run()
     filter_ = start(run)
     prior = filter_.landmarks().depth_sigmas
@@ -186,7 +186,7 @@ def test_standing_or_turning_gives_no_depth(turn: float) -> None:
     assert not filter_.converged().any()
 
 
-def test_convergence_is_reached_by_driving_and_is_true() -> None:
+def test_convergence_is_reached_by_driving_and_is_true():
     run = a_run("line", steps=300)
     filter_ = start(run)
     drive(filter_, run)
@@ -197,7 +197,7 @@ def test_convergence_is_reached_by_driving_and_is_true() -> None:
     assert (off < 4 * np.maximum(0.05, 0.05 * known.depths[converged])).all()
 
 
-def test_predicts_where_landmarks_will_be_seen() -> None:
+def test_predicts_where_landmarks_will_be_seen():
     run = a_run("arc", steps=200)
     filter_ = start(run)
     drive(filter_, run, last=199)
@@ -209,7 +209,7 @@ def test_predicts_where_landmarks_will_be_seen() -> None:
     np.testing.assert_array_equal(filter_.predict_pixels()[filter_.ids == 5][0], expected[0])
 
 
-def test_the_report_is_about_the_given_ids() -> None:
+def test_the_report_is_about_the_given_ids():
     run = a_run()
     filter_ = start(run)
     filter_.predict(STILL)
@@ -220,7 +220,7 @@ def test_the_report_is_about_the_given_ids() -> None:
     assert np.isnan(report.innovations_px[2:]).all()
 
 
-def test_bad_input_is_refused() -> None:
+def test_bad_input_is_refused():
     run = a_run()
     filter_ = start(run)
     with pytest.raises(InvalidValue):
@@ -231,7 +231,7 @@ def test_bad_input_is_refused() -> None:
         filter_.add(np.array([40]), np.array([[10.0, 10.0]]), np.array([0.5]))
 
 
-def test_landmarks_that_fall_behind_are_let_go() -> None:
+def test_landmarks_that_fall_behind_are_let_go():
     filter_ = MappingFilter(CAMERA, AXLE, 0.02)
     filter_.add(
         np.array([1, 2]), np.array([[160.0, 120.0]] * 2), np.array([1.0, 0.2]), np.array([0.01, 0.01])
@@ -245,7 +245,7 @@ def test_landmarks_that_fall_behind_are_let_go() -> None:
     assert filter_.landmarks().points_in_robot.shape == (0, 3)
 
 
-def test_removed_between_wheels_and_image() -> None:
+def test_removed_between_wheels_and_image():
     """The mapper forgets lost tracks after predict: the pending step must forget them too."""
     run = a_run()
     one, other = start(run), start(run)
@@ -263,7 +263,7 @@ def test_removed_between_wheels_and_image() -> None:
     np.testing.assert_allclose(one.state.rays, other.state.rays, atol=1e-12)
 
 
-def test_few_consistent_among_many_inconsistent_are_rejected() -> None:
+def test_few_consistent_among_many_inconsistent_are_rejected():
     run = a_run("line", steps=100)
     filter_ = start(run)
     drive(filter_, run)

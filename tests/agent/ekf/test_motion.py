@@ -28,7 +28,7 @@ def derivative(function, at: np.ndarray, h: float = 1e-6) -> np.ndarray:  # type
 
 
 @given(steps, mounts, seeds)
-def test_rays_move_as_points_do(step: Odometry, mount: float, seed: int) -> None:
+def test_rays_move_as_points_do(step: Odometry, mount: float, seed: int):
     rays = some_rays(seed)
     depth = 1.0 / rays[:, 2]
     # In the robot before the step: x forward, y left, z up relative to the camera.
@@ -42,7 +42,7 @@ def test_rays_move_as_points_do(step: Odometry, mount: float, seed: int) -> None
 
 
 @given(steps, st.floats(-0.4, 0.4), seeds)
-def test_rays_follow_the_exact_form_of_the_notes(step: Odometry, _: float, seed: int) -> None:
+def test_rays_follow_the_exact_form_of_the_notes(step: Odometry, _: float, seed: int):
     rays = some_rays(seed)
     p3 = 1.0 / rays[:, 2]
     p1, p2 = rays[:, 0] * p3, rays[:, 1] * p3
@@ -55,7 +55,7 @@ def test_rays_follow_the_exact_form_of_the_notes(step: Odometry, _: float, seed:
 
 
 @given(steps, mounts, seeds)
-def test_jacobians_of_rays(step: Odometry, mount: float, seed: int) -> None:
+def test_jacobians_of_rays(step: Odometry, mount: float, seed: int):
     rays = some_rays(seed)
     moved = move_rays(rays, step, mount)
     for i, ray in enumerate(rays):
@@ -69,7 +69,7 @@ def test_jacobians_of_rays(step: Odometry, mount: float, seed: int) -> None:
 
 
 @given(steps, st.floats(-2, 2), st.floats(-2, 2), st.floats(-3, 3))
-def test_pose_moves_by_composition_and_its_jacobians(step: Odometry, x: float, y: float, h: float) -> None:
+def test_pose_moves_by_composition_and_its_jacobians(step: Odometry, x: float, y: float, h: float):
     pose_vector = np.array([x, y, h])
     after, by_pose, by_input = move_pose(pose_vector, step)
     expected = Pose2.from_vector(pose_vector) @ step.motion()
@@ -82,7 +82,7 @@ def test_pose_moves_by_composition_and_its_jacobians(step: Odometry, x: float, y
 
 
 @given(steps)
-def test_wheel_noise_is_that_of_two_independent_wheels(step: Odometry) -> None:
+def test_wheel_noise_is_that_of_two_independent_wheels(step: Odometry):
     noise = WheelNoise(axle=0.24, share=0.02)
     ways = np.array([step.forward + 0.12 * step.turn, step.forward - 0.12 * step.turn])
     from_ways = np.array([[0.5, 0.5], [1 / 0.24, -1 / 0.24]])

@@ -41,7 +41,7 @@ def everything(run: MappingRun) -> np.ndarray:
 
 
 @pytest.mark.slow
-def test_near_the_batch_optimum(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
+def test_near_the_batch_optimum(runs: list[tuple[MappingRun, MappingFilter]]):
     ratios = []
     for run, filter_ in runs[:6]:
         pose_vector, points = batch_optimum(run, PRIOR_DEPTH, PRIOR_SPREAD)
@@ -52,7 +52,7 @@ def test_near_the_batch_optimum(runs: list[tuple[MappingRun, MappingFilter]]) ->
 
 
 @pytest.mark.slow
-def test_pose_errors_match_the_covariance(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
+def test_pose_errors_match_the_covariance(runs: list[tuple[MappingRun, MappingFilter]]):
     """Average NEES in its interval; with each step linearised only where the wheels say, it is 8 to 10."""
     nees = [filter_.pose.mahalanobis2(run.poses[-1]) for run, filter_ in runs]
     low, high = INTERVAL
@@ -60,13 +60,13 @@ def test_pose_errors_match_the_covariance(runs: list[tuple[MappingRun, MappingFi
 
 
 @pytest.mark.slow
-def test_landmark_errors_match_their_covariances(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
+def test_landmark_errors_match_their_covariances(runs: list[tuple[MappingRun, MappingFilter]]):
     low, high = INTERVAL
     assert low < np.mean([landmark_nees(run, filter_) for run, filter_ in runs]) < high
 
 
 @pytest.mark.slow
-def test_spoiled_tracks_do_not_bend_the_map(runs: list[tuple[MappingRun, MappingFilter]]) -> None:
+def test_spoiled_tracks_do_not_bend_the_map(runs: list[tuple[MappingRun, MappingFilter]]):
     ratios = []
     for k, (run, filter_) in enumerate(runs[:6]):
         bad, spoiled = spoil(run, 0.3, np.random.default_rng([12, k]))
@@ -75,7 +75,7 @@ def test_spoiled_tracks_do_not_bend_the_map(runs: list[tuple[MappingRun, Mapping
     assert max(ratios) < 2.0
 
 
-def test_spoiled_tracks_are_refused() -> None:
+def test_spoiled_tracks_are_refused():
     """A track that has jumped is refused from then on, and no good one with it."""
     run = draw_run(np.random.default_rng(3), "line", 200)
     pixels = run.pixels.copy()
@@ -93,7 +93,7 @@ def test_spoiled_tracks_are_refused() -> None:
 
 
 @pytest.mark.parametrize("k", first_quick(range(RUNS), 2))
-def test_covariance_is_symmetric_and_positive_after_a_run(k: int) -> None:
+def test_covariance_is_symmetric_and_positive_after_a_run(k: int):
     assert_covariance(followed(k)[1].state.covariance)
 
 
@@ -104,7 +104,7 @@ def assert_covariance(covariance: np.ndarray) -> None:
 
 
 @pytest.mark.slow
-def test_the_covariance_stays_valid_for_ten_thousand_steps() -> None:
+def test_the_covariance_stays_valid_for_ten_thousand_steps():
     """Symmetric to the last bit and positive, twenty times the paper's run."""
     run = draw_run(np.random.default_rng(4), "arc", 335, landmarks=8)
     filter_ = MappingFilter(run.camera, AXLE, WHEEL_NOISE, FilterSettings(pixel_sigma=run.pixel_sigma))

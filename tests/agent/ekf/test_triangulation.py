@@ -25,7 +25,7 @@ def points_in_robot(triangulation: Triangulation, camera: Camera) -> np.ndarray:
 
 
 @pytest.mark.parametrize("camera", [CAMERA, AHEAD])
-def test_consistent_and_unbiased(camera: Camera) -> None:
+def test_consistent_and_unbiased(camera: Camera):
     run, poses = a_run(camera)
     triangulation = triangulate(poses, run.pixels, camera)
     truth = run.poses[-1].inverse().apply(run.points)
@@ -40,7 +40,7 @@ def test_consistent_and_unbiased(camera: Camera) -> None:
     )
 
 
-def test_same_as_scipy_on_one_track() -> None:
+def test_same_as_scipy_on_one_track():
     run, poses = a_run(AHEAD, landmarks=8)
     triangulation = triangulate(poses, run.pixels, AHEAD, reference=poses[0])
     points = points_in_robot(triangulation, AHEAD)
@@ -55,7 +55,7 @@ def test_same_as_scipy_on_one_track() -> None:
         np.testing.assert_allclose(points[i], best.x, rtol=1e-4, atol=1e-5)
 
 
-def test_reference_frames_agree() -> None:
+def test_reference_frames_agree():
     run, poses = a_run()
     there = points_in_robot(triangulate(poses, run.pixels, CAMERA, reference=poses[30]), CAMERA)
     here = points_in_robot(triangulate(poses, run.pixels, CAMERA), CAMERA)
@@ -63,7 +63,7 @@ def test_reference_frames_agree() -> None:
     np.testing.assert_allclose(moved, here, rtol=1e-3, atol=1e-3)
 
 
-def test_a_track_that_moves_shows_in_chi2() -> None:
+def test_a_track_that_moves_shows_in_chi2():
     run, poses = a_run()
     pixels = run.pixels.copy()
     pixels[40:, 3] += np.linspace(0, 30, len(poses) - 40)[:, None]
@@ -72,7 +72,7 @@ def test_a_track_that_moves_shows_in_chi2() -> None:
     assert (np.delete(triangulation.chi2, 3) < 2).all()
 
 
-def test_pure_rotation_gives_no_depth() -> None:
+def test_pure_rotation_gives_no_depth():
     poses = np.column_stack([np.zeros((30, 2)), np.linspace(-0.2, 0.2, 30)])
     points = np.array([[3.0, 0.2, 0.4], [2.0, -0.3, 0.1]])
     rng = np.random.default_rng(0)
@@ -81,7 +81,7 @@ def test_pure_rotation_gives_no_depth() -> None:
     assert (triangulation.depth_sigmas > 100).all()
 
 
-def test_tracks_seen_once_or_never_are_nan() -> None:
+def test_tracks_seen_once_or_never_are_nan():
     run, poses = a_run()
     pixels = run.pixels.copy()
     pixels[:, 0] = np.nan
@@ -91,6 +91,6 @@ def test_tracks_seen_once_or_never_are_nan() -> None:
     assert np.isfinite(triangulation.depths[2:]).all()
 
 
-def test_shapes_are_checked() -> None:
+def test_shapes_are_checked():
     with pytest.raises(InvalidValue):
         triangulate(np.zeros((3, 3)), np.zeros((4, 5, 2)), CAMERA)

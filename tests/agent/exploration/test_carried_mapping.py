@@ -1,7 +1,5 @@
 """When a carried robot makes nodes: rule by rule, and on photographs hung on walls."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Lost, and in doubt: what the navigator takes for a place, and how it looks for one."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -11,7 +9,7 @@ import pytest
 from mapweave.agent.global_localization import candidates
 from mapweave.agent.global_localization.candidates import FleetMapSource, OwnMapSource
 from mapweave.agent.global_localization.global_localization import GlobalLocalization
-from mapweave.agent.global_localization.search_policy import TO_NAVIGATE
+from mapweave.agent.global_localization.resumption import TO_NAVIGATE
 from mapweave.agent.mission import ServerAnswer, WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from mapweave.agent.observation import Observation, Odometry

@@ -1,7 +1,5 @@
 """How a robot looks for a place of its own map, in rooms of known landmarks."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass, field, replace
@@ -12,8 +10,7 @@ import pytest
 from mapweave.agent.global_localization.candidates import OwnMapSource
 from mapweave.agent.global_localization.global_localization import MOVE, GlobalLocalization
 from mapweave.agent.global_localization.pose_consistency import OTHER_VIEW
-from mapweave.agent.global_localization.resumption import Resumption
-from mapweave.agent.global_localization.search_policy import TO_MAP, SearchPolicy
+from mapweave.agent.global_localization.resumption import TO_MAP, Resumption, SearchPolicy
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.hybridmap.change import NodePut
@@ -301,9 +298,7 @@ def test_the_same_observations_give_the_same_search(home, own_map):
 
 
 @pytest.mark.parametrize("direction", np.linspace(-2.9, 2.9, 11).tolist())
-def test_it_drives_toward_what_it_has_recognised_wherever_that_is(
-    own_map: HybridMap, direction: float
-) -> None:
+def test_it_drives_toward_what_it_has_recognised_wherever_that_is(own_map: HybridMap, direction: float):
     """Where nothing is near, no reading lies on a way between two rangers, and it drove somewhere else."""
     motion = MotionPrimitives(BODY)
     motion.take_in(Observation(0, Odometry(0.0, 0.0), proximity=FREE), ())

@@ -1,7 +1,5 @@
 """Weak answers count together only if the robot moved between them, and as the wheels say."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -30,9 +28,7 @@ steps = st.builds(Pose2, st.floats(0.4, 2.0), st.floats(-0.2, 0.2), st.floats(-0
 
 
 @given(begin=poses, odom=poses, step=steps, node=st.sampled_from([FIRST, SECOND]))
-def test_two_weak_views_of_one_place_are_a_proof(
-    begin: Pose2, odom: Pose2, step: Pose2, node: NodeId
-) -> None:
+def test_two_weak_views_of_one_place_are_a_proof(begin: Pose2, odom: Pose2, step: Pose2, node: NodeId):
     """Wherever the wheels' frame begins, and whether one node was recognised or two of one component."""
     agreement = ViewAgreement()
     assert agreement.take(weak(FIRST, begin), odom, 5.0, 3.0) is None
@@ -42,13 +38,13 @@ def test_two_weak_views_of_one_place_are_a_proof(
 
 
 @given(begin=poses, step=steps, off=st.sampled_from([Pose2(1.2, 0, 0), Pose2(0, -1.2, 0), Pose2(0, 0, 0.6)]))
-def test_another_motion_than_the_wheels_measured_is_none(begin: Pose2, step: Pose2, off: Pose2) -> None:
+def test_another_motion_than_the_wheels_measured_is_none(begin: Pose2, step: Pose2, off: Pose2):
     agreement = ViewAgreement()
     agreement.take(weak(FIRST, begin), Pose2(), 0.0, 0.0)
     assert agreement.take(weak(FIRST, begin @ step @ off), step, abs(step.x), abs(step.heading)) is None
 
 
-def test_the_same_view_again_proves_nothing() -> None:
+def test_the_same_view_again_proves_nothing():
     agreement, noise = ViewAgreement(), np.random.default_rng(0)
     for _ in range(40):
         here = Pose2(*noise.normal(0.0, 0.01, 3))
@@ -56,7 +52,7 @@ def test_the_same_view_again_proves_nothing() -> None:
     assert agreement.take(weak(FIRST, Pose2(0.6, 0, 0)), Pose2(0.6, 0, 0), 0.6, 0.0) is not None
 
 
-def test_vague_poses_need_more_motion() -> None:
+def test_vague_poses_need_more_motion():
     """With a sigma of 0.5 m, 0.6 m of driving are not seen in the poses; 5 m are."""
     for way, certain in ((0.6, False), (5.0, True)):
         agreement = ViewAgreement()
@@ -65,7 +61,7 @@ def test_vague_poses_need_more_motion() -> None:
         assert (agreement.take(weak(FIRST, moved, 0.5), moved, way, 0.0) is not None) == certain
 
 
-def test_what_is_not_joined_or_long_ago_is_not_compared() -> None:
+def test_what_is_not_joined_or_long_ago_is_not_compared():
     step = Pose2(1.0, 0.0, 0.0)
     for component, begun in ((NO_COMPONENT, 0.0), (1, 0.0), (0, -MEMORY)):
         agreement = ViewAgreement()
@@ -73,7 +69,7 @@ def test_what_is_not_joined_or_long_ago_is_not_compared() -> None:
         assert agreement.take(weak(SECOND, step, component=component), step, 1.0, 0.0) is None
 
 
-def test_an_answer_that_is_certain_needs_no_other_and_an_ambiguous_one_is_none() -> None:
+def test_an_answer_that_is_certain_needs_no_other_and_an_ambiguous_one_is_none():
     answer = weak(FIRST, Pose2())
     agreement = ViewAgreement()
     found = RelocalizeAnswer(Certainty.FOUND, answer.candidates, "")

@@ -1,7 +1,5 @@
 """Estimates of a pose that are joined, and how certain one is."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

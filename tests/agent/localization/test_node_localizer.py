@@ -1,7 +1,5 @@
 """A node is mapped, then the robot stands somewhere else: does it know where, and does it know when not?"""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

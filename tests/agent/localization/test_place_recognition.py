@@ -1,7 +1,5 @@
 """Recognising places of the own map among others that are alike, in a world with known truth."""
 
-from __future__ import annotations
-
 import math
 import tracemalloc
 from dataclasses import replace

@@ -1,9 +1,6 @@
 """Keyframes: what is left of an episode is made in pieces."""
 
-from __future__ import annotations
-
 import numpy as np
-import pytest
 
 from mapweave.agent.mapping import keyframe_builder, loop_closures
 from mapweave.agent.mapping.anchored_keyframe import AnchoredKeyframe
@@ -25,7 +22,7 @@ def node(number: int) -> Node:
     return Node(NodeId("r0", 1, number), number, pose, CAMERA, Landmarks.empty())
 
 
-def test_a_piece_compares_a_node_with_one_earlier_place(monkeypatch: pytest.MonkeyPatch):
+def test_a_piece_compares_a_node_with_one_earlier_place(monkeypatch):
     """A comparison takes as long as following the tracks: four in one tick were a late tick."""
     compared: list[int] = []
     monkeypatch.setattr(loop_closures, "register", lambda earlier, *_: compared.append(earlier.id.number))
@@ -40,9 +37,7 @@ def test_a_piece_compares_a_node_with_one_earlier_place(monkeypatch: pytest.Monk
     assert by_piece == [(3,), (2,), (1,), ()]
 
 
-def test_no_edge_is_written_that_servers_refuse(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_no_edge_is_written_that_servers_refuse(monkeypatch, caplog):
     """After a long way without landmarks a robot knows nothing of a drive; servers refuse such edges."""
     sigmas = iter((11.0, 9.0))
     ends = node(1).id, node(2).id

@@ -1,7 +1,5 @@
 """Whether an image continues the one before: on photographs, in the dark, and behind a person's back."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

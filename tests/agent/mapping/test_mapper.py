@@ -1,7 +1,5 @@
 """The mapper on photographs hung on walls of known depth."""
 
-from __future__ import annotations
-
 import threading
 from dataclasses import replace
 from itertools import pairwise

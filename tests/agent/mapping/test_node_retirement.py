@@ -1,7 +1,5 @@
 """Nodes of the own map that newer ones have superseded for long leave it, and nothing is lost by it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import replace
 
@@ -57,7 +55,7 @@ def nodes_of(robot: Robot, day: int) -> set[NodeId]:
     return {node.id for node in robot.map.nodes.values() if node.stamp_ns // DAY == day}
 
 
-def test_superseded_nodes_leave_after_two_weeks_and_the_map_holds_together() -> None:
+def test_superseded_nodes_leave_after_two_weeks_and_the_map_holds_together():
     robot = Robot(WAY, BESIDE)
     old, new = nodes_of(robot, 0), nodes_of(robot, 1)
     before = dict(robot.map.nodes)
@@ -76,13 +74,13 @@ def test_superseded_nodes_leave_after_two_weeks_and_the_map_holds_together() -> 
     assert not robot.retire(2 * DAY + KEPT + EVERY), "none is left that could go"
 
 
-def test_the_only_views_of_a_place_stay() -> None:
+def test_the_only_views_of_a_place_stay():
     robot = Robot(WAY, BACK)
     assert len(nodes_of(robot, 0)) >= 5 and not robot.retire(30 * DAY)
 
 
 @pytest.mark.parametrize("kept", ["held", "not released"])
-def test_what_is_in_use_or_named_stays(kept: str) -> None:
+def test_what_is_in_use_or_named_stays(kept: str):
     some = Robot(WAY, BESIDE).retire(30 * DAY)
     robot, stays = Robot(WAY, BESIDE), max(some)
     ways: dict[str, Callable[[], set[NodeId]]] = {
@@ -93,7 +91,7 @@ def test_what_is_in_use_or_named_stays(kept: str) -> None:
     assert gone and stays not in gone and stays in robot.map.nodes
 
 
-def test_a_node_stays_that_alone_leads_to_others() -> None:
+def test_a_node_stays_that_alone_leads_to_others():
     robot = Robot(WAY, BESIDE)
     some = max(robot.retire(30 * DAY))
     robot = Robot(WAY, BESIDE)
@@ -106,7 +104,7 @@ def test_a_node_stays_that_alone_leads_to_others() -> None:
     assert some not in gone and len(robot.map.components()) == 1
 
 
-def test_many_later_views_around_supersede_a_node_that_none_recognises() -> None:
+def test_many_later_views_around_supersede_a_node_that_none_recognises():
     """Later views of the first one's place; their edges say nothing of what they share."""
     robot = Robot(WAY)
     middle = sorted(robot.map.nodes)[3]
@@ -123,7 +121,7 @@ def test_many_later_views_around_supersede_a_node_that_none_recognises() -> None
     assert len(robot.map.components()) == 1 and min(robot.map.nodes) == NodeId(*MAP, 1)
 
 
-def test_a_clock_that_is_put_back_holds_nothing_up() -> None:
+def test_a_clock_that_is_put_back_holds_nothing_up():
     robot = Robot(WAY, BESIDE)
     retirement = NodeRetirement(robot.map)
     assert retirement.next(900 * DAY) is None
@@ -134,7 +132,7 @@ def test_a_clock_that_is_put_back_holds_nothing_up() -> None:
 
 
 @pytest.mark.slow
-def test_a_year_of_drives_makes_no_larger_map() -> None:
+def test_a_year_of_drives_makes_no_larger_map():
     rng = np.random.default_rng(5)
     world = room(0, 0, 5, 4, 900, rng)
     own = SurveyedMap(MAP, rng)

@@ -1,7 +1,5 @@
 """Wheels against image: small slips are consistent, contradicting motions are not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Poses relative to a node against networkx, and against the truth behind a loop that closes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Sightings of tracks against a plain table."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st

@@ -1,7 +1,5 @@
 """Tracks and filter together: what is reported, and that the filter does not run dry."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What is kept of the way between two nodes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which features are tracks, and which are chosen, against brute force."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

@@ -15,7 +15,7 @@ def number(pose: Pose2) -> complex:
 
 
 @pytest.mark.parametrize("world_from_map", [Pose2(), Pose2(3.0, 4.0, -2.0)])
-def test_a_correction_seen_from_elsewhere_is_the_same(world_from_map: Pose2) -> None:
+def test_a_correction_seen_from_elsewhere_is_the_same(world_from_map: Pose2):
     frame = cmath.exp(1j * world_from_map.heading)
     robot = Pose2(0.5, 6.0, 1.1)
     moved = WAY.seen_from(world_from_map).apply(world_from_map @ robot)
@@ -24,7 +24,7 @@ def test_a_correction_seen_from_elsewhere_is_the_same(world_from_map: Pose2) -> 
     assert moved.heading == pytest.approx((world_from_map @ Pose2(heading=1.1 + 0.7)).heading)
 
 
-def test_about_a_pose_that_pose_stays() -> None:
+def test_about_a_pose_that_pose_stays():
     here = Pose2(2.0, -1.0, 0.3)
     way = WayCorrection.about(here, 0.9)
     assert way.apply(here).vector == pytest.approx(here.vector)

@@ -1,7 +1,5 @@
 """Drives between boxes and standing robots, on an exact unicycle with exact rays, the guard in between."""
 
-from __future__ import annotations
-
 import math
 import tracemalloc
 

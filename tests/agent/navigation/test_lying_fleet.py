@@ -3,8 +3,6 @@
 `python -m benchmarks.trust` does the same with the whole agent in the simulator, judged by the truth.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """A drive past walls, written by hand in every format that is read."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """What a bag unpacks to is limited, in every way in which a bag may be compressed."""
 
-from __future__ import annotations
-
 import bz2
 from collections.abc import Callable
 from pathlib import Path
@@ -38,9 +36,7 @@ PACKED: dict[str, Callable[[bytes], bytes]] = {
 
 
 @pytest.mark.parametrize("kind", DECOMPRESSORS)
-def test_as_much_as_the_limit_is_unpacked_and_no_byte_more(
-    kind: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_as_much_as_the_limit_is_unpacked_and_no_byte_more(kind: str, monkeypatch):
     monkeypatch.setattr(bounded_decompression, "MOST_BYTES", TOO_SMALL)
     whole = PACKED[kind](bytes(TOO_SMALL - 3)) + PACKED[kind](b"end")
     assert bounded(DECOMPRESSORS[kind], whole) == bytes(TOO_SMALL - 3) + b"end"
@@ -51,7 +47,7 @@ def test_as_much_as_the_limit_is_unpacked_and_no_byte_more(
 
 
 @pytest.mark.parametrize("kind", DECOMPRESSORS)
-def test_what_is_too_large_is_not_unpacked_first(kind: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_too_large_is_not_unpacked_first(kind: str, monkeypatch):
     monkeypatch.setattr(bounded_decompression, "MOST_BYTES", TOO_SMALL)
     bomb = PACKED[kind](bytes(20 * ZEROS))
     asked: list[int] = []
@@ -102,9 +98,7 @@ BAGS: dict[str, Callable[[Path], Path]] = {
 
 
 @pytest.mark.parametrize("kind", BAGS)
-def test_a_message_that_is_too_large_unpacked_ends_its_topic(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_message_that_is_too_large_unpacked_ends_its_topic(kind: str, tmp_path, monkeypatch):
     """A bag of 6 kB took 6.2 GB."""
     path = BAGS[kind](tmp_path)
     ((_, message),) = Bag(path).messages(TOPIC)
@@ -119,8 +113,8 @@ def test_a_message_that_is_too_large_unpacked_ends_its_topic(
 
 @pytest.mark.parametrize("plugin", StoragePlugin)
 def test_a_file_that_is_packed_as_a_whole_and_is_too_large_is_not_unpacked(
-    plugin: StoragePlugin, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    plugin: StoragePlugin, tmp_path, monkeypatch
+):
     """A bag of 86 kB filled 100 MB of the disk."""
     path = ros2(tmp_path, plugin, CompressionMode.FILE)
     ((_, message),) = Bag(path).messages(TOPIC)
@@ -137,9 +131,7 @@ def test_a_file_that_is_packed_as_a_whole_and_is_too_large_is_not_unpacked(
 
 
 @pytest.mark.parametrize("kind", ["bz2", "lz4", "mcap"])
-def test_a_damaged_bag_is_unpacked_with_the_limit(
-    kind: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_damaged_bag_is_unpacked_with_the_limit(kind: str, tmp_path, monkeypatch):
     """It is read without its index, in another way than a whole one."""
     path = BAGS[kind](tmp_path)
     file = path if path.is_file() else next(path.glob("*.mcap"))
@@ -150,7 +142,7 @@ def test_a_damaged_bag_is_unpacked_with_the_limit(
         DamagedBag(file)
 
 
-def test_a_chunk_in_a_chunk_is_not_unpacked(tmp_path: Path) -> None:
+def test_a_chunk_in_a_chunk_is_not_unpacked(tmp_path):
     """Formats have none; each level would take the limit again."""
     path = next(BAGS["mcap"](tmp_path).glob("*.mcap"))
     data = path.read_bytes()
@@ -167,9 +159,7 @@ def test_a_chunk_in_a_chunk_is_not_unpacked(tmp_path: Path) -> None:
         DamagedBag(path)
 
 
-def test_a_video_of_too_many_pixels_is_refused_before_a_frame_is_decoded(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_video_of_too_many_pixels_is_refused_before_a_frame_is_decoded(tmp_path, monkeypatch):
     """Three black frames of 16000x16000 px in 5 MB took 2.1 GB."""
 
     class Large:

@@ -1,9 +1,5 @@
 """Videos whose headers or chunks are damaged: refused, or read as far as they go."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -33,9 +29,7 @@ class Damaged:
 
 @pytest.mark.parametrize("rate", [float("nan"), float("inf"), 1e-300, 0.0])
 @pytest.mark.parametrize("stamp", [float("nan"), float("inf"), 1e300])
-def test_times_that_are_no_numbers_are_none(
-    stamp: float, rate: float, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_times_that_are_no_numbers_are_none(stamp: float, rate: float, tmp_path, monkeypatch):
     (tmp_path / "a.avi").write_bytes(bytes(100))
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: Damaged(stamp, rate))
     images = video_images(tmp_path / "a.avi")
@@ -43,7 +37,7 @@ def test_times_that_are_no_numbers_are_none(
     assert "assumed" in images.assumed
 
 
-def test_an_error_of_opencv_ends_the_video(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_error_of_opencv_ends_the_video(tmp_path, monkeypatch):
     (tmp_path / "a.avi").write_bytes(bytes(100))
     monkeypatch.setattr(cv2, "VideoCapture", lambda *_: Damaged(0.0, 10.0, fails_at=3))
     images = video_images(tmp_path / "a.avi")

@@ -1,7 +1,5 @@
 """The same drive in every format gives the same observations."""
 
-from __future__ import annotations
-
 import struct
 from pathlib import Path
 
@@ -80,7 +78,7 @@ def folder_with_poses(drive: Drive, folder: Path) -> None:
 CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
 
 
-def test_what_a_camera_file_lacks_is_named_with_what_to_do(tmp_path: Path) -> None:
+def test_what_a_camera_file_lacks_is_named_with_what_to_do(tmp_path):
     """A robot's settings file was refused as a camera without a width, which it has in a table."""
     path = tmp_path / "robot.toml"
     path.write_text(f'[robot]\ndriver = "arduino"\n[robot.camera]\n{CAMERA_TOML}')
@@ -94,7 +92,7 @@ def test_what_a_camera_file_lacks_is_named_with_what_to_do(tmp_path: Path) -> No
 @pytest.mark.parametrize(
     "write", [kitti, euroc, tum_rgbd, four_seasons, folder_with_poses], ids=lambda f: f.__name__
 )
-def test_a_drive_is_read_as_it_was(write, drive: Drive, poses_file: Path, tmp_path: Path) -> None:
+def test_a_drive_is_read_as_it_was(write, drive: Drive, poses_file: Path, tmp_path):
     folder = tmp_path / "sequence"
     folder.mkdir()
     write(drive, folder)
@@ -118,9 +116,7 @@ def test_a_drive_is_read_as_it_was(write, drive: Drive, poses_file: Path, tmp_pa
     assert np.abs(gaps - STEP_NS).max() <= 1000
 
 
-def test_kitti_and_euroc_say_what_camera_it_is_but_not_how_high(
-    drive: Drive, poses_file: Path, tmp_path: Path
-) -> None:
+def test_kitti_and_euroc_say_what_camera_it_is_but_not_how_high(drive: Drive, poses_file: Path, tmp_path):
     euroc(drive, tmp_path)
     with pytest.raises(DeviceError, match="--camera-height"):
         open_recording(tmp_path, RecordingOptions(odometry=poses_file))
@@ -128,9 +124,7 @@ def test_kitti_and_euroc_say_what_camera_it_is_but_not_how_high(
     assert recording.camera == drive.camera
 
 
-def test_a_first_image_that_is_missing_is_left_out_as_any_other(
-    drive: Drive, poses_file: Path, tmp_path: Path
-) -> None:
+def test_a_first_image_that_is_missing_is_left_out_as_any_other(drive: Drive, poses_file: Path, tmp_path):
     euroc(drive, tmp_path)
     data = tmp_path / "mav0" / "cam0" / "data"
     (data / f"{drive.stamps_ns[0]}.png").unlink()
@@ -145,7 +139,7 @@ def test_a_first_image_that_is_missing_is_left_out_as_any_other(
         open_recording(tmp_path, RecordingOptions(odometry=poses_file, camera_height=0.3))
 
 
-def test_an_excerpt_of_kitti_has_the_times_that_its_images_are_named_by(drive: Drive, tmp_path: Path) -> None:
+def test_an_excerpt_of_kitti_has_the_times_that_its_images_are_named_by(drive: Drive, tmp_path):
     """times.txt and calib.txt are of the whole sequence; images 3 to 6 are there."""
     kitti(drive, tmp_path)
     for k in {*range(COUNT)} - {3, 4, 5, 6}:
@@ -166,8 +160,8 @@ def test_an_excerpt_of_kitti_has_the_times_that_its_images_are_named_by(drive: D
 )
 @pytest.mark.parametrize("text", [None, "intrinsics: [fx: 277.0]\nP0: 1\n"], ids=["missing", "another form"])
 def test_the_calibration_of_others_is_not_needed_beside_a_camera_file(
-    write, calibration: str, text: str | None, drive: Drive, poses_file: Path, tmp_path: Path
-) -> None:
+    write, calibration: str, text: str | None, drive: Drive, poses_file: Path, tmp_path
+):
     folder, camera = tmp_path / "sequence", tmp_path / "camera.toml"
     folder.mkdir()
     write(drive, folder)
@@ -183,7 +177,7 @@ def test_the_calibration_of_others_is_not_needed_beside_a_camera_file(
     assert calibration.split("/")[-1] in str(refused.value) or "give --camera FILE" in str(refused.value)
 
 
-def test_kitti_without_times_is_ten_images_a_second(drive: Drive, tmp_path: Path) -> None:
+def test_kitti_without_times_is_ten_images_a_second(drive: Drive, tmp_path):
     kitti(drive, tmp_path)
     (tmp_path / "times.txt").unlink()
     with pytest.raises(NoOdometry) as found:
@@ -195,7 +189,7 @@ def test_kitti_without_times_is_ten_images_a_second(drive: Drive, tmp_path: Path
         open_recording(tmp_path)
 
 
-def test_images_may_lie_in_the_folder_itself(drive: Drive, tmp_path: Path) -> None:
+def test_images_may_lie_in_the_folder_itself(drive: Drive, tmp_path):
     for k, image in enumerate(drive.images):
         cv2.imwrite(str(tmp_path / f"{k}.png"), image)
     with pytest.raises(Incomplete, match=r"no camera.toml; .* give --camera FILE"):
@@ -210,7 +204,7 @@ def test_images_may_lie_in_the_folder_itself(drive: Drive, tmp_path: Path) -> No
         open_recording(tmp_path)
 
 
-def test_a_fisheye_of_euroc_becomes_an_ideal_camera(drive: Drive, poses_file: Path, tmp_path: Path) -> None:
+def test_a_fisheye_of_euroc_becomes_an_ideal_camera(drive: Drive, poses_file: Path, tmp_path):
     euroc(drive, tmp_path)
     sensor = tmp_path / "mav0" / "cam0" / "sensor.yaml"
     text = sensor.read_text().replace("radial-tangential", "equidistant")
@@ -236,13 +230,13 @@ def test_a_fisheye_of_euroc_becomes_an_ideal_camera(drive: Drive, poses_file: Pa
         open_recording(tmp_path, options)
 
 
-def test_without_odometry_nothing_is_guessed(drive: Drive, tmp_path: Path) -> None:
+def test_without_odometry_nothing_is_guessed(drive: Drive, tmp_path):
     euroc(drive, tmp_path)
     with pytest.raises(DeviceError, match="EuRoC, 9 images, but no odometry: give --odometry FILE"):
         open_recording(tmp_path, RecordingOptions(camera_height=0.3))
 
 
-def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, tmp_path: Path) -> None:
+def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, tmp_path):
     path, camera = tmp_path / "walk.avi", tmp_path / "camera.toml"
     camera.write_text(CAMERA_TOML)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (320, 240), isColor=True)
@@ -269,8 +263,8 @@ def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, t
      ("walk.webm", "VP80", 1.0, "")],
 )  # fmt: skip
 def test_a_video_that_was_cut_off_says_so(
-    name: str, codec: str, share: float, says: str, drive: Drive, tmp_path: Path
-) -> None:
+    name: str, codec: str, share: float, says: str, drive: Drive, tmp_path
+):
     path, camera = tmp_path / name, tmp_path / "camera.toml"
     camera.write_text(CAMERA_TOML)
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 1.0, (320, 240), isColor=True)
@@ -297,9 +291,7 @@ def written_avi(drive: Drive, path: Path) -> Path:
     return path
 
 
-def test_a_video_that_ends_within_its_header_is_one_line(
-    drive: Drive, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_video_that_ends_within_its_header_is_one_line(drive: Drive, tmp_path, capfd):
     """A second reader of OpenCV, which reads no more of it, added a line of its own."""
     path = written_avi(drive, tmp_path / "walk.avi")
     path.write_bytes(path.read_bytes()[:300])
@@ -309,9 +301,7 @@ def test_a_video_that_ends_within_its_header_is_one_line(
     assert "Unexpected element" not in capfd.readouterr().err
 
 
-def test_an_avi_whose_last_frames_cannot_be_read_says_how_long_it_should_be(
-    drive: Drive, tmp_path: Path
-) -> None:
+def test_an_avi_whose_last_frames_cannot_be_read_says_how_long_it_should_be(drive: Drive, tmp_path):
     """As a card's bad sectors leave it: as long as it was, with an index."""
     path = written_avi(drive, tmp_path / "walk.avi")
     data, half = path.read_bytes(), path.stat().st_size // 2
@@ -324,7 +314,7 @@ def test_an_avi_whose_last_frames_cannot_be_read_says_how_long_it_should_be(
     )
 
 
-def test_a_camera_that_stops_is_named(drive: Drive, poses_file: Path, tmp_path: Path) -> None:
+def test_a_camera_that_stops_is_named(drive: Drive, poses_file: Path, tmp_path):
     """The wheels go on for seven seconds. The map is of what was seen."""
     folder = tmp_path / "sequence"
     folder.mkdir()
@@ -338,7 +328,7 @@ def test_a_camera_that_stops_is_named(drive: Drive, poses_file: Path, tmp_path: 
     assert recording.notes == ("the camera is silent for 7.0 s, 1.6 s after its first image",)
 
 
-def test_odometry_that_begins_again_at_zero_goes_on(drive: Drive, tmp_path: Path) -> None:
+def test_odometry_that_begins_again_at_zero_goes_on(drive: Drive, tmp_path):
     """A base that is started again counts from zero: the way back was taken for driven, and tore the map."""
     folder_with_poses(drive, tmp_path)
     (tmp_path / "camera.toml").write_text(CAMERA_TOML)
@@ -359,9 +349,7 @@ def test_odometry_that_begins_again_at_zero_goes_on(drive: Drive, tmp_path: Path
     ("scale", "way", "words"),
     [(1e3, 0.02, "every 100 s: times must be in seconds"), (1.0, 0.02, ""), (1e3, 2.0, ""), (1e3, 0.0, "")],
 )
-def test_times_in_milliseconds_are_named(
-    scale: float, way: float, words: str, drive: Drive, tmp_path: Path
-) -> None:
+def test_times_in_milliseconds_are_named(scale: float, way: float, words: str, drive: Drive, tmp_path):
     folder_with_poses(drive, tmp_path)
     (tmp_path / "camera.toml").write_text(CAMERA_TOML)
     (tmp_path / "times.txt").write_text("".join(f"{scale * 0.1 * k:g}\n" for k in range(COUNT)))
@@ -370,7 +358,7 @@ def test_times_in_milliseconds_are_named(
     assert words in notes and bool(notes) is bool(words)
 
 
-def test_odometry_of_another_clock_is_refused(drive: Drive, poses_file: Path, tmp_path: Path) -> None:
+def test_odometry_of_another_clock_is_refused(drive: Drive, poses_file: Path, tmp_path):
     kitti(drive, tmp_path)
     with pytest.raises(DeviceError, match="do not overlap: they must be of one clock"):
         open_recording(tmp_path, RecordingOptions(odometry=poses_file, camera_height=1.65))
@@ -387,7 +375,7 @@ def test_odometry_of_another_clock_is_refused(drive: Drive, poses_file: Path, tm
         ("# only a comment\n1 0 0 0 0 0 0 1\n", "1 poses"),
     ],
 )
-def test_wrong_poses_are_refused_in_one_line(text: str, words: str, drive: Drive, tmp_path: Path) -> None:
+def test_wrong_poses_are_refused_in_one_line(text: str, words: str, drive: Drive, tmp_path):
     kitti(drive, tmp_path)
     (tmp_path / "odometry.txt").write_text(text)
     with pytest.raises(DeviceError) as error:
@@ -395,9 +383,7 @@ def test_wrong_poses_are_refused_in_one_line(text: str, words: str, drive: Drive
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
-def test_poses_that_go_back_in_time_are_sorted_and_said(
-    drive: Drive, poses_file: Path, tmp_path: Path
-) -> None:
+def test_poses_that_go_back_in_time_are_sorted_and_said(drive: Drive, poses_file: Path, tmp_path):
     folder = tmp_path / "sequence"
     folder.mkdir()
     tum_rgbd(drive, folder)
@@ -417,7 +403,7 @@ def test_poses_that_go_back_in_time_are_sorted_and_said(
 
 
 @pytest.mark.parametrize("name", ["odometry.txt", "odometry.csv"])
-def test_poses_that_a_disk_has_damaged_are_used_up_to_there(name: str, drive: Drive, tmp_path: Path) -> None:
+def test_poses_that_a_disk_has_damaged_are_used_up_to_there(name: str, drive: Drive, tmp_path):
     """As a loss of power leaves them: the last block is zero, or another file's."""
     folder = tmp_path / "sequence"
     folder.mkdir()
@@ -439,7 +425,7 @@ def test_poses_that_a_disk_has_damaged_are_used_up_to_there(name: str, drive: Dr
 
 
 @pytest.mark.parametrize("height", [1650.0, -0.1, float("nan")])
-def test_a_height_in_another_unit_is_refused(height: float, drive: Drive, tmp_path: Path) -> None:
+def test_a_height_in_another_unit_is_refused(height: float, drive: Drive, tmp_path):
     euroc(drive, tmp_path)
     with pytest.raises(
         DeviceError, match=r"^--camera-height: camera: height_m is .*; it is in metres, from 0"
@@ -448,7 +434,7 @@ def test_a_height_in_another_unit_is_refused(height: float, drive: Drive, tmp_pa
 
 
 @pytest.mark.parametrize("name", ["notes.txt", "walk.mp4", "walk.mcap", "walk.bag", "walk.db3"])
-def test_what_is_no_recording_is_refused_in_one_line(name: str, tmp_path: Path) -> None:
+def test_what_is_no_recording_is_refused_in_one_line(name: str, tmp_path):
     path = tmp_path / name
     path.write_bytes(struct.pack("<8I", *range(8)))
     with pytest.raises(DeviceError) as error:
@@ -457,7 +443,7 @@ def test_what_is_no_recording_is_refused_in_one_line(name: str, tmp_path: Path) 
 
 
 @pytest.mark.parametrize("name", ["a.mp4", "a.avi", "a.bag", "a.mcap", "a.db3", "a.txt"])
-def test_an_empty_file_is_named_as_such(name: str, tmp_path: Path) -> None:
+def test_an_empty_file_is_named_as_such(name: str, tmp_path):
     """Of a copy that has failed it was said that the index of an MP4 is lost, or how a bag begins."""
     path = tmp_path / name
     path.touch()
@@ -466,7 +452,7 @@ def test_an_empty_file_is_named_as_such(name: str, tmp_path: Path) -> None:
     assert str(refusal.value) == f"{path}: the file is empty"
 
 
-def test_files_of_an_editor_of_windows(drive: Drive, tmp_path: Path) -> None:
+def test_files_of_an_editor_of_windows(drive: Drive, tmp_path):
     """Such editors begin a file with an invisible mark, and end lines with CR LF."""
     folder = tmp_path / "drive"
     folder.mkdir()
@@ -489,7 +475,7 @@ def test_files_of_an_editor_of_windows(drive: Drive, tmp_path: Path) -> None:
     assert open_recording(folder).increments[1] == pytest.approx([0.1, 0.0])
 
 
-def test_files_of_macos_beside_the_images_are_none(drive: Drive, tmp_path: Path) -> None:
+def test_files_of_macos_beside_the_images_are_none(drive: Drive, tmp_path):
     """Each was taken for an image, and each second image was left out."""
     folder_with_poses(drive, tmp_path)
     for path in list((tmp_path / "images").iterdir()):

@@ -1,10 +1,7 @@
 """The measured geometry of a robot in a file: read as it was written, what else is there stays."""
 
-from __future__ import annotations
-
 import math
 import tomllib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -37,7 +34,7 @@ def within(field: str) -> st.SearchStrategy[float]:
 
 @given(geometry=st.builds(DriveGeometry, **{field: within(field) for field in KEYS}), fresh=st.booleans())
 @settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
-def test_what_is_written_is_read(tmp_path: Path, geometry: DriveGeometry, fresh: bool) -> None:
+def test_what_is_written_is_read(tmp_path, geometry: DriveGeometry, fresh: bool):
     file = tmp_path / "new" / "r0.toml"
     file.unlink(missing_ok=True)
     if not fresh:
@@ -56,7 +53,7 @@ def test_what_is_written_is_read(tmp_path: Path, geometry: DriveGeometry, fresh:
             assert "# measured by hand" in file.read_text()
 
 
-def test_angles_are_degrees(tmp_path: Path) -> None:
+def test_angles_are_degrees(tmp_path):
     write_geometry(tmp_path / "r0.toml", DriveGeometry(heading=math.radians(-2.0)), {})
     assert tomllib.loads((tmp_path / "r0.toml").read_text())["heading_deg"] == pytest.approx(-2.0)
 
@@ -72,7 +69,7 @@ def test_angles_are_degrees(tmp_path: Path) -> None:
         ("left_m = " + "9" * 400, "left_m has too many digits"), ("left_m = " + "[" * 5000, "r0.toml"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_right_is_refused_in_one_line(tmp_path: Path, text: str, word: str) -> None:
+def test_what_cannot_be_right_is_refused_in_one_line(tmp_path, text: str, word: str):
     file = tmp_path / "r0.toml"
     file.write_text(text)
     with pytest.raises(DeviceError) as error:
@@ -82,14 +79,14 @@ def test_what_cannot_be_right_is_refused_in_one_line(tmp_path: Path, text: str, 
     assert "\n" not in str(error.value)
 
 
-def test_a_place_without_files_is_refused(tmp_path: Path) -> None:
+def test_a_place_without_files_is_refused(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(MapweaveError) as error:
         write_geometry(tmp_path / "file" / "r0.toml", DriveGeometry(), {})
     assert "\n" not in str(error.value)
 
 
-def test_a_robot_takes_what_was_measured_and_declares_the_rest(tmp_path: Path) -> None:
+def test_a_robot_takes_what_was_measured_and_declares_the_rest(tmp_path):
     camera = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3, mount_forward=0.1)
     declared = RobotDescription(camera, geometry=DriveGeometry(left=0.05))
     assert measured(declared, None) is declared

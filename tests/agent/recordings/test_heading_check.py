@@ -1,10 +1,7 @@
 """Headings of poses, held against the way."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -30,7 +27,7 @@ def driven(seed: int, step: float = 0.02) -> Array:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_right_headings_are_right(seed: int) -> None:
+def test_right_headings_are_right(seed: int):
     poses = driven(seed)
     assert not contradiction(poses)
     assert not contradiction(poses + np.array([0.0, 0.0, math.pi])), "a robot may drive back all the time"
@@ -51,14 +48,14 @@ def test_right_headings_are_right(seed: int) -> None:
     ],
     ids=["degrees", "reversed", "compass", "sideways", "held in the hand"],
 )
-def test_wrong_headings_are_named(seed: int, spoil: Callable[[Array], Array], words: str) -> None:
+def test_wrong_headings_are_named(seed: int, spoil: Callable[[Array], Array], words: str):
     poses = driven(seed)
     said = contradiction(np.column_stack([poses[:, :2], spoil(poses[:, 2])]))
     assert words in said and bool(said) is bool(words)
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_headings_that_were_never_filled_in_are_named(seed: int) -> None:
+def test_headings_that_were_never_filled_in_are_named(seed: int):
     poses = driven(seed)
     empty = np.column_stack([poses[:, :2], np.zeros(len(poses))])
     assert "all the same while the way turns" in contradiction(empty)
@@ -66,7 +63,7 @@ def test_headings_that_were_never_filled_in_are_named(seed: int) -> None:
     assert not contradiction(straight)
 
 
-def test_a_recording_with_headings_in_degrees_is_refused(tmp_path: Path) -> None:
+def test_a_recording_with_headings_in_degrees_is_refused(tmp_path):
     poses, folder = driven(0), tmp_path / "walk"
     (folder / "images").mkdir(parents=True)
     (folder / "camera.toml").write_text(

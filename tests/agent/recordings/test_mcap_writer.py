@@ -1,7 +1,5 @@
 """What a robot records: replayed as it sensed it, and read by rosbags as standard messages."""
 
-from __future__ import annotations
-
 import math
 import time
 from dataclasses import replace
@@ -77,7 +75,7 @@ def record(drive: Drive, folder: Path, lossless: bool = True, *lens: Distortion)
     return robot
 
 
-def test_what_a_robot_recorded_is_replayed_as_it_sensed_it(drive: Drive, tmp_path: Path) -> None:
+def test_what_a_robot_recorded_is_replayed_as_it_sensed_it(drive: Drive, tmp_path):
     robot = record(drive, tmp_path / "walk")
     assert robot.closed
     replay = Replay(tmp_path / "walk")
@@ -116,7 +114,7 @@ def on_a_curve(walls: PhotoWalls) -> list[Observation]:
     return seen
 
 
-def test_a_lossless_recording_is_replayed_to_the_very_same_map(walls: PhotoWalls, tmp_path: Path) -> None:
+def test_a_lossless_recording_is_replayed_to_the_very_same_map(walls: PhotoWalls, tmp_path):
     """Axle and noise of the wheels were guessed: other nodes were made, some centimetres off."""
     robot = replace(DESCRIPTION, axle=0.35, wheel_noise=0.06, side_slip=0.01)
     seen = on_a_curve(walls)
@@ -145,8 +143,8 @@ def test_a_lossless_recording_is_replayed_to_the_very_same_map(walls: PhotoWalls
     ],
 )
 def test_wheels_of_the_metadata_that_cannot_be_right_are_named(
-    drive: Drive, given: str | None, line: str, tmp_path: Path
-) -> None:
+    drive: Drive, given: str | None, line: str, tmp_path
+):
     record(drive, tmp_path / "walk")
     metadata = tmp_path / "walk" / "walk_0" / "metadata.yaml"
     lines = metadata.read_text().splitlines()
@@ -159,7 +157,7 @@ def test_wheels_of_the_metadata_that_cannot_be_right_are_named(
     assert line in damage
 
 
-def test_failed_proximity_sensors_do_not_end_a_recording(drive: Drive, tmp_path: Path) -> None:
+def test_failed_proximity_sensors_do_not_end_a_recording(drive: Drive, tmp_path):
     """A driver gives no readings then, see `mapweave.agent.drivers.checked`."""
 
     class Blind(Driven):
@@ -180,7 +178,7 @@ def test_failed_proximity_sensors_do_not_end_a_recording(drive: Drive, tmp_path:
     assert counts["/odom"] == COUNT and counts["/proximity/0"] == counts["/proximity/1"] == COUNT - 3
 
 
-def test_a_fisheyes_recording_names_its_lens_as_ros_does(drive: Drive, tmp_path: Path) -> None:
+def test_a_fisheyes_recording_names_its_lens_as_ros_does(drive: Drive, tmp_path):
     fisheye = Equidistant(115.0, 115.5, 158.7, 120.9, (-0.02, 0.004, -0.003, 0.0005))
     ideal = fisheye.ideal(320, 240, drive.camera.mount_height)
     record(replace(drive, camera=ideal), tmp_path / "walk", True, fisheye)
@@ -195,7 +193,7 @@ def test_a_fisheyes_recording_names_its_lens_as_ros_does(drive: Drive, tmp_path:
     assert (described.camera, described.distortion) == (ideal, NO_DISTORTION)
 
 
-def test_a_recording_holds_standard_messages(drive: Drive, tmp_path: Path) -> None:
+def test_a_recording_holds_standard_messages(drive: Drive, tmp_path):
     """Read by rosbags with the definitions in the file itself."""
     record(drive, tmp_path / "walk", lossless=False)
     with AnyReader([tmp_path / "walk" / "walk_0"]) as reader:
@@ -231,7 +229,7 @@ def test_a_recording_holds_standard_messages(drive: Drive, tmp_path: Path) -> No
         assert profile.durability.name == "TRANSIENT_LOCAL" and profile.reliability.name == "RELIABLE"
 
 
-def test_a_long_recording_is_a_row_of_files(drive: Drive, tmp_path: Path) -> None:
+def test_a_long_recording_is_a_row_of_files(drive: Drive, tmp_path):
     gap = round((PART_S + 1.0) * 1e9 / 4)
     slow = Drive(drive.images, [BEGUN_NS + k * gap for k in range(COUNT)], drive.poses, drive.camera)
     record(slow, tmp_path / "walk")
@@ -249,14 +247,14 @@ def test_a_long_recording_is_a_row_of_files(drive: Drive, tmp_path: Path) -> Non
     assert len(Replay(tmp_path / "walk")) == 8
 
 
-def test_a_recording_overwrites_nothing(drive: Drive, tmp_path: Path) -> None:
+def test_a_recording_overwrites_nothing(drive: Drive, tmp_path):
     (tmp_path / "walk").mkdir()
     (tmp_path / "walk" / "notes.txt").write_text("mine")
     with pytest.raises(DeviceError, match="not empty; a recording overwrites nothing"):
         RecordedRobot(Driven(drive), tmp_path / "walk")
 
 
-def test_what_cannot_be_written_ends_the_recording_with_one_line(drive: Drive, tmp_path: Path) -> None:
+def test_what_cannot_be_written_ends_the_recording_with_one_line(drive: Drive, tmp_path):
     """No number in the place of a reading. What came before is kept, and the robot goes on."""
     lines: list[str] = []
     robot = Driven(drive)
@@ -283,8 +281,8 @@ def test_what_cannot_be_written_ends_the_recording_with_one_line(drive: Drive, t
     [(0.3, 0.6, "34 deg down by tf"), (0.3, -0.2, "11 deg up by tf"), (0.0, 0.0, ""), (-0.3, 0.0, "")],
 )
 def test_a_mount_that_cannot_be_right_or_is_not_level_is_named(
-    drive: Drive, height: float, pitch: float, line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    drive: Drive, height: float, pitch: float, line: str, tmp_path, monkeypatch
+):
     """A camera at the floor or below it was a traceback; one that looks down was mapped as if level."""
     mount = making.mount
 
@@ -310,7 +308,7 @@ def test_a_mount_that_cannot_be_right_or_is_not_level_is_named(
     assert len(Replay(tmp_path / "walk", options=RecordingOptions(camera_height=0.3))) == COUNT
 
 
-def test_a_robot_whose_camera_is_at_the_floor_is_refused_in_one_line() -> None:
+def test_a_robot_whose_camera_is_at_the_floor_is_refused_in_one_line():
     camera = replace(DESCRIPTION.camera, mount_height=0.0)
     with pytest.raises(InvalidValue, match=r"^camera: height_m is 0; a robot needs its height"):
         Pipeline(MapId("r0", 1), replace(DESCRIPTION, camera=camera))
@@ -347,7 +345,7 @@ class Large:
 @pytest.mark.parametrize(
     "lens", [(-0.1, 0.02, 0.001, 0.0, 0.0), Equidistant(500.0, 501.0, 640.5, 481.0, (-0.02, 0.0, 0.0, 0.0))]
 )
-def test_a_large_camera_is_replayed_as_the_robot_has_worked_on_it(lens: Distortion, tmp_path: Path) -> None:
+def test_a_large_camera_is_replayed_as_the_robot_has_worked_on_it(lens: Distortion, tmp_path):
     """Robots were not reduced and recordings were: a replay could not give the robot's map."""
     robot = CheckedRobot(Large(lens))
     recorded = RecordedRobot(robot, tmp_path / "walk", lossless=True)

@@ -1,7 +1,5 @@
 """Trajectories of all frames: the wheels carry on what is not localized."""
 
-from __future__ import annotations
-
 import math
 import re
 from contextlib import suppress
@@ -29,7 +27,7 @@ def written(path: Path, poses: list[Pose2 | None]) -> list[str]:
     return path.read_text().splitlines(keepends=True)
 
 
-def test_frames_before_between_and_after_are_carried_by_the_wheels(tmp_path: Path) -> None:
+def test_frames_before_between_and_after_are_carried_by_the_wheels(tmp_path):
     at = Pose2(5.0, 1.0, 0.0)
     lines = written(tmp_path / "a.tum", [None, None, at, None, Pose2(5.3, 1.0, 0.0), None])
     assert [k for k, line in enumerate(lines) if line == BY_WHEELS] == [0, 5, 9]
@@ -39,13 +37,13 @@ def test_frames_before_between_and_after_are_carried_by_the_wheels(tmp_path: Pat
     assert np.allclose(trajectory.positions_xyz[:, 1], 1.0)
 
 
-def test_without_any_place_there_are_the_wheels(tmp_path: Path) -> None:
+def test_without_any_place_there_are_the_wheels(tmp_path):
     lines = written(tmp_path / "b.tum", [None, None])
     assert lines[0] == BY_WHEELS and len(lines) == 3
     assert lines[2].startswith("1.000000000 0.100000 ")
 
 
-def test_a_way_that_is_moved_is_moved_to_the_place_where_it_was(tmp_path: Path) -> None:
+def test_a_way_that_is_moved_is_moved_to_the_place_where_it_was(tmp_path):
     """What an earlier run has written stays; so do comments and stamps."""
     path, turn = tmp_path / "d.tum", Pose2(1.0, 2.0, math.pi / 2)
     path.write_text("0.5 7.000000 0.000000 0 0 0 0.000000000 1.000000000\n")
@@ -74,12 +72,12 @@ def test_a_way_that_is_moved_is_moved_to_the_place_where_it_was(tmp_path: Path) 
     assert headings == pytest.approx([0.0, quarter + 0.1, quarter + 0.1, quarter + 0.2, 0.3, 0.3], abs=1e-6)
 
 
-def test_a_drive_that_is_always_localized_needs_no_comment(tmp_path: Path) -> None:
+def test_a_drive_that_is_always_localized_needs_no_comment(tmp_path):
     assert len(written(tmp_path / "c.tum", [Pose2(), STEP])) == 2
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
-def test_a_full_disk_is_named_with_the_file_and_what_to_do() -> None:
+def test_a_full_disk_is_named_with_the_file_and_what_to_do():
     """An error of the system without a file was all that a person read."""
     words = re.escape(f"/dev/full: cannot be written ({NO_ROOM})")
     file = TrajectoryFile(Path("/dev/full"))

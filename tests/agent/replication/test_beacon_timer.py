@@ -1,7 +1,5 @@
 """When beacons are due, by hand."""
 
-from __future__ import annotations
-
 import pytest
 
 from mapweave.agent.replication.beacon_timer import RAREST, SETTLED_BEACONS, BeaconTimer
@@ -19,14 +17,14 @@ def timer() -> BeaconTimer:
     return timer
 
 
-def test_while_nothing_happens_they_are_rare(timer: BeaconTimer) -> None:
+def test_while_nothing_happens_they_are_rare(timer: BeaconTimer):
     assert timer.due == 100.0 + ALL
     assert not timer.all_due(timer.due - 0.1, 0.0) and timer.all_due(timer.due, 2.0)
     timer.sent(timer.due, lacking=False)
     assert timer.due == 100.0 + ALL + SETTLED_BEACONS * 2.0, "and rarer where servers have many robots"
 
 
-def test_what_is_not_acknowledged_has_beacons_at_growing_intervals(timer: BeaconTimer) -> None:
+def test_what_is_not_acknowledged_has_beacons_at_growing_intervals(timer: BeaconTimer):
     timer.changed(101.0)
     times = []
     for _ in range(6):
@@ -37,7 +35,7 @@ def test_what_is_not_acknowledged_has_beacons_at_growing_intervals(timer: Beacon
     assert timer.due == 110.0, "all of them are due before the next overdue one"
 
 
-def test_who_is_acknowledged_slowly_waits_longer(timer: BeaconTimer) -> None:
+def test_who_is_acknowledged_slowly_waits_longer(timer: BeaconTimer):
     timer.published(1, 101.0)
     timer.settled(1, 103.0)
     timer.changed(103.0)
@@ -46,7 +44,7 @@ def test_who_is_acknowledged_slowly_waits_longer(timer: BeaconTimer) -> None:
     assert timer.due == 104.0 + 2.0 + 4 * 1.0, "the others have the whole time again"
 
 
-def test_a_server_that_comes_hears_of_all_maps(timer: BeaconTimer) -> None:
+def test_a_server_that_comes_hears_of_all_maps(timer: BeaconTimer):
     timer.hasten(101.0)
     assert timer.due == 101.0 and not timer.all_due(101.0, 0.0)
     timer.sent(101.0, lacking=False)

@@ -1,7 +1,5 @@
 """A journal in which the disk has changed some bytes: it is found, and nothing else is altered for it."""
 
-from __future__ import annotations
-
 import logging
 import sqlite3
 from contextlib import closing
@@ -112,21 +110,15 @@ def check_damaged(path: Path, before: Contents, damaged: bytes, caplog: pytest.L
 @settings(max_examples=100, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
 def test_bytes_that_the_disk_has_changed_alter_nothing_without_a_line(
-    sound: bytes,
-    before: Contents,
-    tmp_path_factory: pytest.TempPathFactory,
-    caplog: pytest.LogCaptureFixture,
-    data: st.DataObject,
-) -> None:
+    sound: bytes, before: Contents, tmp_path_factory, caplog, data: st.DataObject
+):
     offset = data.draw(st.integers(0, len(sound) - 4))
     written = data.draw(st.binary(min_size=1, max_size=4))
     damaged = sound[:offset] + written + sound[offset + len(written) :]
     check_damaged(tmp_path_factory.mktemp("damage") / "r0.sqlite", before, damaged, caplog)
 
 
-def test_a_change_whose_number_or_stamp_is_damaged_is_found(
-    sound: bytes, before: Contents, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_change_whose_number_or_stamp_is_damaged_is_found(sound: bytes, before: Contents, tmp_path, caplog):
     """Bytes before the body of a change were not checked: stamps and numbers were wrong without a word."""
     path = tmp_path / "r0.sqlite"
     path.write_bytes(sound)
@@ -144,9 +136,7 @@ def test_a_change_whose_number_or_stamp_is_damaged_is_found(
 
 
 @pytest.mark.parametrize("column", ["sequence", "stamp_ns", "element", "put"])
-def test_a_damaged_number_is_refused_and_the_others_can_be_extracted(
-    column: str, sound: bytes, tmp_path: Path
-) -> None:
+def test_a_damaged_number_is_refused_and_the_others_can_be_extracted(column: str, sound: bytes, tmp_path):
     path = tmp_path / "r0.sqlite"
     path.write_bytes(sound)
     whole = len(salvage(path).maps[MAP].contents)
@@ -160,9 +150,7 @@ def test_a_damaged_number_is_refused_and_the_others_can_be_extracted(
     assert whole - len(salvaged.contents) <= 3
 
 
-def test_acknowledgements_that_are_damaged_are_asked_for_again(
-    sound: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_acknowledgements_that_are_damaged_are_asked_for_again(sound: bytes, tmp_path, caplog):
     """A greater one lets what a server has not got be dropped."""
     path = tmp_path / "r0.sqlite"
     path.write_bytes(sound)
@@ -177,7 +165,7 @@ def test_acknowledgements_that_are_damaged_are_asked_for_again(
         assert journal.acknowledged(MAP) == {"s0": 20} and not caplog.text
 
 
-def test_another_log_id_than_was_written_is_refused(sound: bytes, tmp_path: Path) -> None:
+def test_another_log_id_than_was_written_is_refused(sound: bytes, tmp_path):
     path = tmp_path / "r0.sqlite"
     path.write_bytes(sound)
     with closing(sqlite3.connect(path)) as disk, disk:
@@ -186,9 +174,7 @@ def test_another_log_id_than_was_written_is_refused(sound: bytes, tmp_path: Path
         Journal(path, "r0")
 
 
-def test_a_damaged_mission_is_left_out_with_a_line(
-    sound: bytes, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_damaged_mission_is_left_out_with_a_line(sound: bytes, tmp_path, caplog):
     """It was believed: a goal could be another one, to which the robot drove."""
     assert sound.count(b"anna") == 1
     path = tmp_path / "r0.sqlite"
@@ -217,8 +203,8 @@ def left_behind(path: Path, killed: tuple[bytes, bytes], log: bytes) -> Path:
 
 @pytest.mark.parametrize("place", [0, 9, 20, 28, 40, 3000, 0.1, 0.3, 0.6, 0.8, 0.9])
 def test_damage_in_the_log_of_an_agent_that_was_killed_is_found(
-    place: float, killed: tuple[bytes, bytes], tmp_path: Path
-) -> None:
+    place: float, killed: tuple[bytes, bytes], tmp_path
+):
     """SQLite went on as if all that follows had never been made: the robot had a part of its map, or none."""
     log = bytearray(killed[1])
     log[int(place * len(log)) if isinstance(place, float) else place] ^= 4
@@ -234,9 +220,7 @@ def test_damage_in_the_log_of_an_agent_that_was_killed_is_found(
         assert not salvaged.whole and 1 <= len(salvaged.maps[MAP].contents) <= 22
 
 
-def test_a_log_that_a_loss_of_power_has_cut_short_goes_on(
-    killed: tuple[bytes, bytes], tmp_path: Path
-) -> None:
+def test_a_log_that_a_loss_of_power_has_cut_short_goes_on(killed: tuple[bytes, bytes], tmp_path):
     """The last commit was not on the disk yet, in whole or in part: it was never acknowledged."""
     whole = contents_of(left_behind(tmp_path / "r0.sqlite", killed, killed[1]))
     assert whole.logs[0][2] == 24
@@ -252,9 +236,7 @@ def test_a_log_that_a_loss_of_power_has_cut_short_goes_on(
 
 @settings(max_examples=20, deadline=None)
 @given(st.lists(st.integers(1, 5), min_size=1, max_size=8), st.integers(0, 6))
-def test_a_log_that_holds_is_never_refused(
-    tmp_path_factory: pytest.TempPathFactory, sizes: list[int], checkpoint: int
-) -> None:
+def test_a_log_that_holds_is_never_refused(tmp_path_factory, sizes: list[int], checkpoint: int):
     """Also one that SQLite has begun again: what is behind its end is of before."""
     folder = tmp_path_factory.mktemp("log")
     path, log = folder / "r0.sqlite", log_of(6)

@@ -1,10 +1,7 @@
 """A new map gets the next number, also after a robot has lost its disk."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -24,7 +21,7 @@ KEYS = Keys("test")
 
 
 @given(st.sets(st.integers(1, LARGEST)), st.one_of(st.none(), st.integers(0, LARGEST)))
-def test_the_number_is_new_and_short(taken: set[int], stored: int | None) -> None:
+def test_the_number_is_new_and_short(taken: set[int], stored: int | None):
     epoch = next_epoch(taken, stored)
     assert epoch not in taken
     assert stored is None or epoch > stored
@@ -32,18 +29,18 @@ def test_the_number_is_new_and_short(taken: set[int], stored: int | None) -> Non
     assert epoch == max(known) + 1 or (not taken and stored is None and epoch in FOUR_DIGITS)
 
 
-def test_two_robots_without_disk_and_server_draw_different_numbers() -> None:
+def test_two_robots_without_disk_and_server_draw_different_numbers():
     drawn = [next_epoch([], None) for _ in range(50)]
     assert len(set(drawn)) > 40
 
 
 @given(st.integers(0, 2**53))
-def test_the_answer_survives(epoch: int) -> None:
+def test_the_answer_survives(epoch: int):
     assert NewestMap.decode(NewestMap(epoch).encode()) == NewestMap(epoch)
 
 
 @pytest.mark.parametrize("payload", [b"", b"\x80", NewestMap(-1).encode(), NewestMap(2**60).encode()])
-def test_a_broken_answer_is_refused(payload: bytes) -> None:
+def test_a_broken_answer_is_refused(payload: bytes):
     with pytest.raises(InvalidMessage):
         NewestMap.decode(payload)
 
@@ -55,7 +52,7 @@ def bus(hub: MemoryHub) -> Iterator[MemoryBus]:
     made.close()
 
 
-def test_a_server_reports_the_newest_map_on_its_disk(hub: MemoryHub, bus: MemoryBus, tmp_path: Path) -> None:
+def test_a_server_reports_the_newest_map_on_its_disk(hub: MemoryHub, bus: MemoryBus, tmp_path):
     with ExitStack() as stack:
         store = SqliteStore(tmp_path / "s0.sqlite")
         stack.callback(store.close)
@@ -71,7 +68,7 @@ def test_a_server_reports_the_newest_map_on_its_disk(hub: MemoryHub, bus: Memory
         assert newest_on_server(bus, KEYS, "s1", "r0", 0.0) is None
 
 
-def test_nonsense_answers_are_ignored(hub: MemoryHub, bus: MemoryBus) -> None:
+def test_nonsense_answers_are_ignored(hub: MemoryHub, bus: MemoryBus):
     lines = [b"\x00", NewestMap(LARGEST + 1).encode()]
     liar = MemoryBus(hub)
 

@@ -1,7 +1,5 @@
 """The journal: appended changes are there, whatever happens to the process or the file."""
 
-from __future__ import annotations
-
 import sqlite3
 import subprocess
 import sys
@@ -56,7 +54,7 @@ def as_bytes(changes: list[Change]) -> list[bytes]:
     return [encode_change(change) for change in changes]
 
 
-def test_appended_changes_come_back_after_a_restart(path: Path) -> None:
+def test_appended_changes_come_back_after_a_restart(path: Path):
     journal = Journal(path, "r0")
     map_id = journal.open_map(None)
     assert map_id == MAP
@@ -77,7 +75,7 @@ def test_appended_changes_come_back_after_a_restart(path: Path) -> None:
     journal.close()
 
 
-def test_a_fresh_map_is_another_and_keeps_the_first(journal: Journal) -> None:
+def test_a_fresh_map_is_another_and_keeps_the_first(journal: Journal):
     one, two, far = journal.open_map(None), journal.open_map(None), journal.open_map(1_700_000_000_000)
     assert (one.epoch, two.epoch) == (1, 2)
     assert journal.open_map(None).epoch == far.epoch + 1
@@ -87,7 +85,7 @@ def test_a_fresh_map_is_another_and_keeps_the_first(journal: Journal) -> None:
     assert [map_id.epoch for map_id in journal.maps()] == [1, 2, far.epoch, far.epoch + 1]
 
 
-def test_two_disks_never_have_the_same_log(tmp_path: Path) -> None:
+def test_two_disks_never_have_the_same_log(tmp_path):
     ids = []
     for k in range(2):
         journal = Journal(tmp_path / f"{k}", "r0")
@@ -96,7 +94,7 @@ def test_two_disks_never_have_the_same_log(tmp_path: Path) -> None:
     assert ids[0] != ids[1]
 
 
-def test_long_replays_are_read_in_pieces(journal: Journal) -> None:
+def test_long_replays_are_read_in_pieces(journal: Journal):
     map_id = journal.open_map(None)
     journal.append(map_id, [node_put(k) for k in range(1, 601)], 0)
     assert [body.node.id.number for body in journal.replay(map_id) if isinstance(body, NodePut)] == list(
@@ -104,7 +102,7 @@ def test_long_replays_are_read_in_pieces(journal: Journal) -> None:
     )
 
 
-def test_all_of_a_batch_or_nothing(journal: Journal) -> None:
+def test_all_of_a_batch_or_nothing(journal: Journal):
     map_id = journal.open_map(None)
     journal.append(map_id, [node_put(1)], 0)
     foreign = NodeRetired(NodeId("r1", 1, 1))
@@ -119,7 +117,7 @@ def test_all_of_a_batch_or_nothing(journal: Journal) -> None:
     assert journal.head(map_id) == 1
 
 
-def test_acknowledgements_only_grow_and_stay(path: Path, journal: Journal) -> None:
+def test_acknowledgements_only_grow_and_stay(path: Path, journal: Journal):
     map_id = journal.open_map(None)
     journal.append(map_id, [node_put(k) for k in range(1, 6)], 0)
     journal.acknowledge("s0", map_id, 4)
@@ -133,7 +131,7 @@ def test_acknowledgements_only_grow_and_stay(path: Path, journal: Journal) -> No
     again.close()
 
 
-def test_pruning_waits_for_every_required_server(journal: Journal) -> None:
+def test_pruning_waits_for_every_required_server(journal: Journal):
     map_id = journal.open_map(None)
     journal.append(map_id, [node_put(1, x) for x in range(5)], 0)
     assert journal.prune(map_id, ["s0", "s1"]) == 0
@@ -146,7 +144,7 @@ def test_pruning_waits_for_every_required_server(journal: Journal) -> None:
     assert journal.head(map_id) == 5
 
 
-def test_of_what_is_retired_nothing_stays_once_all_have_it(journal: Journal) -> None:
+def test_of_what_is_retired_nothing_stays_once_all_have_it(journal: Journal):
     map_id = journal.open_map(None)
     retired = [NodeRetired(NodeId(*MAP, 2)), EdgeRetired(NodeId(*MAP, 13))]
     nodes, edges = map(node_put, (1, 2, 3)), [edge_put(11, 1, 2), edge_put(12, 2, 3), edge_put(13, 1, 3)]
@@ -164,7 +162,7 @@ def test_of_what_is_retired_nothing_stays_once_all_have_it(journal: Journal) -> 
     assert state(journal.replay(map_id)) == before and RetainedMap.of(journal, map_id).next_number == 21
 
 
-def test_the_greatest_number_stays_and_what_takes_it_away(journal: Journal) -> None:
+def test_the_greatest_number_stays_and_what_takes_it_away(journal: Journal):
     map_id = journal.open_map(None)
     journal.append(map_id, [node_put(1), node_put(2), edge_put(11, 1, 2), NodeRetired(NodeId(*MAP, 2))], 0)
     journal.append(map_id, [node_put(1, 3.0)], 0)
@@ -196,9 +194,7 @@ bodies = st.one_of(
 
 @settings(max_examples=30, deadline=None)
 @given(st.lists(bodies, min_size=1, max_size=30), st.data())
-def test_pruning_never_changes_the_map(
-    tmp_path_factory: pytest.TempPathFactory, log: list[ChangeBody], data: st.DataObject
-) -> None:
+def test_pruning_never_changes_the_map(tmp_path_factory, log: list[ChangeBody], data: st.DataObject):
     acknowledged = data.draw(st.integers(0, len(log)))
     with closing(Journal(tmp_path_factory.mktemp("prune") / "j", "r0")) as journal:
         map_id = journal.open_map(None)
@@ -214,14 +210,14 @@ def test_pruning_never_changes_the_map(
         assert set(range(acknowledged + 1, len(log) + 1)) <= kept
 
 
-def test_another_agents_journal_is_refused(path: Path, journal: Journal) -> None:
+def test_another_agents_journal_is_refused(path: Path, journal: Journal):
     journal.close()
     with pytest.raises(InvalidFile, match=r"r0\.sqlite: is the journal of agent r0, not of r1"):
         Journal(path, "r1")
     Journal(path, "r0").close()
 
 
-def test_a_journal_in_use_is_refused(path: Path, journal: Journal) -> None:
+def test_a_journal_in_use_is_refused(path: Path, journal: Journal):
     journal.open_map(None)
     program = (
         "import sqlite3, sys, mapweave.storage.database as d\n"
@@ -240,14 +236,14 @@ def test_a_journal_in_use_is_refused(path: Path, journal: Journal) -> None:
 
 
 @pytest.mark.parametrize("data", [b"no database at all" * 100, b"SQLite format 3\0" + b"\xff" * 4096])
-def test_no_database_is_refused(path: Path, data: bytes) -> None:
+def test_no_database_is_refused(path: Path, data: bytes):
     path.write_bytes(data)
     with pytest.raises(InvalidFile, match=r"r0\.sqlite: agent journal cannot be used") as error:
         Journal(path, "r0")
     assert "\n" not in str(error.value)
 
 
-def test_another_programs_database_is_refused(path: Path) -> None:
+def test_another_programs_database_is_refused(path: Path):
     other = sqlite3.connect(path)
     other.execute("CREATE TABLE song (name TEXT)")
     other.commit()
@@ -259,7 +255,7 @@ def test_another_programs_database_is_refused(path: Path) -> None:
     other.close()
 
 
-def test_a_newer_format_is_refused(path: Path, journal: Journal) -> None:
+def test_a_newer_format_is_refused(path: Path, journal: Journal):
     journal.close()
     other = sqlite3.connect(path)
     other.execute("PRAGMA user_version = 9")
@@ -270,12 +266,12 @@ def test_a_newer_format_is_refused(path: Path, journal: Journal) -> None:
         Journal(path, "r0")
 
 
-def test_a_folder_that_is_not_there(tmp_path: Path) -> None:
+def test_a_folder_that_is_not_there(tmp_path):
     with pytest.raises(InvalidFile, match="cannot be used"):
         Journal(tmp_path / "nowhere" / "r0.sqlite", "r0")
 
 
-def test_a_truncated_journal_is_refused(path: Path, journal: Journal) -> None:
+def test_a_truncated_journal_is_refused(path: Path, journal: Journal):
     journal.append(journal.open_map(None), [node_put(k) for k in range(1, 300)], 0)
     journal.close()
     data = path.read_bytes()
@@ -284,7 +280,7 @@ def test_a_truncated_journal_is_refused(path: Path, journal: Journal) -> None:
         Journal(path, "r0")
 
 
-def test_a_damaged_change_is_found(path: Path, journal: Journal) -> None:
+def test_a_damaged_change_is_found(path: Path, journal: Journal):
     map_id = journal.open_map(None)
     changes = journal.append(map_id, [node_put(k, 1.5) for k in range(1, 10)], 0)
     journal.close()

@@ -1,7 +1,5 @@
 """Maps that a robot has left are dropped when its server has pruned all of them, and not before."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -189,7 +187,7 @@ DOINGS = (
 @example([("drive", 0), ("drive", 0), ("acknowledged", 0), ("prune", 1), ("look", 0), ("kill robot", 0)])
 @example([("drive", 0), ("drive", 0), ("acknowledged", 0), ("prune", 1), ("lose store", 0), ("look", 0)])
 @example([("drive", 0), ("drive", 0), ("acknowledged", 0), ("prune some", 1), ("start server", 0)])
-def test_in_whatever_order_maps_are_pruned_and_processes_killed(doings: list[tuple[str, int]]) -> None:
+def test_in_whatever_order_maps_are_pruned_and_processes_killed(doings: list[tuple[str, int]]):
     """What is not pruned as a whole stays, and a server whose store is gone gets it again."""
     with TemporaryDirectory() as place:
         fleet = Fleet(Path(place))
@@ -228,7 +226,7 @@ def changes_kept(journal: Journal, map_id: MapId) -> int:
     return len(journal.rows(map_id, 1, journal.head(map_id)))
 
 
-def test_what_is_pruned_as_a_whole_leaves_the_disk(fleet: Fleet) -> None:
+def test_what_is_pruned_as_a_whole_leaves_the_disk(fleet: Fleet):
     for _ in range(3):
         fleet.robot.drive()
     assert fleet.robot.replicator.wait_acknowledged(WAIT)
@@ -248,7 +246,7 @@ def test_what_is_pruned_as_a_whole_leaves_the_disk(fleet: Fleet) -> None:
     assert not server.map_of(old).nodes
 
 
-def test_a_map_that_the_server_has_not_acknowledged_is_not_asked_about(fleet: Fleet) -> None:
+def test_a_map_that_the_server_has_not_acknowledged_is_not_asked_about(fleet: Fleet):
     """Whatever the server would say."""
     fleet.robot.drive()
     assert fleet.robot.replicator.wait_acknowledged(WAIT)
@@ -276,7 +274,7 @@ def test_a_map_that_the_server_has_not_acknowledged_is_not_asked_about(fleet: Fl
 
 
 @pytest.mark.parametrize("answer", [NewestMap(3).encode(), b"", b"\x81\xa1e\x03", None])
-def test_without_a_clear_answer_all_stays(fleet: Fleet, answer: bytes | None) -> None:
+def test_without_a_clear_answer_all_stays(fleet: Fleet, answer: bytes | None):
     """A server that does not know the question, or none."""
     for _ in range(2):
         fleet.robot.drive()
@@ -295,7 +293,7 @@ def test_without_a_clear_answer_all_stays(fleet: Fleet, answer: bytes | None) ->
     bus.close()
 
 
-def test_a_map_with_a_damaged_change_is_not_asked_about(fleet: Fleet) -> None:
+def test_a_map_with_a_damaged_change_is_not_asked_about(fleet: Fleet):
     for _ in range(2):
         fleet.robot.drive()
     assert fleet.robot.replicator.wait_acknowledged(WAIT)
@@ -311,16 +309,14 @@ def test_a_map_with_a_damaged_change_is_not_asked_about(fleet: Fleet) -> None:
     assert fleet.robot.replicator.flush(WAIT) and fleet.robot.journal.head(old) == head
 
 
-def test_the_map_that_is_made_and_unknown_ones_are_not_retired(fleet: Fleet) -> None:
+def test_the_map_that_is_made_and_unknown_ones_are_not_retired(fleet: Fleet):
     replicator = fleet.robot.replicator
     for map_id in (replicator.map_id, MapId("r0", 99)):
         with pytest.raises(InvalidValue, match="was not left"):
             replicator.retire(map_id, nodes_of(map_id), 1)
 
 
-def test_a_question_without_an_answer_is_asked_again_soon(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_question_without_an_answer_is_asked_again_soon(fleet: Fleet, monkeypatch):
     monkeypatch.setattr(left_maps, "TIMEOUT", 0.2)
     monkeypatch.setattr(left_maps, "RETRY", 0.2)
     for _ in range(2):
@@ -335,7 +331,7 @@ def test_a_question_without_an_answer_is_asked_again_soon(
     bus.close()
 
 
-def test_it_asks_when_the_server_appears_and_then_at_times(tmp_path: Path) -> None:
+def test_it_asks_when_the_server_appears_and_then_at_times(tmp_path):
     hub = MemoryHub()
     robot = Robot(MemoryBus(hub), tmp_path / "r0.sqlite")
     robot.drive()
@@ -393,7 +389,7 @@ robot.close()
 @pytest.mark.slow
 @pytest.mark.parametrize("when", ["before", "after"])
 @pytest.mark.parametrize("method", ["write", "acknowledge", "prune"])
-def test_a_robot_is_killed_between_two_steps(tmp_path: Path, method: str, when: str) -> None:
+def test_a_robot_is_killed_between_two_steps(tmp_path, method: str, when: str):
     """Before and after it has the retirements on its disk, knows them acknowledged, and drops the nodes."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     path = tmp_path / "r0.sqlite"
@@ -450,7 +446,7 @@ class Calendar(LiveSchedule):
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_the_journal_of_a_robot_that_leaves_map_after_map_stays_small(tmp_path: Path) -> None:
+def test_the_journal_of_a_robot_that_leaves_map_after_map_stays_small(tmp_path):
     """A server and a robot's link over TCP: twenty drives through a hall, 3.65 days apart."""
     drives, rng = 20, np.random.default_rng(911)
     hall, clock = room(0, 0, 8, 4, 1600, rng), Calendar()

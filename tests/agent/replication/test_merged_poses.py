@@ -1,7 +1,5 @@
 """A server that floods a robot with poses of its nodes, or names nodes without end."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Iterator
@@ -62,9 +60,7 @@ def news(after: int, first: int, count: int) -> bytes:
     return PoseNews(7, after, after + 1, placed).encode("r0")
 
 
-def test_a_flood_fills_neither_memory_nor_log(
-    server: LyingServer, poses: MergedPoses, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_flood_fills_neither_memory_nor_log(server: LyingServer, poses: MergedPoses, caplog):
     """Each message may have 8 MB, and a question to a server that says nothing takes 3 s."""
     server.may_answer.clear()
     with caplog.at_level(logging.WARNING):
@@ -79,9 +75,7 @@ def test_a_flood_fills_neither_memory_nor_log(
     eventually(lambda: poses.count(MAP) == 3)
 
 
-def test_no_more_poses_are_kept_than_one_message_holds(
-    server: LyingServer, poses: MergedPoses, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_more_poses_are_kept_than_one_message_holds(server: LyingServer, poses: MergedPoses, monkeypatch):
     monkeypatch.setattr(merged_poses, "MAX_POSTURES", 10)
     server.send(news(1, 1, 6))
     eventually(lambda: server.asked == 1)

@@ -1,7 +1,5 @@
 """Answers that no robot can act on are refused with a reason."""
 
-from __future__ import annotations
-
 import pytest
 
 from mapweave.agent.mission import WhereAmI, WhichWay
@@ -27,19 +25,19 @@ def where(view: View, *places: Whereabouts) -> RelocalizeAnswer:
 
 
 @pytest.mark.parametrize("far", [Pose2(1e6), Pose2(0.0, -FARTHEST - 1.0)])
-def test_a_leg_of_a_million_metres_is_refused(far: Pose2) -> None:
+def test_a_leg_of_a_million_metres_is_refused(far: Pose2):
     question = WhichWay(1, A, C)
     decode_answer(question, encode(route_of(Pose2(1.0), Pose2(FARTHEST - 1.0))))
     with pytest.raises(InvalidMessage, match=rf"route: the leg to node {C} is \d+ m away, more than 100 m"):
         decode_answer(question, encode(route_of(Pose2(1.0), far)))
 
 
-def test_a_route_to_another_node_is_refused() -> None:
+def test_a_route_to_another_node_is_refused():
     with pytest.raises(InvalidMessage, match=f"route: it ends at node {B}, not at {C}"):
         decode_answer(WhichWay(1, A, C), encode(route_of(Pose2(1.0))))
 
 
-def test_a_circle_and_a_way_that_was_blocked_are_refused() -> None:
+def test_a_circle_and_a_way_that_was_blocked_are_refused():
     a, b, c = (bare(node) for node in (A, B, C))
     with pytest.raises(InvalidMessage, match=f"route: it leads in a circle, to node {A} twice"):
         decode_answer(WhichWay(1, A, C), encode(RouteAnswer(straight(a, b, a, b, c), "a way")))
@@ -48,13 +46,13 @@ def test_a_circle_and_a_way_that_was_blocked_are_refused() -> None:
         decode_answer(blocked, encode(RouteAnswer(straight(a, b, c), "a way")))
 
 
-def test_no_way_is_an_answer() -> None:
+def test_no_way_is_an_answer():
     answer = decode_answer(WhichWay(1, A, C), encode(RouteAnswer((), "all blocked")))
     assert isinstance(answer, RouteAnswer)
     assert answer.reason == "all blocked"
 
 
-def test_a_place_a_million_metres_from_its_node_is_refused_and_costs_no_better_one() -> None:
+def test_a_place_a_million_metres_from_its_node_is_refused_and_costs_no_better_one():
     view = View(bare(A).camera, bare(A).landmarks.pixels, bare(A).landmarks.codes)
     near, far = here(A, Pose2(1.0)), here(B, Pose2(1e6))
     assert where(view, near, far).candidates[0].node == A

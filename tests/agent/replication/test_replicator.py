@@ -1,7 +1,5 @@
 """The replicator against servers that are played by hand."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time
@@ -93,7 +91,7 @@ def server(hub: MemoryHub) -> Iterator[HandServer]:
     server.bus.close()
 
 
-def test_changes_are_published_in_order_with_their_mark(agent: Agent, server: HandServer) -> None:
+def test_changes_are_published_in_order_with_their_mark(agent: Agent, server: HandServer):
     agent.replicator.submit(bodies(1, 3), 10)
     agent.replicator.submit(bodies(4, 4), 20)
     eventually(lambda: len(server.changes) == 4)
@@ -106,7 +104,7 @@ def test_changes_are_published_in_order_with_their_mark(agent: Agent, server: Ha
     assert {sample.key for sample in server.changes} == {KEYS.change(MAP)}
 
 
-def test_the_longest_status_period_that_servers_want_counts(agent: Agent, hub: MemoryHub) -> None:
+def test_the_longest_status_period_that_servers_want_counts(agent: Agent, hub: MemoryHub):
     first, second = HandServer(hub), HandServer(hub, "s1")
     assert agent.replicator.status_period == FIRST_STATUS_PERIOD, "none has said anything"
     first.acknowledge(agent.log_id, 0, period=2.5)
@@ -122,7 +120,7 @@ def test_the_longest_status_period_that_servers_want_counts(agent: Agent, hub: M
     second.bus.close()
 
 
-def test_the_disk_comes_first(hub: MemoryHub, path: Path) -> None:
+def test_the_disk_comes_first(hub: MemoryHub, path: Path):
     """A published change is in the journal."""
     agent = Agent(hub, path)
     on_disk: list[bool] = []
@@ -136,7 +134,7 @@ def test_the_disk_comes_first(hub: MemoryHub, path: Path) -> None:
     server.close()
 
 
-def test_submitting_never_waits_for_the_disk(agent: Agent, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_submitting_never_waits_for_the_disk(agent: Agent, monkeypatch):
     release = threading.Event()
     write = agent.journal.write
 
@@ -157,7 +155,7 @@ def test_submitting_never_waits_for_the_disk(agent: Agent, monkeypatch: pytest.M
     assert agent.journal.head(MAP) == 50
 
 
-def test_a_change_that_cannot_be_encoded_is_refused_at_once(agent: Agent) -> None:
+def test_a_change_that_cannot_be_encoded_is_refused_at_once(agent: Agent):
     for bad in (NodeRetired(NodeId("r0", 1, -1)), NodeRetired(NodeId("r1", 1, 1))):
         with pytest.raises(InvalidValue):
             agent.replicator.submit([*bodies(1, 2), bad], 0)
@@ -165,9 +163,7 @@ def test_a_change_that_cannot_be_encoded_is_refused_at_once(agent: Agent) -> Non
     assert agent.journal.head(MAP) == 0
 
 
-def test_a_flood_of_acknowledgements_holds_up_no_change_and_fills_no_memory(
-    agent: Agent, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_flood_of_acknowledgements_holds_up_no_change_and_fills_no_memory(agent: Agent, monkeypatch):
     """Of a server that lies, or of any program without keys: nothing reached the disk while it lasted."""
     over, again = threading.Event(), Sample(KEYS.ack("s0", "r0"), Ack(MAP, agent.log_id, 0).encode())
     take, most = agent.replicator._take_ack, [0]
@@ -194,9 +190,7 @@ def test_a_flood_of_acknowledgements_holds_up_no_change_and_fills_no_memory(
     assert most[0] <= 18, "and what was submitted"
 
 
-def test_a_server_that_lies_fills_no_log_and_no_memory(
-    agent: Agent, hub: MemoryHub, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_server_that_lies_fills_no_log_and_no_memory(agent: Agent, hub: MemoryHub, caplog):
     """Garbage, refusals of changes that there are not, a new store each time, and any number of names."""
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
@@ -218,7 +212,7 @@ def test_a_server_that_lies_fills_no_log_and_no_memory(
     liar.close()
 
 
-def test_a_server_that_says_that_the_disk_was_put_back_is_believed(agent: Agent, hub: MemoryHub) -> None:
+def test_a_server_that_says_that_the_disk_was_put_back_is_believed(agent: Agent, hub: MemoryHub):
     """Its word alone ends that a map is sent; what is mapped reaches the own disk all the same."""
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
@@ -230,17 +224,13 @@ def test_a_server_that_says_that_the_disk_was_put_back_is_believed(agent: Agent,
     liar.close()
 
 
-def test_a_question_for_which_there_is_no_room_is_refused(
-    agent: Agent, hub: MemoryHub, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_question_for_which_there_is_no_room_is_refused(agent: Agent, hub: MemoryHub, monkeypatch):
     monkeypatch.setattr(replicator, "MOST_WAITING", 0)
     (reply,) = MemoryBus(hub).ask(KEYS.log(MAP), pack({"f": 1, "q": 1}), 5)
     assert reply.error == "r0 is asked too much at once" and reply.retry_after == 1.0
 
 
-def test_a_full_disk_is_logged_once_and_retried(
-    agent: Agent, server: HandServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_full_disk_is_logged_once_and_retried(agent: Agent, server: HandServer, monkeypatch, caplog):
     tries: list[int] = []
 
     def full(*_: object) -> None:
@@ -261,8 +251,8 @@ def test_a_full_disk_is_logged_once_and_retried(
 
 
 def test_a_full_disk_that_takes_no_acknowledgement_either_is_one_line(
-    agent: Agent, server: HandServer, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+    agent: Agent, server: HandServer, monkeypatch, caplog
+):
     """A server says again and again what it has, until the robot has noted it."""
     agent.replicator.submit(bodies(1, 2), 0)
     assert agent.replicator.flush(30)
@@ -291,7 +281,7 @@ def test_a_full_disk_that_takes_no_acknowledgement_either_is_one_line(
         eventually(lambda: len(caplog.records) == 2)
 
 
-def test_closing_commits_what_was_submitted(hub: MemoryHub, path: Path) -> None:
+def test_closing_commits_what_was_submitted(hub: MemoryHub, path: Path):
     agent = Agent(hub, path)
     agent.replicator.submit(bodies(1, 100), 0)
     agent.close()
@@ -300,7 +290,7 @@ def test_closing_commits_what_was_submitted(hub: MemoryHub, path: Path) -> None:
     journal.close()
 
 
-def test_the_beacon_has_the_length_of_the_log_and_the_watermarks(agent: Agent, server: HandServer) -> None:
+def test_the_beacon_has_the_length_of_the_log_and_the_watermarks(agent: Agent, server: HandServer):
     eventually(lambda: server.heads)
     assert server.heads[0] == Head(agent.log_id, 0, {})
     agent.replicator.submit(bodies(1, 3), 0)
@@ -311,7 +301,7 @@ def test_the_beacon_has_the_length_of_the_log_and_the_watermarks(agent: Agent, s
     eventually(lambda: len(server.heads) >= count + 3)
 
 
-def test_a_slow_server_gets_no_beacons_for_what_is_on_its_way(agent: Agent, server: HandServer) -> None:
+def test_a_slow_server_gets_no_beacons_for_what_is_on_its_way(agent: Agent, server: HandServer):
     """Its acknowledgements take ten times as long as the shortest time to a beacon."""
 
     def beacons_until_acknowledged(sequence: int) -> int:
@@ -330,7 +320,7 @@ def test_a_slow_server_gets_no_beacons_for_what_is_on_its_way(agent: Agent, serv
     assert sorted(rest)[len(rest) // 2] <= 1
 
 
-def test_who_waits_for_acknowledgements_does_not_wait_for_beacons(agent: Agent, server: HandServer) -> None:
+def test_who_waits_for_acknowledgements_does_not_wait_for_beacons(agent: Agent, server: HandServer):
     """A slow hour is over, and a change is lost: the robot's owner wants to switch it off."""
     for sequence in range(1, 4):
         agent.replicator.submit(bodies(sequence, sequence), 0)
@@ -348,7 +338,7 @@ def test_who_waits_for_acknowledgements_does_not_wait_for_beacons(agent: Agent, 
     assert time.monotonic() - began >= 30 * QUICK.beacon_interval
 
 
-def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: HandServer) -> None:
+def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: HandServer):
     agent = Agent(hub, path, ("s0", "s1"))
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
@@ -366,7 +356,7 @@ def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: Han
     other.bus.close()
 
 
-def test_acknowledgements_are_waited_for_while_that_is_worthwhile(agent: Agent, server: HandServer) -> None:
+def test_acknowledgements_are_waited_for_while_that_is_worthwhile(agent: Agent, server: HandServer):
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
     before, looks = len(server.heads), iter([True, True, False])
@@ -380,7 +370,7 @@ def test_acknowledgements_are_waited_for_while_that_is_worthwhile(agent: Agent, 
     assert agent.replicator.wait_acknowledged(30, lambda: False), "nothing is waited for"
 
 
-def test_without_required_servers_any_will_do(hub: MemoryHub, path: Path, server: HandServer) -> None:
+def test_without_required_servers_any_will_do(hub: MemoryHub, path: Path, server: HandServer):
     agent = Agent(hub, path, ())
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
@@ -390,7 +380,7 @@ def test_without_required_servers_any_will_do(hub: MemoryHub, path: Path, server
     agent.close()
 
 
-def test_old_and_foreign_acknowledgements_change_nothing(agent: Agent, server: HandServer) -> None:
+def test_old_and_foreign_acknowledgements_change_nothing(agent: Agent, server: HandServer):
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
     server.acknowledge(agent.log_id, 2)
@@ -404,8 +394,8 @@ def test_old_and_foreign_acknowledgements_change_nothing(agent: Agent, server: H
 
 @pytest.mark.parametrize("again", [False, True])
 def test_a_server_that_has_lost_its_store_lacks_everything_again(
-    hub: MemoryHub, path: Path, server: HandServer, again: bool, caplog: pytest.LogCaptureFixture
-) -> None:
+    hub: MemoryHub, path: Path, server: HandServer, again: bool, caplog
+):
     agent = Agent(hub, path)
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
@@ -426,8 +416,8 @@ def test_a_server_that_has_lost_its_store_lacks_everything_again(
 
 
 def test_a_late_acknowledgement_of_a_store_that_is_lost_says_nothing(
-    hub: MemoryHub, path: Path, server: HandServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    hub: MemoryHub, path: Path, server: HandServer, monkeypatch
+):
     """The robot would drop retirements that the new store has never had."""
     agent = Agent(hub, path)
     agent.replicator.submit(bodies(1, 3), 0)
@@ -451,9 +441,7 @@ def test_a_late_acknowledgement_of_a_store_that_is_lost_says_nothing(
     agent.close()
 
 
-def test_a_server_that_has_more_than_the_disk(
-    agent: Agent, server: HandServer, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_server_that_has_more_than_the_disk(agent: Agent, server: HandServer, caplog):
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
     with caplog.at_level(logging.WARNING):
@@ -463,7 +451,7 @@ def test_a_server_that_has_more_than_the_disk(
     assert agent.replicator.status().unacknowledged == 3
 
 
-def test_refusals_are_logged_once(agent: Agent, server: HandServer, caplog: pytest.LogCaptureFixture) -> None:
+def test_refusals_are_logged_once(agent: Agent, server: HandServer, caplog):
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
     with caplog.at_level(logging.WARNING):
@@ -479,7 +467,7 @@ def test_refusals_are_logged_once(agent: Agent, server: HandServer, caplog: pyte
     ]
 
 
-def test_the_log_answers_for_ranges(agent: Agent, server: HandServer) -> None:
+def test_the_log_answers_for_ranges(agent: Agent, server: HandServer):
     agent.replicator.submit(bodies(1, 30), 0)
     assert agent.replicator.flush(30)
     answer = server.ask(4, 6)
@@ -491,7 +479,7 @@ def test_the_log_answers_for_ranges(agent: Agent, server: HandServer) -> None:
         server.ask(5, 4)
 
 
-def test_the_log_answers_in_pieces(agent: Agent, server: HandServer) -> None:
+def test_the_log_answers_in_pieces(agent: Agent, server: HandServer):
     """Not more than 256 changes, and not more than the settings' bytes."""
     agent.replicator.submit(bodies(1, 600), 0)
     assert agent.replicator.flush(30)
@@ -505,7 +493,7 @@ def test_the_log_answers_in_pieces(agent: Agent, server: HandServer) -> None:
     assert collected == list(range(1, 601))
 
 
-def test_a_map_that_was_left_is_still_handed_over(hub: MemoryHub, path: Path, server: HandServer) -> None:
+def test_a_map_that_was_left_is_still_handed_over(hub: MemoryHub, path: Path, server: HandServer):
     agent = Agent(hub, path)
     agent.replicator.submit(bodies(1, 3), 0)
     agent.close()
@@ -535,14 +523,12 @@ def test_a_map_that_was_left_is_still_handed_over(hub: MemoryHub, path: Path, se
     journal.close()
 
 
-def test_no_log_answers_for_a_map_that_is_not_there(agent: Agent, server: HandServer) -> None:
+def test_no_log_answers_for_a_map_that_is_not_there(agent: Agent, server: HandServer):
     (reply,) = server.bus.ask(KEYS.log(MapId("r0", 9)), LogRequest(1, 2).encode(), 5)
     assert reply.error.endswith("agent/r0/log/9: no such log")
 
 
-def test_a_restarted_agent_goes_on_and_prunes_what_all_have(
-    hub: MemoryHub, path: Path, server: HandServer
-) -> None:
+def test_a_restarted_agent_goes_on_and_prunes_what_all_have(hub: MemoryHub, path: Path, server: HandServer):
     agent = Agent(hub, path)
     agent.replicator.submit([*bodies(1, 1), *bodies(1, 1), *bodies(2, 2)], 0)
     eventually(lambda: len(server.changes) == 3)
@@ -563,8 +549,8 @@ def test_a_restarted_agent_goes_on_and_prunes_what_all_have(
 
 
 def test_what_later_changes_undo_leaves_the_disk_while_the_agent_runs(
-    agent: Agent, server: HandServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    agent: Agent, server: HandServer, monkeypatch
+):
     monkeypatch.setattr("mapweave.agent.replication.replicator.COMPACTED", 4)
     assert not agent.replicator.shared
     agent.replicator.submit([*bodies(1, 2), *bodies(1, 2), *bodies(9, 9)], 0)
@@ -577,7 +563,7 @@ def test_what_later_changes_undo_leaves_the_disk_while_the_agent_runs(
 
 
 @given(st.integers(0, 20), st.lists(st.tuples(st.integers(1, 40), st.integers(0, 6))))
-def test_ranges_are_the_set_of_their_numbers(last: int, added: list[tuple[int, int]]) -> None:
+def test_ranges_are_the_set_of_their_numbers(last: int, added: list[tuple[int, int]]):
     ranges, numbers = Ranges(last), set(range(last + 1))
     for first, more in added:
         ranges.add(first, first + more)

@@ -1,7 +1,5 @@
 """What a journal has kept of a map: what is in force, numbers that were never used, and what is damaged."""
 
-from __future__ import annotations
-
 import sqlite3
 from pathlib import Path
 
@@ -66,8 +64,8 @@ bodies = st.one_of(
 @settings(max_examples=25, deadline=None)
 @given(st.lists(bodies, min_size=1, max_size=30), st.booleans())
 def test_a_sound_log_gives_its_replay_and_numbers_above_all(
-    tmp_path_factory: pytest.TempPathFactory, log: list[ChangeBody], pruned: bool
-) -> None:
+    tmp_path_factory, log: list[ChangeBody], pruned: bool
+):
     path = tmp_path_factory.mktemp("kept") / "j"
     journal = Journal(path, "r0")
     journal.append(journal.open_map(1), log, 0)
@@ -88,17 +86,17 @@ def test_a_sound_log_gives_its_replay_and_numbers_above_all(
     assert kept.complaint == ""
 
 
-def test_an_empty_map_begins_with_one(tmp_path: Path) -> None:
+def test_an_empty_map_begins_with_one(tmp_path):
     assert kept_of(tmp_path / "j", []) == RetainedMap((), 1)
 
 
-def test_retired_numbers_are_not_given_again(tmp_path: Path) -> None:
+def test_retired_numbers_are_not_given_again(tmp_path):
     kept = kept_of(tmp_path / "j", [node(1), node(2), node(7), NodeRetired(NodeId(*MAP, 7))])
     assert numbers(kept) == [1, 2]
     assert kept.next_number == 8
 
 
-def test_a_damaged_node_is_missing_with_its_edges_and_reported(tmp_path: Path) -> None:
+def test_a_damaged_node_is_missing_with_its_edges_and_reported(tmp_path):
     kept = kept_of(tmp_path / "j", [node(1), node(2), edge(3, 1, 2), node(4), edge(5, 1, 4)], damage=(4,))
     assert numbers(kept) == [1, 2, 3]
     assert kept.next_number == 6
@@ -108,18 +106,18 @@ def test_a_damaged_node_is_missing_with_its_edges_and_reported(tmp_path: Path) -
     )
 
 
-def test_the_last_number_counts_even_if_it_is_damaged(tmp_path: Path) -> None:
+def test_the_last_number_counts_even_if_it_is_damaged(tmp_path):
     kept = kept_of(tmp_path / "j", [node(1), node(9)], damage=(2,))
     assert numbers(kept) == [1]
     assert kept.next_number == 10
 
 
-def test_a_damaged_retirement_still_retires(tmp_path: Path) -> None:
+def test_a_damaged_retirement_still_retires(tmp_path):
     log = [node(1), node(2), edge(3, 1, 2), EdgeRetired(NodeId(*MAP, 3)), NodeRetired(NodeId(*MAP, 2))]
     assert numbers(kept_of(tmp_path / "j", log, damage=(4, 5))) == [1]
 
 
-def test_an_older_state_is_used_where_the_newer_is_damaged(tmp_path: Path) -> None:
+def test_an_older_state_is_used_where_the_newer_is_damaged(tmp_path):
     kept = kept_of(tmp_path / "j", [node(1, 1.0), node(1, 2.0)], damage=(2,))
     (put,) = kept.contents
     assert isinstance(put, NodePut)
@@ -128,14 +126,14 @@ def test_an_older_state_is_used_where_the_newer_is_damaged(tmp_path: Path) -> No
     assert "\n" not in kept.complaint
 
 
-def test_another_agents_map_is_refused(tmp_path: Path) -> None:
+def test_another_agents_map_is_refused(tmp_path):
     journal = Journal(tmp_path / "j", "r0")
     with pytest.raises(InvalidValue, match="has no map r1"):
         RetainedMap.of(journal, MapId("r1", 1))
     journal.close()
 
 
-def test_drives_among_nodes_of_others_are_kept(tmp_path: Path) -> None:
+def test_drives_among_nodes_of_others_are_kept(tmp_path):
     """They are not in this journal, and not missing for that; an own node that is damaged is."""
     here = PoseGaussian.from_sigmas(Pose2(1.0), 0.1, 0.1)
     other = NodeId("r1", 1, 4)

@@ -1,7 +1,5 @@
 """Images of nodes on a robot's disk: kept, given to who asks, removed; no tick waits for them."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -81,7 +79,7 @@ def kept(hub: MemoryHub, wanted: NodeId) -> bytes:
     return answer.jpeg
 
 
-def test_an_image_is_kept_given_and_removed_with_its_node(begin: Robot, hub, folder, image) -> None:
+def test_an_image_is_kept_given_and_removed_with_its_node(begin: Robot, hub, folder, image):
     keeper = begin()
     keeper.keep([(node(1), image), (node(3), image)], [])
     jpeg = kept(hub, node(1))
@@ -97,7 +95,7 @@ def test_an_image_is_kept_given_and_removed_with_its_node(begin: Robot, hub, fol
 
 def test_what_was_kept_outlasts_a_restart_but_for_nodes_that_are_gone(
     begin: Robot, hub: MemoryHub, folder: Path, image: RawImage
-) -> None:
+):
     begin().keep([(node(1), image), (node(3), image), (node(1, epoch=2), image)], [])
     begin().close()
     (folder / ".r0.1.5.jpg.77.part").write_bytes(b"cut off by a loss of power")
@@ -110,7 +108,7 @@ def test_what_was_kept_outlasts_a_restart_but_for_nodes_that_are_gone(
 
 
 @pytest.mark.parametrize("damage", ["missing", "empty", "cut off", "zeros", "too large"])
-def test_a_damaged_file_is_no_view(begin: Robot, hub, folder, image, damage: str) -> None:
+def test_a_damaged_file_is_no_view(begin: Robot, hub, folder, image, damage: str):
     begin().keep([(node(1), image)], [])
     jpeg, path = kept(hub, node(1)), folder / "r0.1.1.jpg"
     if damage == "missing":
@@ -122,7 +120,7 @@ def test_a_damaged_file_is_no_view(begin: Robot, hub, folder, image, damage: str
     assert kept(hub, node(1)) == b""
 
 
-def test_the_oldest_make_room(begin: Robot, hub, image, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_oldest_make_room(begin: Robot, hub, image, monkeypatch):
     monkeypatch.setattr(view_keeper, "MOST_VIEWS", 2)
     begin().keep([(node(10), image), (node(9, epoch=2), image)], [])
     # Of the files of an earlier run the numbers say which is older.
@@ -131,7 +129,7 @@ def test_the_oldest_make_room(begin: Robot, hub, image, monkeypatch: pytest.Monk
     assert kept(hub, node(9, epoch=2)) and kept(hub, node(11, epoch=2))
 
 
-def test_a_disk_that_hangs_holds_up_no_one(begin: Robot, hub, image, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_disk_that_hangs_holds_up_no_one(begin: Robot, hub, image, monkeypatch):
     """What it has no time for is left out, and who asks meanwhile gets a time to ask again."""
     hangs, goes_on = threading.Event(), threading.Event()
     write = view_keeper.write_whole
@@ -153,7 +151,7 @@ def test_a_disk_that_hangs_holds_up_no_one(begin: Robot, hub, image, monkeypatch
     assert [number for number in range(1, 40) if kept(hub, node(number))] == [*range(1, 2 + MOST_WAITING)]
 
 
-def test_a_full_disk_is_reported_once(begin: Robot, hub, image, monkeypatch, caplog) -> None:
+def test_a_full_disk_is_reported_once(begin: Robot, hub, image, monkeypatch, caplog):
     def full(path: Path, data: bytes) -> None:
         raise InvalidFile(f"{path.name}: cannot be written (No space left on device)")
 
@@ -170,7 +168,7 @@ def test_a_full_disk_is_reported_once(begin: Robot, hub, image, monkeypatch, cap
     assert len(caplog.records) == 1
 
 
-def test_an_image_that_cannot_be_encoded_ends_nothing(begin: Robot, hub, image, monkeypatch, caplog) -> None:
+def test_an_image_that_cannot_be_encoded_ends_nothing(begin: Robot, hub, image, monkeypatch, caplog):
     def broken(pixels: np.ndarray, camera: object) -> bytes:
         raise cv2.error("OpenCV(4.0)\nassertion failed")
 
@@ -184,7 +182,7 @@ def test_an_image_that_cannot_be_encoded_ends_nothing(begin: Robot, hub, image, 
     assert kept(hub, node(2))
 
 
-def test_what_is_no_question_is_refused(begin: Robot, hub) -> None:
+def test_what_is_no_question_is_refused(begin: Robot, hub):
     begin()
     (reply,) = MemoryBus(hub).ask(KEYS.view("r0"), b"\x81\xa1v\x01", 10.0)
     assert reply.error and not reply.retry_after
@@ -192,7 +190,7 @@ def test_what_is_no_question_is_refused(begin: Robot, hub) -> None:
         decode(b"x" * 2 * MAX_BYTES, ViewImage)
 
 
-def test_noise_of_any_size_fits_in_a_message() -> None:
+def test_noise_of_any_size_fits_in_a_message():
     noise = np.random.default_rng(0).integers(0, 255, (480, 640)).astype(np.uint8)
     assert len(view_file(noise, CAMERA)) <= MAX_BYTES
 
@@ -206,7 +204,7 @@ def run(walls: PhotoWalls, description, hub: MemoryHub, folder: Path, keep_views
     return agent
 
 
-def test_an_agent_keeps_the_view_of_each_node(walls, description, hub, tmp_path) -> None:
+def test_an_agent_keeps_the_view_of_each_node(walls, description, hub, tmp_path):
     agent = run(walls, description, hub, tmp_path, keep_views=True)
     try:
         nodes = agent.pipeline.map.nodes
@@ -227,7 +225,7 @@ def test_an_agent_keeps_the_view_of_each_node(walls, description, hub, tmp_path)
         agent.close()
 
 
-def test_without_the_setting_nothing_is_kept(walls, description, hub, tmp_path) -> None:
+def test_without_the_setting_nothing_is_kept(walls, description, hub, tmp_path):
     agent = run(walls, description, hub, tmp_path, keep_views=False)
     try:
         assert agent.pipeline.map.nodes
@@ -240,7 +238,7 @@ def test_without_the_setting_nothing_is_kept(walls, description, hub, tmp_path) 
 @pytest.mark.parametrize("distortion", [(-0.3, 0.1, 0.001, -0.001, 0.0), (0.0,) * 5])
 def test_the_image_is_the_one_in_which_the_landmarks_are(
     begin: Robot, hub, image: RawImage, distortion: Distortion
-) -> None:
+):
     """A distorting lens is taken out of it."""
     lens = Lens(CAMERA, distortion)
     grid = np.stack(np.meshgrid(np.arange(CAMERA.width), np.arange(CAMERA.height)), axis=-1)

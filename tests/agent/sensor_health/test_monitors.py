@@ -1,7 +1,5 @@
 """Each monitor by itself: what it calls a fault, when, and what it does not."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -9,9 +7,9 @@ import pytest
 
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.ranger_monitor import RangerMonitor
-from mapweave.agent.sensor_health.camera_monitor import CameraMonitor
 from mapweave.agent.sensor_health.clock_monitor import ClockMonitor
 from mapweave.agent.sensor_health.encoder_monitor import EncoderMonitor
+from mapweave.agent.sensor_health.sensor_monitor import CameraMonitor
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Pose2
 

@@ -1,7 +1,5 @@
 """Unit and signs of odometry, held against the image."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -68,7 +66,7 @@ def complaint(seen: list[Observation]) -> str:
 )  # fmt: skip
 def test_a_wrong_unit_or_sign_is_named_and_a_wrong_scale_is_not(
     walls: PhotoWalls, every: int, times: float, words: tuple[str, ...]
-) -> None:
+):
     line = complaint(drive(walls, times, every))
     assert bool(line) is bool(words) and "\n" not in line
     for word in (REVERSED, DEGREES):
@@ -84,13 +82,13 @@ def test_a_wrong_unit_or_sign_is_named_and_a_wrong_scale_is_not(
     ],
     ids=["mirrored", "upside down", "right"],
 )
-def test_an_image_that_is_mirrored_or_upside_down_turns_the_other_way(walls, turned, words: str) -> None:
+def test_an_image_that_is_mirrored_or_upside_down_turns_the_other_way(walls, turned, words: str):
     seen = [replace(one, image=np.ascontiguousarray(turned(one.image))) for one in drive(walls, 1.0)]
     line = complaint(seen)
     assert words in line and bool(line) is bool(words)
 
 
-def test_images_that_lack_and_a_robot_that_does_not_turn_say_nothing_wrong(walls: PhotoWalls) -> None:
+def test_images_that_lack_and_a_robot_that_does_not_turn_say_nothing_wrong(walls: PhotoWalls):
     rng = np.random.default_rng(0)
     lacking = [
         replace(one, image=None) if lacks else one
@@ -104,7 +102,7 @@ def test_images_that_lack_and_a_robot_that_does_not_turn_say_nothing_wrong(walls
 
 @pytest.mark.parametrize("direction", [1.0, -1.0], ids=["ahead", "back"])
 @pytest.mark.parametrize("sign", [1.0, -1.0], ids=["right", "reversed"])
-def test_ways_with_the_wrong_sign_are_named(walls: PhotoWalls, direction: float, sign: float) -> None:
+def test_ways_with_the_wrong_sign_are_named(walls: PhotoWalls, direction: float, sign: float):
     """A robot may drive back; then the image moves back, too."""
     seen = drive(walls, 1.0, step=0.014)
     steps = [0.0, *(one.odometry.forward for one in seen[1:])]
@@ -178,9 +176,7 @@ def spoilt(seen: list[Observation], how: str) -> list[Observation]:
         ("another drive", ("show nothing in common", "in the wrong order")),
     ],
 )  # fmt: skip
-def test_the_likeliest_cause_is_named_and_no_other(
-    walls: PhotoWalls, how: str, words: tuple[str, ...]
-) -> None:
+def test_the_likeliest_cause_is_named_and_no_other(walls: PhotoWalls, how: str, words: tuple[str, ...]):
     line = complaint(spoilt(drive(walls, 1.0, count=150), how))
     assert all(word in line for word in words), line
     assert bool(line) is bool(words)
@@ -188,7 +184,7 @@ def test_the_likeliest_cause_is_named_and_no_other(
     assert sum(cause in line for cause in causes) <= max(len(words), 1), line
 
 
-def test_a_clock_that_goes_back_begins_again(walls: PhotoWalls) -> None:
+def test_a_clock_that_goes_back_begins_again(walls: PhotoWalls):
     seen = spoilt(drive(walls, 1.0, count=150), "late")
     assert not complaint([*seen[:40], *seen[:40]])
     assert "1.0 s after" in complaint([*seen[:40], *seen])

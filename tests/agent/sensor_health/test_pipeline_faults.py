@@ -1,7 +1,5 @@
 """The whole robot with a sensor that fails: it stands, says which, and goes on by itself when it is back."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Which encoder is dead is said of a robot that is driven by hand, and nothing in a turn about a wheel."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -44,7 +42,7 @@ WEAVE = [(0.02 + 0.006 * math.sin(0.3 * k), 0.02 - 0.006 * math.sin(0.3 * k)) fo
 
 @pytest.mark.parametrize("side", ["left", "right"])
 @pytest.mark.parametrize("steps", [STRAIGHT, WEAVE])
-def test_the_encoder_that_is_dead_is_named(steps: list[tuple[float, float]], side: str) -> None:
+def test_the_encoder_that_is_dead_is_named(steps: list[tuple[float, float]], side: str):
     words = complaint(ticks(steps, side))
     assert words == (
         f"the {side} encoder counts nothing while the image shows that its wheel turns: check its cable"
@@ -55,25 +53,23 @@ def test_the_encoder_that_is_dead_is_named(steps: list[tuple[float, float]], sid
     "steps",
     [STRAIGHT, WEAVE, [(0.0, 0.02)] * 8 + [(0.0, -0.02)] * 16 + [(0.0, 0.02)] * 16, [(0.0, 0.0)] * 40],
 )
-def test_encoders_that_count_are_believed_also_in_a_turn_about_a_wheel(
-    steps: list[tuple[float, float]],
-) -> None:
+def test_encoders_that_count_are_believed_also_in_a_turn_about_a_wheel(steps: list[tuple[float, float]]):
     assert not complaint(ticks(steps))
 
 
-def test_a_wheel_that_spins_in_place_is_no_dead_encoder() -> None:
+def test_a_wheel_that_spins_in_place_is_no_dead_encoder():
     """The image stands: the other wheel stands too, as its encoder says."""
     still = [replace(one, image=WALLS.render(Pose2(-1.0))) for one in ticks([(0.0, 0.03)] * 40)]
     assert not complaint(still)
 
 
-def test_images_that_show_nothing_say_nothing() -> None:
+def test_images_that_show_nothing_say_nothing():
     blank = [replace(one, image=np.full((240, 320), 90, np.uint8)) for one in ticks(STRAIGHT, "left")]
     assert not complaint(blank)
     assert not complaint([replace(one, image=None) for one in ticks(STRAIGHT, "left")])
 
 
-def test_a_pipeline_names_it_and_blames_no_clock() -> None:
+def test_a_pipeline_names_it_and_blames_no_clock():
     """It used to be named as odometry that turns late, if at all."""
     pipeline = Pipeline(MapId("r0", 1), ROBOT)
     pipeline.set_mission(Carried())

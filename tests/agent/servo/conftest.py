@@ -1,7 +1,5 @@
 """A small world for the servo: a unicycle integrated finely, landmarks, and brute-force visibility."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field

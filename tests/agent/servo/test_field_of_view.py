@@ -1,7 +1,5 @@
 """The slack against brute-force projection."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace
@@ -26,7 +24,7 @@ poses = st.tuples(st.floats(-2, 2), st.floats(-2, 2), st.floats(-3.1, 3.1))
 @given(pose_vector=poses, seed=st.integers(0, 10_000), forward=st.sampled_from([0.0, 0.1]))
 def test_the_margin_counts_visible_landmarks(
     pose_vector: tuple[float, float, float], seed: int, forward: float, robot: RobotDescription, seen: Seen
-) -> None:
+):
     rng = np.random.default_rng(seed)
     points = rng.uniform([-1, -2, -0.5], [4, 2, 1.5], (10, 3))
     camera = replace(robot.camera, mount_forward=forward)
@@ -42,7 +40,7 @@ def test_the_margin_counts_visible_landmarks(
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_slack_changes_no_faster_than_the_heading(
     pose_vector: tuple[float, float, float], turn: float, robot: RobotDescription
-) -> None:
+):
     points = np.random.default_rng(1).uniform([1, -2, 0], [5, 2, 0.5], (8, 3))
     field = FieldOfView(points, robot.camera)
     turned = np.array([pose_vector[0], pose_vector[1], pose_vector[2] + turn])
@@ -51,7 +49,7 @@ def test_slack_changes_no_faster_than_the_heading(
 
 
 @pytest.mark.parametrize("forward", [0.0, 0.12])
-def test_the_table_is_the_slack_pose_by_pose(robot: RobotDescription, forward: float) -> None:
+def test_the_table_is_the_slack_pose_by_pose(robot: RobotDescription, forward: float):
     points = np.random.default_rng(2).uniform([1, -2, 0], [5, 2, 0.5], (8, 3))
     field = FieldOfView(points, replace(robot.camera, mount_forward=forward))
     x, y = np.meshgrid(np.linspace(-1, 0.5, 4), np.linspace(-1, 1, 3), indexing="ij")
@@ -62,7 +60,7 @@ def test_the_table_is_the_slack_pose_by_pose(robot: RobotDescription, forward: f
         assert table[k] == pytest.approx(one_by_one, abs=1e-9)
 
 
-def test_fewer_landmarks_are_a_stricter_field(robot: RobotDescription) -> None:
+def test_fewer_landmarks_are_a_stricter_field(robot: RobotDescription):
     rng = np.random.default_rng(3)
     field = FieldOfView(rng.uniform([1, -2, 0], [5, 2, 0.5], (60, 3)), robot.camera)
     some = field.spread(20)
@@ -71,12 +69,12 @@ def test_fewer_landmarks_are_a_stricter_field(robot: RobotDescription) -> None:
     assert (some.slack(where) <= field.slack(where) + 1e-12).all()
 
 
-def test_too_few_landmarks_are_never_enough(robot: RobotDescription) -> None:
+def test_too_few_landmarks_are_never_enough(robot: RobotDescription):
     assert float(FieldOfView(np.array([[2.0, 0.0, 0.3]]), robot.camera).slack(np.zeros(3))) < 0
     assert float(FieldOfView(np.zeros((0, 3)), robot.camera).slack(np.zeros(3))) < 0
 
 
 @pytest.mark.parametrize("points", [np.zeros((3, 2)), np.full((3, 3), np.nan)])
-def test_bad_landmarks_are_refused(points: Array, robot: RobotDescription) -> None:
+def test_bad_landmarks_are_refused(points: Array, robot: RobotDescription):
     with pytest.raises(InvalidValue):
         FieldOfView(points, robot.camera)

@@ -1,7 +1,5 @@
 """The exploration drive on a true unicycle with true bearings."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from itertools import pairwise
@@ -51,7 +49,7 @@ def free(robot: RobotDescription) -> Callable[[Pose2], Array]:
 @pytest.mark.parametrize("distance", [0.6, -0.5])
 def test_drives_forth_and_back_almost_straight(
     robot: RobotDescription, integrate: Integrate, distance: float
-) -> None:
+):
     points = np.random.default_rng(1).uniform([2.0, -0.7], [4.0, 0.7], (20, 2))
     path, commands, fewest, reason = explore(robot, integrate, points, distance, free(robot))
     furthest = max(path, key=lambda p: abs(p.x))
@@ -66,9 +64,7 @@ def test_drives_forth_and_back_almost_straight(
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_turns_toward_features_on_one_side(
-    robot: RobotDescription, integrate: Integrate, side: float
-) -> None:
+def test_turns_toward_features_on_one_side(robot: RobotDescription, integrate: Integrate, side: float):
     rng = np.random.default_rng(2)
     points = np.column_stack([rng.uniform(1.5, 2.5, 20), side * rng.uniform(0.3, 1.0, 20)])
     straight_fewest = _fewest_when_straight(robot, points, 0.6)
@@ -86,7 +82,7 @@ def _fewest_when_straight(robot: RobotDescription, points: Array, distance: floa
     return min(counts)
 
 
-def test_turns_round_before_the_features_are_lost(robot: RobotDescription, integrate: Integrate) -> None:
+def test_turns_round_before_the_features_are_lost(robot: RobotDescription, integrate: Integrate):
     points = np.array([[1.0, y] for y in (-0.45, -0.4, -0.35, -0.3, 0.3, 0.35, 0.4, 0.45)])
     path, _, fewest, reason = explore(robot, integrate, points, 0.8, free(robot))
     assert max(p.x for p in path) < 0.4
@@ -95,9 +91,7 @@ def test_turns_round_before_the_features_are_lost(robot: RobotDescription, integ
 
 
 @pytest.mark.parametrize("distance", [0.8, -0.8])
-def test_turns_round_before_an_obstacle(
-    robot: RobotDescription, integrate: Integrate, distance: float
-) -> None:
+def test_turns_round_before_an_obstacle(robot: RobotDescription, integrate: Integrate, distance: float):
     points = np.random.default_rng(3).uniform([3.0, -0.7], [4.0, 0.7], (20, 2))
     wall = math.copysign(0.6, distance)
 
@@ -115,9 +109,7 @@ def test_turns_round_before_an_obstacle(
 
 
 @pytest.mark.parametrize(("distance", "bearing"), [(0.8, 0.6), (0.8, -0.6), (-0.8, 2.5), (-0.8, -2.5)])
-def test_gives_way_to_an_obstacle_on_one_side(
-    robot: RobotDescription, distance: float, bearing: float
-) -> None:
+def test_gives_way_to_an_obstacle_on_one_side(robot: RobotDescription, distance: float, bearing: float):
     drive = ImageDrive(robot)
     drive.start(distance)
     rangers = np.full(len(robot.ranger_bearings), FREE)

@@ -1,7 +1,5 @@
 """The paper's equations against finite differences of the true unicycle and against their literal form."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -27,7 +25,7 @@ law_ = st.integers(0, LAWS - 1)
 
 
 @given(rho_, phi_, beta_)
-def test_polar_coordinates_round_trip(rho: float, phi: float, beta: float) -> None:
+def test_polar_coordinates_round_trip(rho: float, phi: float, beta: float):
     polar = polar_of(Polar(rho, phi, beta).pose())
     assert polar.rho == pytest.approx(rho)
     assert polar.phi == pytest.approx(phi)
@@ -45,7 +43,7 @@ def unicycle_step(polar: Polar, forward: float, turn: float, dt: float) -> Polar
 @given(rho_, phi_, beta_, law_, st.floats(0.3, 4.0))
 def test_lyapunov_rate_is_the_derivative_along_the_true_unicycle(
     rho: float, phi: float, beta: float, law: int, lambda_: float
-) -> None:
+):
     u, omega = control(phi, beta, lambda_)
     forward, turn = rho * float(u), float(omega[law])
     dt = 1e-5
@@ -59,7 +57,7 @@ def test_lyapunov_rate_is_the_derivative_along_the_true_unicycle(
 
 
 @given(phi_, beta_, law_, st.floats(0.3, 4.0))
-def test_control_is_equation_5(phi: float, beta: float, law: int, lambda_: float) -> None:
+def test_control_is_equation_5(phi: float, beta: float, law: int, lambda_: float):
     phi_tilde, beta_tilde = (float(c[law]) for c in charts(phi, beta))
     assume(abs(beta_tilde) > 1e-3)
     u, omega = control(phi, beta, lambda_)
@@ -68,7 +66,7 @@ def test_control_is_equation_5(phi: float, beta: float, law: int, lambda_: float
     assert omega[law] == pytest.approx(literal, rel=1e-6, abs=1e-9)
 
 
-def test_control_has_no_hole_where_beta_tilde_vanishes() -> None:
+def test_control_has_no_hole_where_beta_tilde_vanishes():
     for beta in (0.0, math.pi, -math.pi):
         _, at = control(1.0, beta, 2.0)
         _, beside = control(1.0, beta + 1e-7, 2.0)
@@ -76,7 +74,7 @@ def test_control_has_no_hole_where_beta_tilde_vanishes() -> None:
         assert at == pytest.approx(beside, abs=1e-5)
 
 
-def test_all_equilibria_are_the_goal_pose() -> None:
+def test_all_equilibria_are_the_goal_pose():
     laws = np.arange(LAWS)
     zero = np.zeros((1, LAWS))
     poses = law_paths(laws, zero, zero, zero)[:, 0]
@@ -84,14 +82,14 @@ def test_all_equilibria_are_the_goal_pose() -> None:
     assert [wrap_angle(float(h)) for h in poses[:, 2]] == pytest.approx([0.0] * LAWS, abs=1e-9)
 
 
-def test_the_sign_of_each_law() -> None:
+def test_the_sign_of_each_law():
     # At the equilibrium of chart i, beta = -BETA_SHIFT[i]: forward for chart 1, backward for the others.
     _, beta_tilde = charts(0.0, 0.0)
     assert pytest.approx(np.cos(-beta_tilde)) == [1.0, -1.0, -1.0, -1.0, -1.0]
 
 
 @given(st.floats(-3, 3), st.floats(-5, 5))
-def test_saturation_keeps_the_curvature_and_the_limits(forward: float, turn: float) -> None:
+def test_saturation_keeps_the_curvature_and_the_limits(forward: float, turn: float):
     v, w = saturate(forward, turn, 0.3, 0.8)
     assert abs(v) <= 0.3 + 1e-12
     assert abs(w) <= 0.8 + 1e-12

@@ -1,7 +1,5 @@
 """The drive without a view."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -34,9 +32,7 @@ def run(
 
 @settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.floats(-2, 2), st.floats(-2, 2), st.floats(-math.pi, math.pi))
-def test_gets_anywhere(
-    robot: RobotDescription, integrate: Integrate, x: float, y: float, heading: float
-) -> None:
+def test_gets_anywhere(robot: RobotDescription, integrate: Integrate, x: float, y: float, heading: float):
     pose, steps = run(robot, Pose2(x, y, heading), integrate)
     assert steps[-1].state == "arrived"
     assert math.hypot(pose.x, pose.y) <= 0.04
@@ -44,18 +40,18 @@ def test_gets_anywhere(
     assert all(abs(s.command.forward) <= 0.3 and abs(s.command.turn) <= 0.8 for s in steps)
 
 
-def test_a_turn_on_the_spot_does_not_drive(robot: RobotDescription, integrate: Integrate) -> None:
+def test_a_turn_on_the_spot_does_not_drive(robot: RobotDescription, integrate: Integrate):
     _, steps = run(robot, Pose2(0.005, 0.0, 2.0), integrate)
     assert all(s.command.forward == 0.0 for s in steps)
 
 
-def test_a_goal_close_behind_is_driven_to_backward(robot: RobotDescription, integrate: Integrate) -> None:
+def test_a_goal_close_behind_is_driven_to_backward(robot: RobotDescription, integrate: Integrate):
     _, steps = run(robot, Pose2(1.0, 0.1, 0.0), integrate)
     assert min(s.command.forward for s in steps) < -0.1
     assert max(s.command.forward for s in steps) <= 0.0
 
 
-def test_an_obstacle_stops_it_then_it_is_stuck(robot: RobotDescription) -> None:
+def test_an_obstacle_stops_it_then_it_is_stuck(robot: RobotDescription):
     drive = OdometryDrive(robot)
     pose = Pose2(-1.0, 0.0, 0.0)
     drive.start(pose)
@@ -70,7 +66,7 @@ def test_an_obstacle_stops_it_then_it_is_stuck(robot: RobotDescription) -> None:
 
 def test_what_is_in_the_way_does_not_keep_it_from_the_goal_s_heading(
     robot: RobotDescription, integrate: Integrate
-) -> None:
+):
     drive, pose, obstacle = OdometryDrive(robot), Pose2(0.0, 0.09, 2.0), np.array([[0.0, -0.12]])
     drive.start(pose)
     for _ in range(120):

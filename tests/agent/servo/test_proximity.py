@@ -1,7 +1,5 @@
 """The guard in random worlds: for any command, the footprint touches nothing that rangers can see."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -38,7 +36,7 @@ def read_rangers(robot: RobotDescription, pose: Pose2, posts: Array) -> Array:
 @given(seed=st.integers(0, 100_000), speed=st.floats(-0.3, 0.3), turn=st.floats(-0.8, 0.8))
 def test_no_collision_in_a_random_world(
     seed: int, speed: float, turn: float, robot: RobotDescription, integrate: Integrate
-) -> None:
+):
     rng = np.random.default_rng(seed)
     posts = np.column_stack([rng.uniform(-2, 2, (12, 2)), rng.uniform(0.15, 0.4, 12)])
     posts = posts[np.hypot(posts[:, 0], posts[:, 1]) > posts[:, 2] + robot.radius + 0.04]
@@ -60,7 +58,7 @@ def test_no_collision_in_a_random_world(
 @pytest.mark.parametrize("speeds", first_quick([[0.3, 0.1], [0.26, 0.26], [0.3, 0.3]], 1))
 def test_two_that_drive_at_each_other_do_not_touch(
     robot: RobotDescription, aside: float, speeds: tuple[float, float]
-) -> None:
+):
     """Each sees the other one and not that it comes; wheels follow a command with a lag of 0.12 s."""
     closest, steps = math.inf, 20
     for start in np.linspace(0.8, 0.9, 7):
@@ -85,7 +83,7 @@ def _post(other: Pose2, robot: RobotDescription) -> Array:
     return np.array([[other.x, other.y, robot.radius]])
 
 
-def test_the_guard_stops_both_ways_and_lets_the_robot_leave(robot: RobotDescription) -> None:
+def test_the_guard_stops_both_ways_and_lets_the_robot_leave(robot: RobotDescription):
     wall_ahead = np.where(np.abs(robot.ranger_bearings) < 0.5, 0.02, robot.ranger_reach)
     stopped = guard(Command(0.2, 0.1), wall_ahead, robot)
     assert stopped.command == Command(0.0, 0.1)
@@ -96,7 +94,7 @@ def test_the_guard_stops_both_ways_and_lets_the_robot_leave(robot: RobotDescript
     assert "behind" in guard(Command(-0.2, 0.0), wall_behind, robot).reason
 
 
-def test_slowing_keeps_the_curvature(robot: RobotDescription) -> None:
+def test_slowing_keeps_the_curvature(robot: RobotDescription):
     some_way_ahead = np.where(np.abs(robot.ranger_bearings) < 0.5, 0.07, robot.ranger_reach)
     safe, reason = guard(Command(0.3, 0.06), some_way_ahead, robot)
     assert "slowed" in reason
@@ -104,13 +102,13 @@ def test_slowing_keeps_the_curvature(robot: RobotDescription) -> None:
     assert safe.turn / safe.forward == pytest.approx(0.2)
 
 
-def test_free_rangers_and_no_rangers_let_everything_pass(robot: RobotDescription) -> None:
+def test_free_rangers_and_no_rangers_let_everything_pass(robot: RobotDescription):
     free = np.full(len(robot.ranger_bearings), robot.ranger_reach)
     assert guard(Command(0.3, 0.3), free, robot) == (Command(0.3, 0.3), "")
     assert guard(Command(0.3, 0.3), np.zeros(0), robot) == (Command(0.3, 0.3), "")
 
 
-def test_hits_are_points_at_the_right_place(robot: RobotDescription) -> None:
+def test_hits_are_points_at_the_right_place(robot: RobotDescription):
     readings = np.full(len(robot.ranger_bearings), robot.ranger_reach)
     readings[list(robot.ranger_bearings).index(0.0)] = 0.3
     assert ranger_points(readings, robot) == pytest.approx(np.array([[robot.radius + 0.3, 0.0]]))

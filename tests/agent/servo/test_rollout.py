@@ -1,7 +1,5 @@
 """Roll-outs against a fine independent integration of the unicycle under the law."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -17,7 +15,7 @@ from mapweave.hybridmap.pose import Pose2
 
 @settings(max_examples=8, deadline=None)
 @given(st.floats(0.2, 2.5), st.floats(0.3, 6.0), st.floats(-2.8, 2.8))
-def test_roll_out_is_the_path_of_the_unicycle_under_each_law(rho: float, phi: float, beta: float) -> None:
+def test_roll_out_is_the_path_of_the_unicycle_under_each_law(rho: float, phi: float, beta: float):
     polar = Polar(rho, phi, beta)
     rollouts = roll_out(polar, 2.0, 0.006)
     dt = 0.008
@@ -37,7 +35,7 @@ def test_roll_out_is_the_path_of_the_unicycle_under_each_law(rho: float, phi: fl
 
 
 @given(st.floats(0.05, 2.5), st.floats(0.0, 6.2), st.floats(-3.1, 3.1))
-def test_roll_outs_start_here_and_never_move_away(rho: float, phi: float, beta: float) -> None:
+def test_roll_outs_start_here_and_never_move_away(rho: float, phi: float, beta: float):
     polar = Polar(rho, phi, beta)
     rollouts = roll_out(polar, 2.0, 0.006)
     here = polar.pose().vector
@@ -50,7 +48,7 @@ def test_roll_outs_start_here_and_never_move_away(rho: float, phi: float, beta: 
     assert (rollouts.lengths >= rho - distance[:, -1] - 1e-9).all()
 
 
-def test_a_law_parks_an_easy_start_and_lowers_its_own_function() -> None:
+def test_a_law_parks_an_easy_start_and_lowers_its_own_function():
     rollouts = roll_out(polar_of(Pose2(-1.5, 0.4, -0.2)), 2.0, 0.006)
     assert rollouts.parked[0]
     assert rollouts.lengths[0] == pytest.approx(math.hypot(1.5, 0.4), rel=0.1)

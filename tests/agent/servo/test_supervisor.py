@@ -1,7 +1,5 @@
 """The servo in closed loop on a true unicycle: parks, never blind, no Zeno, touches nothing."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Any
@@ -22,7 +20,7 @@ NOTHING = np.zeros((0, 2))
 @pytest.mark.slow
 def test_parks_from_random_starts_in_view_and_without_endless_switching(
     robot: RobotDescription, simulate: Callable[..., Any], draw: Draw
-) -> None:
+):
     draw_points, draw_start = draw
     parked, trials, servo = 0, 25, Servo(robot)
     laws: set[int | None] = set()
@@ -38,7 +36,7 @@ def test_parks_from_random_starts_in_view_and_without_endless_switching(
     assert len(laws - {None}) >= 2  # the paper's laws do drive
 
 
-def test_six_landmarks_close_together_still_do(robot: RobotDescription, simulate: Callable[..., Any]) -> None:
+def test_six_landmarks_close_together_still_do(robot: RobotDescription, simulate: Callable[..., Any]):
     rng = np.random.default_rng(3)
     points = rng.uniform([2.0, -0.4, 0.1], [3.0, 0.4, 0.5], (6, 3))
     run = simulate(Servo(robot), Pose2(-0.9, 0.5, -0.2), points, rng)
@@ -46,7 +44,7 @@ def test_six_landmarks_close_together_still_do(robot: RobotDescription, simulate
     assert run.least_visible >= 4
 
 
-def test_is_deterministic(robot: RobotDescription, simulate: Callable[..., Any]) -> None:
+def test_is_deterministic(robot: RobotDescription, simulate: Callable[..., Any]):
     runs = [
         simulate(Servo(robot), Pose2(-1.0, 0.7, -0.3), WALL_OF_POINTS, np.random.default_rng(4))
         for _ in range(2)
@@ -55,9 +53,7 @@ def test_is_deterministic(robot: RobotDescription, simulate: Callable[..., Any])
 
 
 @pytest.mark.parametrize("side", [-1.0, 1.0])
-def test_a_wall_behind_is_not_touched(
-    robot: RobotDescription, simulate: Callable[..., Any], side: float
-) -> None:
+def test_a_wall_behind_is_not_touched(robot: RobotDescription, simulate: Callable[..., Any], side: float):
     # Beside the goal and level with it: without the wall the way leads well back.
     wall = np.column_stack([np.full(61, -0.6), np.linspace(-1.5, 1.5, 61)])
     start = Pose2(-0.1, 0.35 * side, 0.0)
@@ -68,7 +64,7 @@ def test_a_wall_behind_is_not_touched(
     assert run.parked
 
 
-def test_a_post_in_the_way_is_not_touched(robot: RobotDescription, simulate: Callable[..., Any]) -> None:
+def test_a_post_in_the_way_is_not_touched(robot: RobotDescription, simulate: Callable[..., Any]):
     points = np.array([[x, y, 0.3] for x in (3.0, 4.0) for y in np.linspace(-2.0, 2.0, 9)])
     angles = np.linspace(0, 2 * math.pi, 24)
     post = np.column_stack([-0.9 + 0.08 * np.cos(angles), 0.02 + 0.08 * np.sin(angles)])
@@ -79,9 +75,7 @@ def test_a_post_in_the_way_is_not_touched(robot: RobotDescription, simulate: Cal
     assert run.parked
 
 
-def test_a_walled_in_robot_reports_that_it_is_stuck(
-    robot: RobotDescription, simulate: Callable[..., Any]
-) -> None:
+def test_a_walled_in_robot_reports_that_it_is_stuck(robot: RobotDescription, simulate: Callable[..., Any]):
     angles = np.linspace(0, 2 * math.pi, 80)
     ring = np.column_stack([-1.6 + 0.35 * np.cos(angles), 0.35 * np.sin(angles)])
     rng = np.random.default_rng(7)
@@ -91,7 +85,7 @@ def test_a_walled_in_robot_reports_that_it_is_stuck(
     assert run.least_distance >= robot.radius
 
 
-def test_starts_parked(robot: RobotDescription, simulate: Callable[..., Any]) -> None:
+def test_starts_parked(robot: RobotDescription, simulate: Callable[..., Any]):
     run = simulate(Servo(robot), Pose2(0.001, 0.0, 0.0), WALL_OF_POINTS, np.random.default_rng(8), sigma=0.0)
     assert run.parked
     assert len(run.steps) == 3
@@ -101,7 +95,7 @@ def test_starts_parked(robot: RobotDescription, simulate: Callable[..., Any]) ->
 @pytest.mark.parametrize("aside", [-0.007, 0.0055])
 def test_it_comes_nearer_to_the_goal_at_which_it_has_arrived(
     robot: RobotDescription, integrate: Callable[..., list[Pose2]], aside: float
-) -> None:
+):
     """It has arrived by an estimate that was off, hears where it is, and drives the rest."""
     servo, tracked, pose = Servo(robot), np.ones(len(WALL_OF_POINTS), dtype=bool), Pose2(0.0, aside, 0.0)
     servo.start(Pose2(), WALL_OF_POINTS)
@@ -118,7 +112,7 @@ def test_it_comes_nearer_to_the_goal_at_which_it_has_arrived(
     assert pose.distance(Pose2()) <= DEAD_ZONE
 
 
-def test_it_stays_where_it_has_arrived_without_a_way_nearer(robot: RobotDescription) -> None:
+def test_it_stays_where_it_has_arrived_without_a_way_nearer(robot: RobotDescription):
     servo, tracked = Servo(robot), np.ones(len(WALL_OF_POINTS), dtype=bool)
     angles = np.linspace(0, 2 * math.pi, 63)
     ring = robot.radius * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -130,7 +124,7 @@ def test_it_stays_where_it_has_arrived_without_a_way_nearer(robot: RobotDescript
         assert servo.command(pose, WALL_OF_POINTS, tracked, obstacles).state == "arrived"
 
 
-def test_landmarks_that_are_not_tracked_are_not_counted_on(robot: RobotDescription) -> None:
+def test_landmarks_that_are_not_tracked_are_not_counted_on(robot: RobotDescription):
     visibility, pose = Visibility(robot.camera), Pose2(-1.0, 0.0, 0.0)
     tracked = np.zeros(len(WALL_OF_POINTS), dtype=bool)
     tracked[:5] = True
@@ -142,7 +136,7 @@ def test_landmarks_that_are_not_tracked_are_not_counted_on(robot: RobotDescripti
     assert counts[-1] == 5
 
 
-def test_without_enough_landmarks_in_view_it_turns_back_or_backs_off(robot: RobotDescription) -> None:
+def test_without_enough_landmarks_in_view_it_turns_back_or_backs_off(robot: RobotDescription):
     servo = Servo(robot)
     aside = Pose2(-1.0, 0.0, 0.8)
     servo.start(aside, WALL_OF_POINTS)
@@ -160,7 +154,7 @@ def test_without_enough_landmarks_in_view_it_turns_back_or_backs_off(robot: Robo
     assert step.command.forward == 0.0
 
 
-def test_landmarks_without_depth_are_ignored(robot: RobotDescription) -> None:
+def test_landmarks_without_depth_are_ignored(robot: RobotDescription):
     points = np.concatenate([WALL_OF_POINTS, np.full((4, 3), np.nan)])
     servo = Servo(robot)
     assert servo.start(Pose2(-1.0, 0.2, 0.0), points)
@@ -170,9 +164,7 @@ def test_landmarks_without_depth_are_ignored(robot: RobotDescription) -> None:
 
 
 @pytest.mark.slow
-def test_a_long_search_is_made_at_rest(
-    robot: RobotDescription, simulate: Callable[..., Any], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_search_is_made_at_rest(robot: RobotDescription, simulate: Callable[..., Any], monkeypatch):
     import mapweave.agent.servo.supervisor as module
 
     searched: list[int] = []

@@ -1,7 +1,5 @@
 """Tracks of one node's landmarks: where they are followed to, and which are given up."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Patches found again, against brute force, finite differences and warps that are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

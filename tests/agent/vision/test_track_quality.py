@@ -1,7 +1,5 @@
 """The report of the tracks against counts by hand."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tracks against images whose motion is known."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

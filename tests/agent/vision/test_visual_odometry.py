@@ -1,7 +1,5 @@
 """Turn and way by two images, against images of a wall that are warped by the exact homography."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -27,7 +25,7 @@ def moved(image: np.ndarray, turn: float, way: float) -> np.ndarray:
 
 @pytest.mark.parametrize("width", [320, 160])
 @pytest.mark.parametrize(("turn", "way"), [(0.06, 0.0), (-0.04, 0.0), (0.0, 0.06), (0.03, -0.05)])
-def test_motion_is_that_of_the_wall_also_by_reduced_images(width: int, turn: float, way: float) -> None:
+def test_motion_is_that_of_the_wall_also_by_reduced_images(width: int, turn: float, way: float):
     noise = np.random.default_rng(3).uniform(0.0, 255.0, (240, 320))
     blurred = cv2.GaussianBlur(noise, (0, 0), 3.0)
     first = cv2.normalize(blurred, None, 0, 255, cv2.NORM_MINMAX).astype(np.uint8)
