@@ -1,7 +1,5 @@
 """The command line as tests use it: messages of failing commands, and the list of commands."""
 
-from __future__ import annotations
-
 import argparse
 
 import pytest

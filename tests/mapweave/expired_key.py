@@ -1,7 +1,5 @@
 """A robot's key file whose certificate has expired."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
 from pathlib import Path

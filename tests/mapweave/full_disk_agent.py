@@ -5,8 +5,6 @@
 Prints what was seen as JSON.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import signal

@@ -1,7 +1,5 @@
 """A simulated robot in real time as a Koala is wired: a serial line, and a camera that streams over HTTP."""
 
-from __future__ import annotations
-
 import threading
 import time
 from pathlib import Path

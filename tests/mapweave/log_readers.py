@@ -1,7 +1,5 @@
 """Readers of the logs that agents, replays and trials write for Foxglove and for Rerun."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

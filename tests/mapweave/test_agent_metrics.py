@@ -1,7 +1,5 @@
 """What Prometheus scrapes from a running agent: against what its robot sensed, and what its page lists."""
 
-from __future__ import annotations
-
 import http.client
 import re
 import socket
@@ -59,7 +57,7 @@ def step(fault: SensorFault | None = None) -> TickResult:
     return TickResult(Command(), (), (), STATUS, fault)
 
 
-def test_ticks_and_faults_are_counted() -> None:
+def test_ticks_and_faults_are_counted():
     metrics = AgentMetrics("r0")
     camera = SensorFault("camera", "it is dark")
     for busy, fault in ((0.0, None), (0.01, camera), (0.03, camera), (3.0, None), (0.1, camera)):
@@ -75,7 +73,7 @@ def test_ticks_and_faults_are_counted() -> None:
     assert Scrape(metrics.scrape())("sensor_faulty", "camera") == 0
 
 
-def test_the_page_lists_every_metric() -> None:
+def test_the_page_lists_every_metric():
     metrics = AgentMetrics("r0")
     status = AgentStatus(STATUS, 1, "r0", 1, linked=True, placed=2, battery=0.4, skipped=7, traffic=900)
     replication = ReplicationStatus(9, 5, 4, 1, "the disk is full")
@@ -155,7 +153,7 @@ def answers(port: int) -> bool:
         return False
 
 
-def test_a_running_agent_is_scraped_and_waits_for_no_one(tmp_path: Path) -> None:
+def test_a_running_agent_is_scraped_and_waits_for_no_one(tmp_path):
     port = free_port()
     with running(tmp_path, port) as robot:
         eventually(lambda: answers(port))
@@ -187,7 +185,7 @@ def test_a_running_agent_is_scraped_and_waits_for_no_one(tmp_path: Path) -> None
         ({"Sec-Fetch-Site": "cross-site", "Sec-Fetch-Dest": "image"}, 403),
     ],
 )
-def test_pages_of_other_sites_are_refused(headers: dict[str, str], status: int) -> None:
+def test_pages_of_other_sites_are_refused(headers: dict[str, str], status: int):
     """Also one whose name an attacker points at this machine (DNS rebinding)."""
     close = AgentMetrics("r0").serve(port := free_port())
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=20)
@@ -201,7 +199,7 @@ def test_pages_of_other_sites_are_refused(headers: dict[str, str], status: int) 
         close()
 
 
-def test_a_port_that_cannot_be_had(port: int) -> None:
+def test_a_port_that_cannot_be_had(port: int):
     with pytest.raises(NotConnected, match=rf"127.0.0.1:{port} .*in use\); choose another port$"):
         AgentMetrics("r0").serve(port)
     for wrong in (0, -1, 70_000):

@@ -1,7 +1,5 @@
 """What an agent says while it runs."""
 
-from __future__ import annotations
-
 import io
 
 from rich.console import Console
@@ -13,7 +11,7 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent_progress import A_SECOND, BURST, AgentProgress
 
 
-def test_a_robot_that_changes_its_mind_each_tick_does_not_fill_the_log() -> None:
+def test_a_robot_that_changes_its_mind_each_tick_does_not_fill_the_log():
     """A camera that flickers gave ten lines a second."""
     output, now = io.StringIO(), 0.0
     show = AgentProgress(Console(file=output, width=200), "r0", None, lambda: now)
@@ -35,7 +33,7 @@ def test_a_robot_that_changes_its_mind_each_tick_does_not_fill_the_log() -> None
     assert "r0: lost (0 nodes)" in output.getvalue().splitlines()[-1], "what it does in the end is said"
 
 
-def test_one_node_is_no_nodes() -> None:
+def test_one_node_is_no_nodes():
     output = io.StringIO()
     show = AgentProgress(Console(file=output, width=200), "r0", None, lambda: 0.0)
     status = Status("mapping", "", 1, 0, Pose2(), False)

@@ -1,7 +1,5 @@
 """Typed methods for annotations say the same as the fields of the wire, and words are nodes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -31,7 +29,7 @@ def last(record: OfflineRecord) -> Annotation:
     return record.annotations().made[-1]
 
 
-def test_each_kind_has_a_method(record: OfflineRecord) -> None:
+def test_each_kind_has_a_method(record: OfflineRecord):
     record.place("kitchen", THIRD, because="the sink")
     assert last(record).body == Place(THIRD) and last(record).because == "the sink"
     record.place("hall", corners=[(0, 0), (1, 0), (1, 1)], near="kitchen")
@@ -61,7 +59,7 @@ def test_each_kind_has_a_method(record: OfflineRecord) -> None:
     assert record.plans().plan("flat").part().rms < 1e-6
 
 
-def test_a_check_keeps_nothing_and_a_field_that_there_is_not_is_found(record: OfflineRecord) -> None:
+def test_a_check_keeps_nothing_and_a_field_that_there_is_not_is_found(record: OfflineRecord):
     """The type checker finds it, too: an ignored error that there is not would be one."""
     assert record.place("kitchen", THIRD, check=True).startswith("only checked, nothing is changed: place")
     with pytest.raises(TypeError, match="nodee"):
@@ -71,7 +69,7 @@ def test_a_check_keeps_nothing_and_a_field_that_there_is_not_is_found(record: Of
     assert record.annotations().made == ()
 
 
-def test_words_are_nodes_and_what_is_none_is_refused(joined: Path, record: OfflineRecord) -> None:
+def test_words_are_nodes_and_what_is_none_is_refused(joined: Path, record: OfflineRecord):
     room = mapweave.open(joined)
     for one in (room, record):
         assert one.resolve("r1.1.3").found[0].node == THIRD
@@ -82,7 +80,7 @@ def test_words_are_nodes_and_what_is_none_is_refused(joined: Path, record: Offli
             one.resolve(3)  # type: ignore[arg-type]
 
 
-def test_a_position_is_two_numbers_wherever_a_node_stands(joined: Path, record: OfflineRecord) -> None:
+def test_a_position_is_two_numbers_wherever_a_node_stands(joined: Path, record: OfflineRecord):
     """Only text was taken: `(1.0, 2.0)` was asked for as the word "(1.0, 2.0)", or refused."""
     room = mapweave.open(joined)
     at = room.pose(THIRD).mean
@@ -119,7 +117,7 @@ def test_a_position_is_two_numbers_wherever_a_node_stands(joined: Path, record: 
         room.node((500.0, 2.0))
 
 
-def test_a_refusal_says_what_this_annotation_takes(record: OfflineRecord) -> None:
+def test_a_refusal_says_what_this_annotation_takes(record: OfflineRecord):
     """A place was said to be an edge, a closure a node, and a time that is read as UTC local time."""
     edge = (FIRST, THIRD)
     with pytest.raises(Refused, match=r"^a place is a node or an area: give one of them$"):

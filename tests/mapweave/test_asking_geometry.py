@@ -52,7 +52,7 @@ def asked(geometry: DriveGeometry) -> View:
     return listener.views[0]
 
 
-def test_a_robot_that_declares_where_its_camera_looks_asks_with_a_level_view() -> None:
+def test_a_robot_that_declares_where_its_camera_looks_asks_with_a_level_view():
     pitch = math.radians(-0.5)
     level, plain = asked(DriveGeometry(pitch=pitch)), asked(DriveGeometry())
     assert plain.camera == CAMERA

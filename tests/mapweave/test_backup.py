@@ -1,7 +1,5 @@
 """`mapweave map backup`: copies of stores and journals whose processes run on."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import threading
@@ -106,7 +104,7 @@ def status(bus: ZenohBus) -> Mapping[str, Scalar]:
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_running_servers_store_is_backed_up_and_a_server_on_it_is_completed(tmp_path: Path) -> None:
+def test_a_running_servers_store_is_backed_up_and_a_server_on_it_is_completed(tmp_path):
     """The drill of docs/fleet-server.md, with processes that are real and robots that never pause."""
     endpoint, backup = f"tcp/127.0.0.1:{free_port()}", tmp_path / "backup" / "monday.sqlite"
     backup.parent.mkdir()
@@ -179,9 +177,7 @@ def test_a_running_servers_store_is_backed_up_and_a_server_on_it_is_completed(tm
         one.close()
 
 
-def test_a_backup_has_decisions_and_is_a_store_like_the_first(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_backup_has_decisions_and_is_a_store_like_the_first(tmp_path, capfd):
     path, out = annotated_store(tmp_path / "s0.sqlite", LOGS), tmp_path / "copy.sqlite"
     plans = tmp_path / "s0.sqlite.plans"
     plans.mkdir()
@@ -198,7 +194,7 @@ def test_a_backup_has_decisions_and_is_a_store_like_the_first(
     assert kept_images(out, Annotations(content.annotations)) == {}
 
 
-def test_what_cannot_be_backed_up_is_one_line(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_cannot_be_backed_up_is_one_line(tmp_path, capfd):
     path, out = annotated_store(tmp_path / "s0.sqlite", LOGS), tmp_path / "copy"
     assert main(["map", "backup", str(path), "-o", str(out)]) == 0
     capfd.readouterr()

@@ -1,7 +1,5 @@
 """`mapweave calibrate camera`: images, a video or a live camera become settings that an agent reads."""
 
-from __future__ import annotations
-
 import json
 import urllib.request
 from collections.abc import Iterator
@@ -70,7 +68,7 @@ def folder_of(images: list[np.ndarray], path: Path) -> Path:
 
 
 @pytest.mark.parametrize(("name", "true"), first_quick([("fisheye", FISHEYE), ("pinhole", PINHOLE)], 1))
-def test_images_become_settings_that_an_agent_reads(name, true, frames, capfd, tmp_path: Path) -> None:
+def test_images_become_settings_that_an_agent_reads(name, true, frames, capfd, tmp_path):
     robot = tmp_path / "r0.toml"
     robot.write_text(
         '# a robot\n[robot]\ndriver = "koala"\n\n[robot.camera]\nsource = "2"  # front\n\n[agent]\n'
@@ -132,7 +130,7 @@ class EmulatedCamera:
 
 
 @pytest.mark.slow
-def test_a_person_is_guided_live_until_the_views_suffice(frames, monkeypatch, capfd, tmp_path: Path) -> None:
+def test_a_person_is_guided_live_until_the_views_suffice(frames, monkeypatch, capfd, tmp_path):
     camera = EmulatedCamera(frames["fisheye"] * 2)
     opened: list[str] = []
     monkeypatch.setattr(
@@ -151,8 +149,8 @@ def test_a_person_is_guided_live_until_the_views_suffice(frames, monkeypatch, ca
 
 @pytest.mark.parametrize("interrupted", [False, True])
 def test_a_stream_that_ends_early_is_refused_with_what_is_missing(
-    interrupted, frames, monkeypatch, capfd, tmp_path: Path
-) -> None:
+    interrupted, frames, monkeypatch, capfd, tmp_path
+):
     camera = EmulatedCamera(frames["pinhole"][:5], interrupted)
     monkeypatch.setattr(mapweave.agent.drivers.camera, "Capture", lambda settings: camera)
     robot = tmp_path / "r1.toml"
@@ -163,7 +161,7 @@ def test_a_stream_that_ends_early_is_refused_with_what_is_missing(
     assert not robot.exists()
 
 
-def test_the_page_shows_the_camera_and_the_guidance(frames) -> None:
+def test_the_page_shows_the_camera_and_the_guidance(frames):
     from mapweave.drawing.guidance_picture import guidance_picture
     from mapweave.scenarios.live import LiveFilm
     from mapweave.vision.calibration.collection import ViewCollection
@@ -183,7 +181,7 @@ def test_the_page_shows_the_camera_and_the_guidance(frames) -> None:
         assert page.latest()[0] == 1
 
 
-def test_a_video_is_read_where_the_board_is_still(frames, capfd, tmp_path: Path) -> None:
+def test_a_video_is_read_where_the_board_is_still(frames, capfd, tmp_path):
     path = str(tmp_path / "board.avi")
     writer = cv2.VideoWriter(path, cv2.VideoWriter_fourcc(*"FFV1"), 10.0, SIZE)
     for image in frames["pinhole"][:12]:
@@ -196,7 +194,7 @@ def test_a_video_is_read_where_the_board_is_still(frames, capfd, tmp_path: Path)
     assert report["fx"] == pytest.approx(280.0, rel=0.05)
 
 
-def test_the_target_is_written(capfd, tmp_path: Path) -> None:
+def test_the_target_is_written(capfd, tmp_path):
     out = tmp_path / "board.pdf"
     assert main(["calibrate", "target", "--paper", "letter", "--out", str(out)]) == 0
     assert out.read_bytes() == target_pdf(CalibrationTarget(), "letter")
@@ -206,7 +204,7 @@ def test_the_target_is_written(capfd, tmp_path: Path) -> None:
     assert read_page(out.read_bytes()).rectangles[0, 2] == pytest.approx(20.0)
 
 
-def test_the_result_is_shown_where_it_is_not_written(frames, capfd, tmp_path: Path) -> None:
+def test_the_result_is_shown_where_it_is_not_written(frames, capfd, tmp_path):
     """A person has shown the target for ten minutes: what was measured is not lost."""
     images = folder_of(frames["pinhole"], tmp_path / "views")
     assert main(["calibrate", "camera", str(images), *OPTIONS]) == 0
@@ -228,7 +226,7 @@ def test_the_result_is_shown_where_it_is_not_written(frames, capfd, tmp_path: Pa
     assert "nothing is changed" in line
 
 
-def test_images_that_do_not_suffice_or_fit_are_named(frames, capfd, tmp_path: Path) -> None:
+def test_images_that_do_not_suffice_or_fit_are_named(frames, capfd, tmp_path):
     one = folder_of(frames["pinhole"][:1], tmp_path / "one")
     assert "1 view of the target; three are" in complaint(
         capfd, "calibrate", "camera", one, *OPTIONS, status=NO
@@ -239,7 +237,7 @@ def test_images_that_do_not_suffice_or_fit_are_named(frames, capfd, tmp_path: Pa
     assert "different sizes: 320x240, 640x480; 003.png is 640x480" in said
 
 
-def test_mistakes_are_one_line(frames, capfd, tmp_path: Path) -> None:
+def test_mistakes_are_one_line(frames, capfd, tmp_path):
     blank = folder_of([np.full((240, 320), 99, np.uint8)] * 2, tmp_path / "blank")
     robot = tmp_path / "r0.toml"
     assert "no view shows the target (charuco 7x10" in complaint(

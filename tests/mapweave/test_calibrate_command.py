@@ -1,7 +1,5 @@
 """`mapweave calibrate drive` on rendered drives; `replay` takes what it has written."""
 
-from __future__ import annotations
-
 import io
 import json
 import re
@@ -64,9 +62,7 @@ def calibrated(capfd: pytest.CaptureFixture[str], *arguments: object) -> dict[st
 
 
 @pytest.mark.slow
-def test_a_narrow_terminal_cuts_no_number(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_narrow_terminal_cuts_no_number(recording: Path, tmp_path, monkeypatch):
     """On 40 columns a delay of -0.018 s was `-0.0…`."""
     file = io.StringIO()
     console = Console(file=file, force_terminal=True, width=40, color_system=None)
@@ -79,9 +75,7 @@ def test_a_narrow_terminal_cuts_no_number(
 
 
 @pytest.mark.slow
-def test_a_drive_is_calibrated_under_the_robots_name(
-    recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_drive_is_calibrated_under_the_robots_name(recording: Path, tmp_path, capfd):
     figures = calibrated(capfd, recording, "--calibration", tmp_path)
     parameters = figures["parameters"]
     assert set(parameters) == {p.name.lower() for p in Parameter}
@@ -104,9 +98,7 @@ def test_a_drive_is_calibrated_under_the_robots_name(
 
 
 @pytest.mark.slow
-def test_a_robot_is_watched_while_it_is_driven(
-    recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_robot_is_watched_while_it_is_driven(recording: Path, tmp_path, capfd):
     driver = tmp_path / "own.py"
     driver.write_text(OWN_ROBOT.format(folder=str(recording)))
     robot = f"{driver}:Recorded"
@@ -122,8 +114,8 @@ def test_a_robot_is_watched_while_it_is_driven(
 
 @pytest.mark.slow
 def test_an_estimate_that_predicts_worse_is_not_written_and_the_exit_status_says_so(
-    recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    recording: Path, tmp_path, capfd, monkeypatch
+):
     def worse(*arguments: Any) -> recorded_drive.DriveCalibration:
         found = calibrate(*arguments)
         return replace(found, estimated_px=found.declared_px + 1.0)
@@ -137,7 +129,7 @@ def test_an_estimate_that_predicts_worse_is_not_written_and_the_exit_status_says
 
 
 @pytest.mark.slow
-def test_bad_input_is_one_line(folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_bad_input_is_one_line(folder: Path, tmp_path, capfd):
     command = ["calibrate", "drive", folder, "--calibration", tmp_path]
     assert "--robot DRIVER" in complaint(capfd, "calibrate", "drive", status=USAGE)
     assert "--name" in complaint(capfd, "calibrate", "drive", "--robot", "koala", status=USAGE)
@@ -154,9 +146,7 @@ def test_bad_input_is_one_line(folder: Path, tmp_path: Path, capfd: pytest.Captu
 
 
 @pytest.mark.slow
-def test_turns_of_the_other_sign_are_named_and_nothing_is_written(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_turns_of_the_other_sign_are_named_and_nothing_is_written(folder: Path, tmp_path, capfd):
     """A pitch of 180 degrees was written with status 0, with which no agent starts."""
     header, *lines = (folder / "odometry.csv").read_text().splitlines()
     rows = [list(map(float, line.split(","))) for line in lines]
@@ -172,9 +162,7 @@ def test_turns_of_the_other_sign_are_named_and_nothing_is_written(
     assert not list(tmp_path.glob("*.toml"))
 
 
-def test_a_geometry_that_cannot_be_read_again_is_not_written(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_geometry_that_cannot_be_read_again_is_not_written(tmp_path, monkeypatch, capfd):
     monkeypatch.chdir(tmp_path)
     live = LIVE.replace('Path("closed")', f"Path({str(tmp_path / 'closed')!r})")
     Path("live.py").write_text(f"SILENT = False\n{live}")
@@ -223,8 +211,8 @@ class Live:
 
 @pytest.mark.parametrize("silent", [True, False])
 def test_a_robot_that_fails_while_it_is_calibrated_is_closed_and_named(
-    silent: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+    silent: bool, tmp_path, monkeypatch, capfd
+):
     """A camera left open ended the process with a signal; a silent base counted as one that stands."""
     monkeypatch.chdir(tmp_path)
     Path("live.py").write_text(f"SILENT = {silent}\n{LIVE}")
@@ -239,8 +227,8 @@ def test_a_robot_that_fails_while_it_is_calibrated_is_closed_and_named(
 
 @pytest.mark.parametrize("silent", [True, False])
 def test_ctrl_c_before_the_drive_suffices_is_an_interruption_and_no_answer(
-    silent: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+    silent: bool, tmp_path, monkeypatch, capfd
+):
     monkeypatch.chdir(tmp_path)
     # It is closed by a thread, which may be later than this test.
     live = LIVE.replace('Path("closed")', f"Path({str(tmp_path / 'closed')!r})")

@@ -1,7 +1,5 @@
 """The command line: help for everything, and one line on stderr for each error."""
 
-from __future__ import annotations
-
 import json
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The command line and files: one line on stderr for each error."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

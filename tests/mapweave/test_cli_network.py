@@ -1,7 +1,5 @@
 """The command line and the network: one line on stderr without a server, or with another program."""
 
-from __future__ import annotations
-
 import errno
 import os
 import pty

@@ -1,12 +1,8 @@
 """`mapweave close` and `reopen` of a map file: which entry of the record is meant."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
-
-import pytest
 
 from mapweave.cli import main
 from mapweave.exit_status import NO
@@ -29,7 +25,7 @@ def closed(path: Path) -> int:
     return len(Annotations(read_map_file(path).annotations).in_force(Closure))
 
 
-def test_a_second_way_of_a_long_named_robot_reopens_no_first(tmp_path: Path) -> None:
+def test_a_second_way_of_a_long_named_robot_reopens_no_first(tmp_path):
     """Names of two nodes were cut to the 64 characters of a name, and were one."""
     robot = "a-robot-with-a-very-long-name-32"
     path = map_of(robot, tmp_path)
@@ -42,7 +38,7 @@ def test_a_second_way_of_a_long_named_robot_reopens_no_first(tmp_path: Path) -> 
     assert closed(path) == 1
 
 
-def test_a_way_is_open_when_it_was_reopened_whichever_end_was_named_first(tmp_path: Path) -> None:
+def test_a_way_is_open_when_it_was_reopened_whichever_end_was_named_first(tmp_path):
     path, ends = map_of("r0", tmp_path), ["r0.1.1", "r0.1.3"]
     for there in (ends, ends[::-1]):
         assert main(["close", *there, "--map", str(path)]) == 0
@@ -54,9 +50,7 @@ def test_a_way_is_open_when_it_was_reopened_whichever_end_was_named_first(tmp_pa
     assert closed(path) == 0
 
 
-def test_what_a_retirement_leaves_without_effect_is_named(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_retirement_leaves_without_effect_is_named(tmp_path, capfd):
     """Closures were listed as closed, and no longer held."""
     path = map_of("r0", tmp_path)
     at = ["--map", str(path)]
@@ -79,9 +73,7 @@ def test_what_a_retirement_leaves_without_effect_is_named(
     assert "without effect" not in capfd.readouterr().out
 
 
-def test_what_a_person_says_is_said_again_for_a_script(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_what_a_person_says_is_said_again_for_a_script(tmp_path, capfd):
     at = ["--map", str(map_of("r0", tmp_path)), "--json"]
 
     def said(*words: str) -> dict[str, Any]:
@@ -103,9 +95,7 @@ def test_what_a_person_says_is_said_again_for_a_script(
     assert capfd.readouterr().out.startswith("floor r0.1 is on floor ground")
 
 
-def test_links_between_floors_are_named_only_where_there_are_two(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_links_between_floors_are_named_only_where_there_are_two(tmp_path, capfd):
     """With one label in all, it was said that links between floors fall."""
     store = write_store(tmp_path / "s0.sqlite", looked_around([MapId("r0", 1), MapId("r1", 1)], seed=8))
     path = tmp_path / "a.mapweave"

@@ -1,7 +1,5 @@
 """Robots are commanded from the shell: real processes, of which some are killed."""
 
-from __future__ import annotations
-
 import io
 import json
 import socket
@@ -46,9 +44,7 @@ FLEET = "kept"
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_killed(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_killed(tmp_path, capfd):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     network = ["--fleet", FLEET, "--connect", endpoint]
     bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
@@ -139,9 +135,7 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
         bus.close()
 
 
-def test_a_stop_that_has_not_reached_its_robot_is_no_success(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stop_that_has_not_reached_its_robot_is_no_success(capsys, monkeypatch):
     order = MissionOrder.new("r0", MissionKind.STOP, "anna")
     states = iter((MissionState.SENT, MissionState.DONE))
     person = SimpleNamespace(stop=lambda robot, because: (MissionReport(order, next(states)),))
@@ -173,16 +167,14 @@ GO_ON = ["agent", "replay", "doctor", "sim serve"]
 """Those that also look for one, and do without it."""
 
 
-def test_the_commands_that_look_for_a_server_are_known() -> None:
+def test_the_commands_that_look_for_a_server_are_known():
     found = [words for words, parser in parsers().items() if "--connect ENDPOINT" in parser.format_help()]
     assert sorted(found) == sorted([*ASKING, *GO_ON])
 
 
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize("words", ASKING)
-def test_without_a_router_one_line_says_so_and_what_to_do(
-    words: str, recording: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_without_a_router_one_line_says_so_and_what_to_do(words: str, recording: Path, capfd, monkeypatch):
     """Within the time for that, and no other: whatever listens there accepts, and says nothing."""
     monkeypatch.chdir(recording.parent)
     monkeypatch.setattr("mapweave.connection.SOON", 0.1)
@@ -213,16 +205,14 @@ def timed(words: str, *arguments: str, folder: Path) -> tuple[float, int, str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", ASKING)
-def test_every_command_says_within_2_s_that_there_is_no_router(
-    words: str, recording: Path, closed: str
-) -> None:
+def test_every_command_says_within_2_s_that_there_is_no_router(words: str, recording: Path, closed: str):
     took, status, err = timed(words, "--connect", closed, folder=recording.parent)
     assert status == FAILED and "no router at" in err, err
     assert took <= 2.0
 
 
 @pytest.mark.slow
-def test_a_command_says_within_2_s_that_there_is_no_server(recording: Path) -> None:
+def test_a_command_says_within_2_s_that_there_is_no_server(recording: Path):
     """A router is up."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with closing(ZenohBus(BusSettings(mode="router", listen=(endpoint,)))):
@@ -234,9 +224,7 @@ def test_a_command_says_within_2_s_that_there_is_no_server(recording: Path) -> N
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("signals")
-def test_a_robot_that_falls_silent_is_named_to_who_waits_for_it(
-    capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_robot_that_falls_silent_is_named_to_who_waits_for_it(capfd, monkeypatch):
     """A robot takes its mission, reports, and is gone. Before, nothing was said until the time was over."""
     monkeypatch.setattr("mapweave.fleet.SILENT", 0.3)
     endpoint, keys = f"tcp/127.0.0.1:{free_port()}", Keys(FLEET)
@@ -271,7 +259,7 @@ def test_a_robot_that_falls_silent_is_named_to_who_waits_for_it(
     assert said.index("r0: exploring (0%)") < said.index(silent[0])
 
 
-def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
+def test_a_line_of_the_table_has_what_an_operator_asks_for():
     order = MissionOrder("a1", "r0", MissionKind.GO, 1, "anna", NodeId("r1", 1, 5), "kitchen")
     doing = Status("driving along the route", "0.4 m to node r1.1.5", 12, 40, Pose2(), False)
     status = AgentStatus(
@@ -298,7 +286,7 @@ def test_a_line_of_the_table_has_what_an_operator_asks_for() -> None:
         assert ("0.4 m to node r1.1.5" in line) is (width == 240)
 
 
-def test_a_trouble_that_a_narrow_terminal_cuts_is_below_the_table_as_a_whole() -> None:
+def test_a_trouble_that_a_narrow_terminal_cuts_is_below_the_table_as_a_whole():
     doing = AgentStatus(
         Status("driving along the route", "0.4 m to r1.1.5", 12, 40, Pose2(), False), 1, "r0", 1
     )
@@ -313,7 +301,7 @@ def test_a_trouble_that_a_narrow_terminal_cuts_is_below_the_table_as_a_whole() -
     assert lines == [f"r{k}: {over}" for k in range(10)] and more == "and 4 more with a trouble"
 
 
-def test_robots_are_listed_by_their_numbers() -> None:
+def test_robots_are_listed_by_their_numbers():
     names = ("anna", "r1", "r10", "r11", "r2", "r2b", "zed")
     status = FleetStatus(tuple(RobotEntry(name, True, apart="it is alone") for name in names))
     lines = Console(width=100, file=(printed := io.StringIO()))
@@ -338,9 +326,7 @@ def answer_with(monkeypatch: pytest.MonkeyPatch, found: list[FleetStatus | NotCo
 
 
 @pytest.mark.parametrize("terminal", [True, False])
-def test_watching_is_live_on_a_terminal_and_tables_elsewhere(
-    terminal: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_watching_is_live_on_a_terminal_and_tables_elsewhere(terminal: bool, monkeypatch, capsys):
     """Into a file it wrote nothing until it was interrupted."""
     apart = "3 links were found and all refused: [they contradict each other]"
     entry = RobotEntry(
@@ -363,9 +349,7 @@ def test_watching_is_live_on_a_terminal_and_tables_elsewhere(
     assert ("\x1b[" in printed) is terminal
 
 
-def test_watching_for_a_script_goes_on_while_no_server_answers(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_watching_for_a_script_goes_on_while_no_server_answers(monkeypatch, capsys):
     """With `--json` it ended when the server was started again; the table went on."""
     gone = NotConnected("no map server")
     found: list[FleetStatus | NotConnected] = [FleetStatus(), gone, gone, FleetStatus(), gone]
@@ -378,7 +362,7 @@ def test_watching_for_a_script_goes_on_while_no_server_answers(
     assert err.splitlines() == ["mapweave: no map server"] * 2 + ["mapweave: interrupted"]
 
 
-def test_a_router_that_is_gone_is_not_said_to_be_up() -> None:
+def test_a_router_that_is_gone_is_not_said_to_be_up():
     hub = MemoryHub()
     with closing(MemoryBus(hub)) as bus, Fleet(bus=bus) as fleet:
         for ask in (fleet.status, fleet.missions, fleet.annotations):
@@ -390,7 +374,7 @@ def test_a_router_that_is_gone_is_not_said_to_be_up() -> None:
                 ask()
 
 
-def test_a_terminal_of_80_columns_shows_every_column() -> None:
+def test_a_terminal_of_80_columns_shows_every_column():
     """Each was cut to three characters there: `ro… mission doing at no… batt… un… age last tro…`."""
     robots = []
     for name, trouble in (("r0", ""), ("r1", "no map server answered")):

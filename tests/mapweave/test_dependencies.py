@@ -1,7 +1,5 @@
 """What Mapweave is installed with: the list of it, as `make sbom` writes it, and what it must not be."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess
@@ -14,7 +12,7 @@ ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.slow
-def test_the_sbom_lists_every_pinned_package_and_is_the_same_each_time(tmp_path: Path) -> None:
+def test_the_sbom_lists_every_pinned_package_and_is_the_same_each_time(tmp_path):
     tools = Path(sys.prefix) / "audit"
     if shutil.which("make") is None or not (tools / ".installed").exists():
         pytest.skip("needs make, and what `make sbom` installs")
@@ -33,7 +31,7 @@ def test_the_sbom_lists_every_pinned_package_and_is_the_same_each_time(tmp_path:
 
 
 @pytest.mark.slow
-def test_ray_is_imported_without_a_grammar_of_addresses() -> None:
+def test_ray_is_imported_without_a_grammar_of_addresses():
     """It takes 1.6 s of 3; a node of a cluster that has no 15 s for its processes does not start."""
     pytest.importorskip("ray", reason="needs the extra `cluster`")
     code = "import ray, sys; print('rfc3987_syntax' in sys.modules)"

@@ -1,7 +1,5 @@
 """`mapweave doctor`: each thing that can be wrong is found, and named before what follows from it."""
 
-from __future__ import annotations
-
 import io
 import json
 import shlex
@@ -61,7 +59,7 @@ def doctor(capfd: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict
     "missing",
     [["cv2"], ["cv2", "msgpack", "msgspec", "networkx", "numpy", "rich", "rosbags", "serial", "zenoh"]],
 )
-def test_it_runs_without_libraries_and_names_them(missing: list[str], tmp_path: Path) -> None:
+def test_it_runs_without_libraries_and_names_them(missing: list[str], tmp_path):
     commands = [
         ["doctor", "--json", "--data", str(tmp_path), "--offline"],
         ["doctor", "--data", str(tmp_path), "--offline"],
@@ -81,7 +79,7 @@ def test_it_runs_without_libraries_and_names_them(missing: list[str], tmp_path: 
     )
 
 
-def test_an_extra_that_is_not_installed_comes_with_the_pip_of_this_environment(monkeypatch) -> None:
+def test_an_extra_that_is_not_installed_comes_with_the_pip_of_this_environment(monkeypatch):
     """Where the environment is not activated a bare `pip` is another one, or none."""
     monkeypatch.setenv("PATH", "")
     monkeypatch.setattr(libraries, "find_spec", lambda module: None)
@@ -92,7 +90,7 @@ def test_an_extra_that_is_not_installed_comes_with_the_pip_of_this_environment(m
 # The computer
 
 
-def test_a_clock_before_the_installation_and_a_place_that_is_no_folder(tmp_path, monkeypatch) -> None:
+def test_a_clock_before_the_installation_and_a_place_that_is_no_folder(tmp_path, monkeypatch):
     monkeypatch.setattr(time, "time", lambda: 3600.0)
     (finding,) = machine.clock()
     assert finding.verdict is FindingLevel.WRONG and "1970" in finding.detail
@@ -101,7 +99,7 @@ def test_a_clock_before_the_installation_and_a_place_that_is_no_folder(tmp_path,
     assert finding.verdict is FindingLevel.WRONG and "--data" in finding.advice
 
 
-def test_a_full_or_slow_disk(tmp_path, monkeypatch) -> None:
+def test_a_full_or_slow_disk(tmp_path, monkeypatch):
     usage = machine.shutil.disk_usage(tmp_path)
     monkeypatch.setattr(machine.shutil, "disk_usage", lambda path: usage._replace(free=5_000_000))
     (finding,) = machine.disk(tmp_path)
@@ -128,7 +126,7 @@ CAMERA = Camera(640, 480, 610.0, 612.0, 322.0, 238.0, 0.25, 0.1)
         (CAMERA, (-1.2, 0.0, 0.0, 0.0, 0.0), "folds the image back"),
     ],
 )
-def test_a_calibration_that_cannot_be_right(declared, distortion, words) -> None:
+def test_a_calibration_that_cannot_be_right(declared, distortion, words):
     (finding,) = camera_model.examine(RobotDescription(declared, distortion))
     assert (
         finding.verdict is FindingLevel.WRONG
@@ -137,7 +135,7 @@ def test_a_calibration_that_cannot_be_right(declared, distortion, words) -> None
     )
 
 
-def test_distortion_folds_where_opencv_brings_two_points_to_one() -> None:
+def test_distortion_folds_where_opencv_brings_two_points_to_one():
     description = RobotDescription(CAMERA, (-1.2, 0.1, 0.0, 0.0, 0.0))
     radius = camera_model.folding_radius(description)
     rays = np.zeros((2000, 3))
@@ -214,7 +212,7 @@ def sketch(tmp_path: Path) -> Iterator[ArduinoSketch]:
 
 
 @pytest.mark.slow
-def test_a_robot_whose_camera_is_another_one(walls, sketch, tmp_path, capfd) -> None:
+def test_a_robot_whose_camera_is_another_one(walls, sketch, tmp_path, capfd):
     """All is well but that the camera does not see the drive; without --drive nothing moves."""
     sketch.distances = [200, 200, 200]
     still = film(tmp_path / "still.avi", walls, moves=False)
@@ -233,7 +231,7 @@ def test_a_robot_whose_camera_is_another_one(walls, sketch, tmp_path, capfd) -> 
     assert status == NO and first in ("image", "encoders")
 
 
-def test_a_robot_that_is_not_pushed_and_a_wrong_size(walls, sketch, tmp_path, capfd) -> None:
+def test_a_robot_that_is_not_pushed_and_a_wrong_size(walls, sketch, tmp_path, capfd):
     settings = robot_toml(tmp_path, film(tmp_path / "film.avi", walls), sketch.path, width=640)
     status, findings, first = doctor(capfd, "--settings", settings, "--offline", "--data", tmp_path)
     assert status == NO and first == "camera" and "320x240" in findings["camera"].detail
@@ -241,7 +239,7 @@ def test_a_robot_that_is_not_pushed_and_a_wrong_size(walls, sketch, tmp_path, ca
     assert sketch.wheels.way() == (0.0, 0.0)
 
 
-def test_a_dark_camera_and_a_port_that_is_not_there(walls, tmp_path, capfd) -> None:
+def test_a_dark_camera_and_a_port_that_is_not_there(walls, tmp_path, capfd):
     dark = film(tmp_path / "dark.avi", walls, lambda image: (image * 0.02).astype(np.uint8))
     settings = robot_toml(tmp_path, dark, tmp_path / "ttyUSB7")
     status, findings, first = doctor(capfd, "--settings", settings, "--offline", "--data", tmp_path)
@@ -250,7 +248,7 @@ def test_a_dark_camera_and_a_port_that_is_not_there(walls, tmp_path, capfd) -> N
     assert "mapweave find-port" in findings["driver"].advice
 
 
-def test_a_port_that_another_program_uses(walls, sketch, tmp_path, capfd) -> None:
+def test_a_port_that_another_program_uses(walls, sketch, tmp_path, capfd):
     settings = robot_toml(tmp_path, film(tmp_path / "film.avi", walls), sketch.path)
     port = SerialPort(str(sketch.path), 115200)
     _, findings, first = doctor(capfd, "--settings", settings, "--offline", "--data", tmp_path)
@@ -259,7 +257,7 @@ def test_a_port_that_another_program_uses(walls, sketch, tmp_path, capfd) -> Non
     assert "a running agent" in findings["driver"].advice
 
 
-def test_a_driver_with_few_images(walls) -> None:
+def test_a_driver_with_few_images(walls):
     image = walls.render(Pose2())
     seen = [
         Observation(k * 10**8, Odometry(0.0, 0.0), image if k % 4 == 0 else None, np.full(3, 1.0))
@@ -270,7 +268,7 @@ def test_a_driver_with_few_images(walls) -> None:
     assert finding.verdict is FindingLevel.WARNING and "5 with an image" in finding.detail
 
 
-def test_the_end_of_the_terminal_is_no_person(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_end_of_the_terminal_is_no_person(monkeypatch):
     def end(words: str) -> str:
         raise EOFError
 
@@ -278,7 +276,7 @@ def test_the_end_of_the_terminal_is_no_person(monkeypatch: pytest.MonkeyPatch) -
     assert not doctor_command._ask("Push the robot")
 
 
-def test_no_camera_and_wrong_settings(tmp_path, capfd) -> None:
+def test_no_camera_and_wrong_settings(tmp_path, capfd):
     settings = robot_toml(tmp_path, tmp_path / "none.avi", tmp_path / "none")
     _, findings, first = doctor(capfd, "--settings", settings, "--offline", "--data", tmp_path)
     assert first == "camera" and "find-cameras" in findings["camera"].advice
@@ -319,7 +317,7 @@ def push(walls: PhotoWalls) -> list:
          FindingLevel.SKIPPED, "too little to follow"),
     ],
 )  # fmt: skip
-def test_encoders_are_compared_with_the_image(push, spoil, verdict, words) -> None:
+def test_encoders_are_compared_with_the_image(push, spoil, verdict, words):
     comparison = MotionComparison(DESCRIPTION)
     for one in push:
         comparison.see(spoil(one, push[0]))
@@ -338,7 +336,7 @@ def router() -> Iterator[tuple[ZenohBus, str]]:
     bus.close()
 
 
-def test_servers(router: tuple[ZenohBus, str], tmp_path, capfd) -> None:
+def test_servers(router: tuple[ZenohBus, str], tmp_path, capfd):
     bus, endpoint = router
     asked = ("--connect", endpoint, "--fleet", "ours", "--data", tmp_path)
     status, findings, first = doctor(capfd, *asked)
@@ -364,7 +362,7 @@ def test_servers(router: tuple[ZenohBus, str], tmp_path, capfd) -> None:
     serving.close()
 
 
-def test_the_own_certificate_that_has_expired_is_named(tmp_path, capfd) -> None:
+def test_the_own_certificate_that_has_expired_is_named(tmp_path, capfd):
     path = expired_key(tmp_path / "keys")
     with socket.create_server(("127.0.0.1", 0)) as there:
         endpoint = f"tls/127.0.0.1:{there.getsockname()[1]}"
@@ -374,13 +372,13 @@ def test_the_own_certificate_that_has_expired_is_named(tmp_path, capfd) -> None:
     assert findings["server"].advice.startswith("`mapweave keys add r0 --role robot` at the server")
 
 
-def test_nothing_listens(tmp_path, capfd) -> None:
+def test_nothing_listens(tmp_path, capfd):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     status, findings, first = doctor(capfd, "--connect", endpoint, "--data", tmp_path)
     assert (status, first) == (NO, "server") and "refused" in findings["server"].detail
 
 
-def test_a_base_behind_the_network_has_no_serial_port(tmp_path, capfd, monkeypatch) -> None:
+def test_a_base_behind_the_network_has_no_serial_port(tmp_path, capfd, monkeypatch):
     """The advice was to look for its serial port."""
     monkeypatch.setattr(doctor_command, "REMOTE_PATIENCE", 0.2)
     where = ("--connect", f"tcp/127.0.0.1:{free_port()}", "--offline", "--data", tmp_path)
@@ -389,7 +387,7 @@ def test_a_base_behind_the_network_has_no_serial_port(tmp_path, capfd, monkeypat
     assert "router" in findings["driver"].advice and "find-port" not in findings["driver"].advice
 
 
-def test_a_table_names_the_first_thing_wrong(tmp_path, capfd) -> None:
+def test_a_table_names_the_first_thing_wrong(tmp_path, capfd):
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{closed.getsockname()[1]}"
@@ -400,7 +398,7 @@ def test_a_table_names_the_first_thing_wrong(tmp_path, capfd) -> None:
     assert capfd.readouterr().out.rstrip().endswith("nothing is wrong")
 
 
-def test_a_pipe_gets_a_line_for_each_check_without_padding(capfd) -> None:
+def test_a_pipe_gets_a_line_for_each_check_without_padding(capfd):
     """Each line had 274 characters, most of them spaces before an empty column."""
     found = [
         Finding("encoders", FindingLevel.SKIPPED, "not compared with the image", "mapweave doctor --drive"),
@@ -416,7 +414,7 @@ def test_a_pipe_gets_a_line_for_each_check_without_padding(capfd) -> None:
 
 
 @pytest.mark.parametrize("width", [40, 60])
-def test_a_narrow_terminal_cuts_no_word(width: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_narrow_terminal_cuts_no_word(width: int, monkeypatch):
     """On 40 columns the table had `observa` and `tions` on two lines, and `encode…`."""
     said = "22 observations, 10 a second, 3 proximity sensors of which one is distance-limited"
     findings = [

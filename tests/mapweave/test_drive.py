@@ -1,7 +1,5 @@
 """`mapweave drive` on a real pseudo-terminal, and by a device file, drives a real agent in the simulator."""
 
-from __future__ import annotations
-
 import os
 import pty
 import signal
@@ -9,7 +7,6 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -113,7 +110,7 @@ def still(control: SimControl) -> bool:
 @needs_simulator
 def test_a_robot_is_driven_by_keys_maps_and_stands_when_who_drives_is_killed(
     network: tuple[list[str], SimControl],
-) -> None:
+):
     arguments, control = network
     start = pose(control)
     person = Person("r0", *arguments)
@@ -154,8 +151,8 @@ def test_a_robot_is_driven_by_keys_maps_and_stands_when_who_drives_is_killed(
 @pytest.mark.slow
 @needs_simulator
 def test_a_robot_is_driven_by_a_gamepad_and_a_second_person_is_refused(
-    network: tuple[list[str], SimControl], tmp_path: Path
-) -> None:
+    network: tuple[list[str], SimControl], tmp_path
+):
     arguments, control = network
     device = tmp_path / "js0"
     os.mkfifo(device)
@@ -184,9 +181,7 @@ def test_a_robot_is_driven_by_a_gamepad_and_a_second_person_is_refused(
 
 @pytest.mark.slow
 @needs_simulator
-def test_who_is_not_there_is_named_in_one_line(
-    network: tuple[list[str], SimControl], tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_who_is_not_there_is_named_in_one_line(network: tuple[list[str], SimControl], tmp_path, capfd):
     arguments, _ = network
     person = Person("r7", *arguments)
     try:

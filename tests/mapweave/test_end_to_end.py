@@ -1,7 +1,5 @@
 """The whole system as processes over Zenoh: server with router, simulator, two agents. Nothing is faked."""
 
-from __future__ import annotations
-
 import json
 import time
 

@@ -1,7 +1,5 @@
 """Recognition on recordings: small ones are made here, of photographs, with known truth."""
 
-from __future__ import annotations
-
 import csv
 import json
 import math
@@ -107,7 +105,7 @@ def report(capfd: pytest.CaptureFixture[str], *arguments: object) -> dict:
     return json.loads(capfd.readouterr().out.strip().splitlines()[-1])
 
 
-def test_a_drive(drive: Path, capfd, tmp_path: Path) -> None:
+def test_a_drive(drive: Path, capfd, tmp_path):
     values = report(capfd, drive, "--out", tmp_path / "out")
     assert (values["queries"], values["expected"]) == (12, 9)
     assert values["nodes"] >= 1
@@ -123,7 +121,7 @@ def test_a_drive(drive: Path, capfd, tmp_path: Path) -> None:
     assert [row["certainty"] for row in rows[-3:]] == ["unknown"] * 3
 
 
-def test_a_map_that_is_there_is_asked(drive: Path, capfd, tmp_path: Path) -> None:
+def test_a_map_that_is_there_is_asked(drive: Path, capfd, tmp_path):
     """The journal of one robot, asked by the other."""
     arguments = ["replay", str(drive), "--robot", "a", "--offline", "--data", str(tmp_path), "--epoch", "1"]
     assert main(arguments) == 0
@@ -141,7 +139,7 @@ def test_a_map_that_is_there_is_asked(drive: Path, capfd, tmp_path: Path) -> Non
         pytest.param(seen_by_fisheye, FISHEYE_TOML, id="fisheye", marks=pytest.mark.slow),
     ],
 )
-def test_other_cameras_map_and_recognise_the_same_drive(see, camera_toml: str, capfd, tmp_path: Path) -> None:
+def test_other_cameras_map_and_recognise_the_same_drive(see, camera_toml: str, capfd, tmp_path):
     folder = recorded(tmp_path / "drive", see, camera_toml)
     values = report(capfd, folder)
     assert values["recall_at_1"] >= 0.8
@@ -162,7 +160,7 @@ def test_other_cameras_map_and_recognise_the_same_drive(see, camera_toml: str, c
 
 
 @pytest.mark.slow
-def test_a_drives_error_is_measured_against_its_truth(drive: Path, capfd, tmp_path: Path) -> None:
+def test_a_drives_error_is_measured_against_its_truth(drive: Path, capfd, tmp_path):
     """The asking robot's truth is moved by 7 m: so are all errors, and nothing is right any more."""
     folder = Path(shutil.copytree(drive, tmp_path / "moved"))
     rows = (folder / "truth.csv").read_text().splitlines()
@@ -181,7 +179,7 @@ def test_a_drives_error_is_measured_against_its_truth(drive: Path, capfd, tmp_pa
     assert values["found"] >= 7
 
 
-def test_photographs(walk: Path, capfd, tmp_path: Path) -> None:
+def test_photographs(walk: Path, capfd, tmp_path):
     values = report(capfd, walk, "--focal", 300, "--out", tmp_path / "out")
     assert (values["queries"], values["expected"], values["nodes"]) == (4, 3, 3)
     assert (values["recall_at_1"], values["precision"], values["unknown_share"]) == (1.0, 1.0, 0.25)
@@ -197,7 +195,7 @@ def test_photographs(walk: Path, capfd, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("step", [1, 5])
-def test_photographs_are_numbered_in_any_step(step: int, capfd, tmp_path: Path) -> None:
+def test_photographs_are_numbered_in_any_step(step: int, capfd, tmp_path):
     """A scene that two places in a row show is one place; if a place far from it shows it too, it is two."""
     (tmp_path / "images").mkdir()
     rng = np.random.default_rng(4)
@@ -220,7 +218,7 @@ def test_photographs_are_numbered_in_any_step(step: int, capfd, tmp_path: Path) 
     assert values["recall_within_2m"] == 0.75, "the one after the second is found"
 
 
-def test_figures_by_hand() -> None:
+def test_figures_by_hand():
     result, unknown, ambiguous = Certainty.FOUND, Certainty.UNKNOWN, Certainty.AMBIGUOUS
     verdicts = [
         JudgedAnswer("1", True, result, "a", True, True, error_m=0.2, error_deg=1.0, answer_ms=10.0),
@@ -250,7 +248,7 @@ def test_figures_by_hand() -> None:
     assert "error_frames_median" not in outcome
 
 
-def test_a_robot_asks_again_until_it_knows_or_has_driven_two_metres() -> None:
+def test_a_robot_asks_again_until_it_knows_or_has_driven_two_metres():
     """Answers every metre: found at 3 m, rightly, and at 6 m, wrongly; nothing is certain elsewhere."""
     node, here = NodeId("r0", 1, 1), PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
     place = Whereabouts(node, here, None, NO_COMPONENT, 30, 0.9)
@@ -269,7 +267,7 @@ def test_a_robot_asks_again_until_it_knows_or_has_driven_two_metres() -> None:
     }  # fmt: skip
 
 
-def test_evidence_bounds_chance() -> None:
+def test_evidence_bounds_chance():
     """Chernoff's bound is above the exact binomial tail, and not by much in its exponent."""
     for inliers, matches in ((12, 20), (20, 25), (30, 60)):
         k, n, p = inliers - 7, matches - 7, 4.0 / 384
@@ -288,7 +286,7 @@ def complaint(capfd: pytest.CaptureFixture[str], *arguments: object) -> str:
     return output[0]
 
 
-def test_folders_that_are_none(walk: Path, capfd, tmp_path: Path) -> None:
+def test_folders_that_are_none(walk: Path, capfd, tmp_path):
     assert "no such folder" in complaint(capfd, tmp_path / "nothing")
     assert "two passes cannot be told apart" in complaint(capfd, tmp_path)
     assert "camera.toml: no such file" in complaint(capfd, walk)
@@ -312,7 +310,7 @@ def test_folders_that_are_none(walk: Path, capfd, tmp_path: Path) -> None:
     assert "not an image" in complaint(capfd, walk, "--focal", 300)
 
 
-def test_drives_that_are_none(drive: Path, capfd, tmp_path: Path) -> None:
+def test_drives_that_are_none(drive: Path, capfd, tmp_path):
     folder = Path(shutil.copytree(drive, tmp_path / "spoilt"))
     assert "leave --camera and --focal out" in complaint(capfd, folder, "--focal", 300)
     (folder / "truth.csv").write_text("stamp_s,x_m\n0,0\n")
@@ -325,7 +323,7 @@ def test_drives_that_are_none(drive: Path, capfd, tmp_path: Path) -> None:
     assert "splits.toml" in complaint(capfd, folder)
 
 
-def test_what_of_a_drive_cannot_be_read_is_said(drive: Path, capfd, tmp_path: Path) -> None:
+def test_what_of_a_drive_cannot_be_read_is_said(drive: Path, capfd, tmp_path):
     """An image that is left out, once for each robot; and why so few images are left that none fits."""
     folder = Path(shutil.copytree(drive, tmp_path / "spoilt"))
     whole = (folder / "images" / "38.png").read_bytes()

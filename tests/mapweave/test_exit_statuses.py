@@ -1,7 +1,5 @@
 """Exit statuses of every command: a wrong command line is 2, an answer "no" is 4, a failure is 1."""
 
-from __future__ import annotations
-
 import argparse
 import shlex
 from pathlib import Path
@@ -252,15 +250,14 @@ def planned(written: Path) -> Path:
     return path
 
 
-def test_every_command_is_tried() -> None:
+def test_every_command_is_tried():
     assert set(CASES) == set(commands(runnable=True))
 
 
 @pytest.mark.parametrize("command", CASES)
 def test_a_command_ends_with_the_status_of_what_was_wrong(
-    command: str, written: Path, planned: Path, recording: Path, closed: str, tmp_path: Path,
-    capfd: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    command: str, written: Path, planned: Path, recording: Path, closed: str, tmp_path, capfd
+):
     keys = tmp_path / "keys"
     if command.startswith("keys"):
         assert main(["keys", "init", "--keys", str(keys)]) == 0
@@ -282,7 +279,7 @@ def test_a_command_ends_with_the_status_of_what_was_wrong(
         assert len(said.splitlines()) == 1 or (status == NO and not said), f"{line}: {said}"
 
 
-def test_one_word_is_one_thing_in_all_commands() -> None:
+def test_one_word_is_one_thing_in_all_commands():
     """Of options that many commands have."""
     shapes: dict[str, set[tuple[object, ...]]] = {}
     for words, parser in parsers().items():

@@ -1,9 +1,6 @@
 """Explanations as people read them: nothing that counts is hidden, torn or cut off."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -26,7 +23,7 @@ def explanation() -> PairExplanation:
 @pytest.mark.parametrize(("agree", "against"), [(40, 3), (40, 40), (2, 40), (40, 0), (3, 4), (0, 0)])
 def test_contradicting_links_are_listed_among_many_that_agree(
     explanation: PairExplanation, agree: int, against: int
-) -> None:
+):
     distances = [*(0.1 + 0.1 * k for k in range(agree)), *(100.0 + k for k in range(against))]
     nodes = (NodeId("r0", 1, 1), NodeId("r1", 1, 1))
     other_links = tuple(LinkAgreement(*nodes, d, d < 50.0, True) for d in distances)
@@ -39,7 +36,7 @@ def test_contradicting_links_are_listed_among_many_that_agree(
     assert not nearest or "10.0 standard deviations" in nearest[0]
 
 
-def test_every_number_of_the_evidence_is_next_to_its_name(explanation: PairExplanation) -> None:
+def test_every_number_of_the_evidence_is_next_to_its_name(explanation: PairExplanation):
     lines = pair_words(explanation)
     begin = next(k for k, line in enumerate(lines) if line.startswith("  evidence "))
     rest = [line for line in lines[begin:] if line.startswith(("  evidence ", " " * 16))]
@@ -49,9 +46,7 @@ def test_every_number_of_the_evidence_is_next_to_its_name(explanation: PairExpla
 
 
 @pytest.mark.parametrize("words", ["short", "quite long " * 60, r"no formula: $\frac{$"])
-def test_the_picture_holds_all_words_of_its_title(
-    explanation: PairExplanation, words: str, tmp_path: Path
-) -> None:
+def test_the_picture_holds_all_words_of_its_title(explanation: PairExplanation, words: str, tmp_path):
     draw_link(replace(explanation, reason=words.strip()), tmp_path / "link.png")
     image = cv2.imread(str(tmp_path / "link.png"), cv2.IMREAD_GRAYSCALE)
     assert image is not None

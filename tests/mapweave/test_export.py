@@ -1,7 +1,5 @@
 """What others' tools read back is the map."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections import Counter
@@ -52,7 +50,7 @@ def part(merged: MergedMap) -> MapPart:
     return MapPart(merged)
 
 
-def test_gtsam_reads_the_pose_graph_and_is_at_its_optimum(part: MapPart, tmp_path: Path) -> None:
+def test_gtsam_reads_the_pose_graph_and_is_at_its_optimum(part: MapPart, tmp_path):
     (path,) = FORMATS["g2o"](part, tmp_path / "map.g2o")
     graph, values = gtsam.readG2o(str(path), False)
     assert values.size() == len(part.nodes)
@@ -75,7 +73,7 @@ def test_gtsam_reads_the_pose_graph_and_is_at_its_optimum(part: MapPart, tmp_pat
     assert names == {str(number): str(node) for node, number in part.numbers.items()}
 
 
-def test_evo_reads_the_trajectories(part: MapPart, tmp_path: Path) -> None:
+def test_evo_reads_the_trajectories(part: MapPart, tmp_path):
     written = FORMATS["tum"](part, tmp_path / "places")
     assert [path.name for path in written] == ["r0.1.tum", "r1.1.tum"]
     for path in written:
@@ -92,12 +90,12 @@ def test_evo_reads_the_trajectories(part: MapPart, tmp_path: Path) -> None:
         assert np.abs(off).max() < 1e-5
 
 
-def test_one_robot_needs_no_folder(merged: MergedMap, tmp_path: Path) -> None:
+def test_one_robot_needs_no_folder(merged: MergedMap, tmp_path):
     (path,) = FORMATS["tum"](MapPart(merged, 1), tmp_path / "r2.tum")
     assert path.is_file()
 
 
-def test_networkx_reads_the_graph(part: MapPart, tmp_path: Path) -> None:
+def test_networkx_reads_the_graph(part: MapPart, tmp_path):
     (path,) = FORMATS["graphml"](part, tmp_path / "map.graphml")
     graph = nx.read_graphml(path, force_multigraph=True)
     union = part.graph
@@ -115,7 +113,7 @@ def test_networkx_reads_the_graph(part: MapPart, tmp_path: Path) -> None:
         assert data["heading"] == pytest.approx(part.pose(NodeId.parse(node)).heading)
 
 
-def test_the_route_graph_has_the_format_of_nav2(part: MapPart, tmp_path: Path) -> None:
+def test_the_route_graph_has_the_format_of_nav2(part: MapPart, tmp_path):
     """By hand: points with ids and a frame; lines both ways between them; no id twice."""
     (path,) = FORMATS["geojson"](part, tmp_path / "map.geojson")
     graph = json.loads(path.read_text())
@@ -142,7 +140,7 @@ def test_the_route_graph_has_the_format_of_nav2(part: MapPart, tmp_path: Path) -
     assert ways == sorted((b, a) for a, b in ways)
 
 
-def test_nav2_is_led_as_robots_are(merged: MergedMap, tmp_path: Path) -> None:
+def test_nav2_is_led_as_robots_are(merged: MergedMap, tmp_path):
     """What the servo could not drive is no way; nodes in one place are joined, and superseded ones."""
     blind = merged.links[0].a
     count = len(merged.maps[blind.map].nodes[blind].landmarks)
@@ -164,9 +162,7 @@ def test_nav2_is_led_as_robots_are(merged: MergedMap, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("form", list(FORMATS))
-def test_the_command_writes_and_prints_what_is_left_out(
-    merged: MergedMap, form: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_writes_and_prints_what_is_left_out(merged: MergedMap, form: str, tmp_path, capfd):
     file = tmp_path / "m.mapweave"
     write_map_file(file, map_file_of(merged))
     assert main(["map", "export", str(file), "--format", form, "-o", str(tmp_path / "out")]) == 0
@@ -189,9 +185,7 @@ edges = st.builds(
 
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(st.tuples(*[st.builds(Pose2, finite, finite, st.floats(-4, 4))] * 3), st.lists(edges, max_size=5))
-def test_g2o_comes_back_to_the_last_bit(
-    tmp_path: Path, poses: tuple[Pose2, ...], drawn: list[G2oEdge]
-) -> None:
+def test_g2o_comes_back_to_the_last_bit(tmp_path, poses: tuple[Pose2, ...], drawn: list[G2oEdge]):
     graph = G2oGraph(dict(enumerate(poses)), drawn, (1,))
     write_g2o(tmp_path / "x.g2o", graph, {0: "r0.1.1"})
     back = read_g2o(tmp_path / "x.g2o")
@@ -216,9 +210,7 @@ def square(noise: float, seed: int) -> G2oGraph:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_back_end_finds_gtsam_s_optimum_of_others_graphs(
-    seed: int, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_the_back_end_finds_gtsam_s_optimum_of_others_graphs(seed: int, tmp_path, capfd):
     graph = square(1.0, seed)
     write_g2o(tmp_path / "in.g2o", graph)
     factors, values = gtsam.readG2o(str(tmp_path / "in.g2o"), False)
@@ -234,9 +226,7 @@ def test_the_back_end_finds_gtsam_s_optimum_of_others_graphs(
     assert read_g2o(tmp_path / "out.g2o").chi2() == pytest.approx(result["chi2"])
 
 
-def test_a_graph_whose_numbers_are_too_large_is_refused_in_one_line(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_graph_whose_numbers_are_too_large_is_refused_in_one_line(tmp_path, capfd):
     path = tmp_path / "in.g2o"
     edge = "EDGE_SE2 0 1 1 0 0 1e308 0 0 1 0 1\n"
     path.write_text(f"VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1e308 0 0\n{edge}")
@@ -246,7 +236,7 @@ def test_a_graph_whose_numbers_are_too_large_is_refused_in_one_line(
     assert not (tmp_path / "out.g2o").exists()
 
 
-def test_vertices_without_a_line_are_placed_along_edges(tmp_path: Path) -> None:
+def test_vertices_without_a_line_are_placed_along_edges(tmp_path):
     graph = square(0.0, 0)
     path = tmp_path / "edges.g2o"
     write_g2o(path, graph)
@@ -274,13 +264,13 @@ LINE = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\n"
         ("\x89PNG", "is none of"),
     ],
 )
-def test_non_planar_graphs_are_reported_with_the_line(text: str, words: str, tmp_path: Path) -> None:
+def test_non_planar_graphs_are_reported_with_the_line(text: str, words: str, tmp_path):
     path = tmp_path / "bad.g2o"
     path.write_text(text)
     with pytest.raises(InvalidFile, match=words):
         read_g2o(path)
 
 
-def test_pieces_are_not_optimised_as_one() -> None:
+def test_pieces_are_not_optimised_as_one():
     with pytest.raises(InvalidValue, match="in 2 pieces"):
         optimum_of(G2oGraph({0: Pose2(), 1: Pose2()}, []))

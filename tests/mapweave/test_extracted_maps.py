@@ -1,7 +1,5 @@
 """What `map extract` gets out of journals and stores, whole and damaged."""
 
-from __future__ import annotations
-
 import sqlite3
 from contextlib import closing
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """An installation without extras: each command works, or names in one line the extra that it needs."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -181,12 +179,12 @@ def outcomes(without: Iterable[str], lines: Iterable[str], path: str = ACTIVATED
     return [(status, out, err) for status, out, err in json.loads(ran.stdout)]
 
 
-def test_every_command_is_tried() -> None:
+def test_every_command_is_tried():
     assert {command for command, _, _ in CASES} == set(commands(runnable=True))
 
 
 @pytest.mark.slow
-def test_without_extras_a_command_works_or_names_what_it_needs(filled: dict[str, object]) -> None:
+def test_without_extras_a_command_works_or_names_what_it_needs(filled: dict[str, object]):
     lines = [f"{command} {arguments}".format(**filled) for command, arguments, _ in CASES]
     for (command, arguments, words), (status, out, err) in zip(CASES, outcomes(MODULES, lines), strict=True):
         what = f"{command} {arguments}: {status}\n{out}{err}"
@@ -202,7 +200,7 @@ def test_without_extras_a_command_works_or_names_what_it_needs(filled: dict[str,
 
 
 @pytest.mark.slow
-def test_each_extra_is_enough_for_its_commands(filled: dict[str, object]) -> None:
+def test_each_extra_is_enough_for_its_commands(filled: dict[str, object]):
     """With the server's libraries alone every command works that asks for no more."""
     lines = [f"{command} {arguments}".format(**filled) for command, arguments, words in CASES
              if words == SERVER and "map" in command
@@ -213,7 +211,7 @@ def test_each_extra_is_enough_for_its_commands(filled: dict[str, object]) -> Non
 
 
 @needs_simulator
-def test_a_trial_names_only_what_is_missing(tmp_path: Path) -> None:
+def test_a_trial_names_only_what_is_missing(tmp_path):
     """Before it starts: figures and pictures are made at its end."""
     (outcome,) = outcomes(["eval", "viz"], [f"sim run office --out {tmp_path}"])
     words = 'mapweave sim run needs the extras "eval" and "viz": pip install \'mapweave[eval,viz]\'\n'
@@ -222,7 +220,7 @@ def test_a_trial_names_only_what_is_missing(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("path", ["", "other"])
-def test_the_pip_that_is_named_is_that_of_this_environment(tmp_path: Path, path: str) -> None:
+def test_the_pip_that_is_named_is_that_of_this_environment(tmp_path, path: str):
     """Where the environment is not activated: there is no `pip`, or another one."""
     other = tmp_path / "other" / "pip"
     other.parent.mkdir()
@@ -238,14 +236,14 @@ def test_the_pip_that_is_named_is_that_of_this_environment(tmp_path: Path, path:
     assert Path(sys.prefix).resolve() in Path(where.stdout.strip()).resolve().parents
 
 
-def test_a_map_that_is_not_there_is_the_only_complaint(tmp_path: Path) -> None:
+def test_a_map_that_is_not_there_is_the_only_complaint(tmp_path):
     """That a picture would need an extra is no matter then."""
     missing = tmp_path / "office.mapweave"
     (outcome,) = outcomes(["viz"], [f"map show {missing}"])
     assert outcome == (1, "", f"mapweave: {missing}: no such file\n")
 
 
-def test_the_extras_are_those_of_the_package() -> None:
+def test_the_extras_are_those_of_the_package():
     package = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["optional-dependencies"]
     installed = packages_distributions()
     for extra, modules in MODULES.items():
@@ -270,7 +268,7 @@ print(*({name.split(".")[0] for name in sys.modules} - before - sys.stdlib_modul
 """
 
 
-def test_help_wrong_use_and_version_import_no_library() -> None:
+def test_help_wrong_use_and_version_import_no_library():
     """All that takes time to import is left until a command runs."""
     asked = [[*command.split(), "--help"] for command in commands()]
     wrong = [[*command.split(), "--no-such-option"] for command in commands()]
@@ -297,9 +295,7 @@ except mapweave.MapweaveError as error:
 """
 
 
-def test_python_asks_a_fleet_without_extras_and_a_file_names_the_one_that_it_needs(
-    filled: dict[str, object],
-) -> None:
+def test_python_asks_a_fleet_without_extras_and_a_file_names_the_one_that_it_needs(filled: dict[str, object]):
     """Both ended with: No module named 'faiss'."""
     ran = subprocess.run(
         [sys.executable, "-c", ASK, str(filled["merged"]), *MODULES["server"]],
@@ -309,7 +305,7 @@ def test_python_asks_a_fleet_without_extras_and_a_file_names_the_one_that_it_nee
     assert view == "0" and file.startswith('needs the extra "server": ')
 
 
-def test_the_version_is_that_of_the_package(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_version_is_that_of_the_package(capsys):
     with pytest.raises(SystemExit) as ended:
         main(["--version"])
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]

@@ -1,7 +1,5 @@
 """`mapweave find-port` and `find-cameras`: ports are pseudo-terminals, cameras are video files."""
 
-from __future__ import annotations
-
 import re
 import sys
 import threading
@@ -40,7 +38,7 @@ def plugged(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[P
     sketch.close()
 
 
-def test_ports_are_listed(plugged: tuple[Path, ArduinoSketch], capsys: pytest.CaptureFixture[str]) -> None:
+def test_ports_are_listed(plugged: tuple[Path, ArduinoSketch], capsys):
     devices, _ = plugged
     assert main(["find-port"]) == 0
     gps, robot = capsys.readouterr().out.splitlines()
@@ -48,7 +46,7 @@ def test_ports_are_listed(plugged: tuple[Path, ArduinoSketch], capsys: pytest.Ca
     assert robot == f"{devices}/ttyUSB0"
 
 
-def test_a_cable_may_be_pulled_while_ports_are_listed(plugged, monkeypatch) -> None:
+def test_a_cable_may_be_pulled_while_ports_are_listed(plugged, monkeypatch):
     devices, sketch = plugged
     readlink = ports.os.readlink
 
@@ -63,7 +61,7 @@ def test_a_cable_may_be_pulled_while_ports_are_listed(plugged, monkeypatch) -> N
     assert [port.path for port in ports.serial_ports(devices)] == [f"{devices}/ttyACM3"]
 
 
-def test_the_port_whose_cable_is_pulled_is_named(plugged, monkeypatch) -> None:
+def test_the_port_whose_cable_is_pulled_is_named(plugged, monkeypatch):
     devices, sketch = plugged
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
     asked = threading.Event()
@@ -103,7 +101,7 @@ def test_the_port_whose_cable_is_pulled_is_named(plugged, monkeypatch) -> None:
     assert f"it was {devices}/ttyUSB0: plug it in" in "".join(said)
 
 
-def test_no_port_and_no_pull_are_one_line(plugged, monkeypatch, capfd, tmp_path) -> None:
+def test_no_port_and_no_pull_are_one_line(plugged, monkeypatch, capfd, tmp_path):
     monkeypatch.setattr(sys.stdin, "isatty", lambda: True)
     assert main(["find-port", "--timeout", "0.05"]) == NO
     assert "no port has gone" in capfd.readouterr().err
@@ -125,7 +123,7 @@ def video(path: Path, size: tuple[int, int], level: int) -> Path:
     return path
 
 
-def test_a_frame_of_each_camera_is_saved(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_frame_of_each_camera_is_saved(tmp_path, capfd):
     good = video(tmp_path / "good.avi", (320, 240), 1)
     dark = video(tmp_path / "dark.avi", (160, 120), 0)
     broken = tmp_path / "broken.avi"
@@ -141,7 +139,7 @@ def test_a_frame_of_each_camera_is_saved(tmp_path: Path, capfd: pytest.CaptureFi
     assert [cv2.imread(str(frame), 0).shape for frame in frames] == [(240, 320), (120, 160)]
 
 
-def test_no_camera_is_an_error(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_no_camera_is_an_error(tmp_path, capfd):
     words = complaint(capfd, "find-cameras", tmp_path / "none.avi", "--out", tmp_path / "frames", status=NO)
     assert "no such file" in words and "no camera gives an image" in words
     assert not (tmp_path / "frames").exists()

@@ -1,7 +1,5 @@
 """`mapweave agent` on a full disk, as a process: it maps on, says so once, and what is stored is kept."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -34,7 +32,7 @@ def about_disks(lines: list[str]) -> list[str]:
     return [line.split(" ", 2)[2].split("; ")[0] for line in lines if "the disk " in line]
 
 
-def test_it_maps_on_and_says_once_which_disk_is_full_and_once_that_it_has_room(said: dict[str, Any]) -> None:
+def test_it_maps_on_and_says_once_which_disk_is_full_and_once_that_it_has_room(said: dict[str, Any]):
     full, journal = said["full"], f"{said['disk']}/r0.sqlite"
     assert full["new while full"] >= 3
     assert (
@@ -46,19 +44,19 @@ def test_it_maps_on_and_says_once_which_disk_is_full_and_once_that_it_has_room(s
     assert not any(line.startswith("Traceback") for line in full["lines after"])
 
 
-def test_lost_on_a_full_disk_it_waits_until_it_can_begin_a_map(said: dict[str, Any]) -> None:
+def test_lost_on_a_full_disk_it_waits_until_it_can_begin_a_map(said: dict[str, Any]):
     full, room = about_disks(said["lost"]["lines"])
     assert full.endswith(f": the disk is full (mounted at {said['disk']})")
     assert room.endswith("r0.sqlite: the disk has room again")
 
 
-def test_ended_on_a_full_disk_it_says_what_is_lost(said: dict[str, Any]) -> None:
+def test_ended_on_a_full_disk_it_says_what_is_lost(said: dict[str, Any]):
     ended = said["ended"]
     assert ended["status"] == FAILED
     assert any(line.endswith(" changes never reached the disk") for line in ended["lines"])
     assert "cannot be written (the disk is full; " in ended["lines"][-1] and len(ended["lines"]) == 3
 
 
-def test_the_server_has_just_what_the_robots_disk_has(said: dict[str, Any]) -> None:
+def test_the_server_has_just_what_the_robots_disk_has(said: dict[str, Any]):
     assert [*said["maps"]] == ["r0.1", "r0.2"]
     assert all(one["same"] and one["nodes"] >= 3 for one in said["maps"].values())

@@ -1,7 +1,5 @@
 """Guides cannot rot: every command of every page parses, and those of two tutorials run in their order."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import signal
@@ -39,7 +37,7 @@ def blocks(page: Path) -> list[str]:
     return found
 
 
-def test_every_command_of_every_page_parses(capsys: pytest.CaptureFixture[str]) -> None:
+def test_every_command_of_every_page_parses(capsys):
     wrong, checked, of_pages = [], 0, set()
     for page in PAGES:
         for command in dict.fromkeys(blocks(page)):
@@ -53,7 +51,7 @@ def test_every_command_of_every_page_parses(capsys: pytest.CaptureFixture[str]) 
     assert checked > 100 and {"first-map.md", "robot.md", "security.md", "README.md"} <= of_pages
 
 
-def test_every_target_of_make_that_a_page_names_is_there() -> None:
+def test_every_target_of_make_that_a_page_names_is_there():
     targets = set(re.findall(r"^([a-z][\w-]*):", (ROOT / "Makefile").read_text(encoding="utf-8"), re.M))
     named = set()
     for page in PAGES:
@@ -70,7 +68,7 @@ def test_every_target_of_make_that_a_page_names_is_there() -> None:
     assert not {(page, word) for page, word in named if word not in targets}
 
 
-def test_every_command_that_a_sentence_names_is_there() -> None:
+def test_every_command_that_a_sentence_names_is_there():
     """Inline, commands lack their arguments: their words are compared."""
     known, wrong = parsers_of(parser()), []
     for page in PAGES:
@@ -146,7 +144,7 @@ class Tutorial:
     ],
     ids=["first-map", "two-robots"],
 )
-def test_the_first_tutorials_run_as_they_stand(name: str, ready: str, tmp_path: Path) -> None:
+def test_the_first_tutorials_run_as_they_stand(name: str, ready: str, tmp_path):
     """What a page shows has a line of the same form in what its commands print."""
     page, tutorial = ROOT / "docs" / f"{name}.md", Tutorial(tmp_path)
     try:

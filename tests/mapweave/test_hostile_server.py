@@ -1,7 +1,5 @@
 """A real agent process whose map server is hostile: over TLS with keys, and without keys."""
 
-from __future__ import annotations
-
 import re
 import threading
 import time
@@ -112,7 +110,7 @@ def hostile(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_hostile_server_neither_fills_nor_stops_a_robot_nor_leads_it_astray(hostile: Hostile) -> None:
+def test_a_hostile_server_neither_fills_nor_stops_a_robot_nor_leads_it_astray(hostile: Hostile):
     rng, bus = np.random.default_rng(0), hostile.bus
     peak, lines = hostile.peak_mb(), hostile.lines()
     hostile.answer = replies_without_end

@@ -1,9 +1,6 @@
 """Where people find the page, as the server says it at its start."""
 
-from __future__ import annotations
-
 import socket
-from pathlib import Path
 
 import pytest
 
@@ -24,8 +21,8 @@ from mapweave.identities.key_folder import KeyFolder, Profile
     ],
 )
 def test_the_address_of_the_page_is_one_that_its_certificate_has(
-    tmp_path: Path, at: list[str], words: str, url: str
-) -> None:
+    tmp_path, at: list[str], words: str, url: str
+):
     """`https://0.0.0.0:8080/` opens on no other machine, and its name is in no certificate."""
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, at, "s0")
     access = http_access(words, folder, "s0")

@@ -1,7 +1,5 @@
 """`mapweave info`: what there is comes first, and all that is missing is listed."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any
@@ -24,7 +22,7 @@ def facts_of(capfd: pytest.CaptureFixture[str], *arguments: object) -> dict[str,
     return facts
 
 
-def test_everything_that_is_missing_is_listed_with_its_option(tmp_path, capfd) -> None:
+def test_everything_that_is_missing_is_listed_with_its_option(tmp_path, capfd):
     (tmp_path / "image_0").mkdir()
     for k in range(3):
         cv2.imwrite(str(tmp_path / "image_0" / f"{k}.png"), np.full((48, 64), 90, np.uint8))
@@ -38,7 +36,7 @@ def test_everything_that_is_missing_is_listed_with_its_option(tmp_path, capfd) -
     assert len(facts_of(capfd, tmp_path, "--camera-height", 1.65)["missing"]) == 1
 
 
-def test_a_folder_without_camera_and_odometry_is_described(recording: Path, capfd) -> None:
+def test_a_folder_without_camera_and_odometry_is_described(recording: Path, capfd):
     (recording / "odometry.csv").unlink()
     (recording / "camera.toml").unlink()
     facts = facts_of(capfd, recording)
@@ -46,14 +44,14 @@ def test_a_folder_without_camera_and_odometry_is_described(recording: Path, capf
     assert "--camera FILE" in facts["missing"][0] and "--odometry FILE" in facts["missing"][1]
 
 
-def test_a_first_image_that_cannot_be_read_is_damage(recording: Path, capfd) -> None:
+def test_a_first_image_that_cannot_be_read_is_damage(recording: Path, capfd):
     (recording / "images" / "0.png").write_bytes(b"no image")
     facts = facts_of(capfd, recording)
     assert facts["images"] == 3 and not facts["missing"]
     assert "0.png: not an image that can be read" in facts["damage"][0]
 
 
-def test_a_bag_without_images_is_described_by_its_topics(tmp_path: Path, capfd) -> None:
+def test_a_bag_without_images_is_described_by_its_topics(tmp_path, capfd):
     from rosbags.rosbag2 import StoragePlugin, Writer
 
     from mapweave.wire.ros2.messages import typestore
@@ -80,7 +78,7 @@ def test_a_bag_without_images_is_described_by_its_topics(tmp_path: Path, capfd) 
     assert facts["missing"][0].startswith("images (") and "--odometry FILE" in facts["missing"][1]
 
 
-def test_a_camera_that_can_hardly_be_right_is_named(recording: Path, tmp_path: Path, capfd) -> None:
+def test_a_camera_that_can_hardly_be_right_is_named(recording: Path, tmp_path, capfd):
     assert not facts_of(capfd, recording)["notes"]
     camera = recording / "camera.toml"
     right = camera.read_text()
@@ -93,7 +91,7 @@ def test_a_camera_that_can_hardly_be_right_is_named(recording: Path, tmp_path: P
         assert f"camera: {line.split(' =')[0]} = " in capfd.readouterr().out
 
 
-def test_images_without_times_are_said_to_have_none(recording: Path, tmp_path: Path, capfd) -> None:
+def test_images_without_times_are_said_to_have_none(recording: Path, tmp_path, capfd):
     """Ten images a second were reported as if the recording said so."""
     assert facts_of(capfd, recording)["images_per_second"] == 10.0
     (recording / "times.txt").unlink()

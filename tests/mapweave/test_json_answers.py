@@ -1,7 +1,5 @@
 """`--json`: one object, the last line on stdout, of every command whose answer a script reads."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -51,12 +49,12 @@ def store(tmp_path: Path) -> Path:
     return write_store(tmp_path / "s0.sqlite", looked_around((MapId("r0", 1), MapId("r1", 1)), seed=8))
 
 
-def test_every_command_has_it_but_for_processes_and_what_people_look_at() -> None:
+def test_every_command_has_it_but_for_processes_and_what_people_look_at():
     without = {words for words in commands(runnable=True) if "--json" not in parsers()[words].format_help()}
     assert without == OTHERWISE
 
 
-def test_keys(answer: Answer, tmp_path: Path) -> None:
+def test_keys(answer: Answer, tmp_path):
     folder = ["--keys", tmp_path / "keys"]
     made = answer("keys", "init", "--fleet", "office", "--at", "10.0.0.1", *folder)
     assert (made["fleet"], made["profile"], made["folder"]) == ("office", "production", str(folder[1]))
@@ -73,7 +71,7 @@ def test_keys(answer: Answer, tmp_path: Path) -> None:
     assert answer("keys", "revoke", "anna", *folder)["name"] == "anna"
 
 
-def test_maps(answer: Answer, store: Path, tmp_path: Path) -> None:
+def test_maps(answer: Answer, store: Path, tmp_path):
     backup = answer("map", "backup", store, "-o", tmp_path / "copy.sqlite")
     assert backup["file"] == str(tmp_path / "copy.sqlite")
     assert backup["bytes"] == (tmp_path / "copy.sqlite").stat().st_size
@@ -85,7 +83,7 @@ def test_maps(answer: Answer, store: Path, tmp_path: Path) -> None:
     assert exported["files"] == sorted(map(str, folder.iterdir()))
 
 
-def test_recordings(answer: Answer, recording: Path, driver: str, tmp_path: Path) -> None:  # noqa: F811
+def test_recordings(answer: Answer, recording: Path, driver: str, tmp_path):  # noqa: F811
     out = tmp_path / "drive"
     nowhere = ["--robot", driver, "--connect", "tcp/127.0.0.1:1"]
     made = answer("record", "r0", "--out", out, "--lossless", *nowhere)
@@ -103,9 +101,9 @@ def test_recordings(answer: Answer, recording: Path, driver: str, tmp_path: Path
 def test_devices(
     answer: Answer,
     plugged: Any,  # noqa: F811
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    tmp_path,
+    monkeypatch,
+):
     devices, _ = plugged
     found = answer("find-port")
     assert [port["path"] for port in found["ports"]] == [f"{devices}/ttyACM3", f"{devices}/ttyUSB0"]
@@ -119,13 +117,13 @@ def test_devices(
     assert answer("calibrate", "target", "-o", target)["file"] == str(target) and target.is_file()
 
 
-def test_portals(answer: Answer, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_portals(answer: Answer, monkeypatch):
     fleet = SimpleNamespace(portal_done=lambda robot: f"{robot} looks where it is")
     monkeypatch.setattr("mapweave.commands.portal.fleet_of", lambda _: nullcontext(fleet))
     assert answer("portal", "done", "r0") == {"said": "r0 looks where it is", "robot": "r0"}
 
 
-def test_what_is_refused_prints_nothing_on_stdout(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_what_is_refused_prints_nothing_on_stdout(capsys, tmp_path):
     assert main(["keys", "add", "r0", "--at", "here", "--json", "--keys", str(tmp_path)]) == USAGE
     captured = capsys.readouterr()
     assert captured.out == "" and captured.err.count("\n") == 1

@@ -1,7 +1,5 @@
 """The log as JSON: each line of real processes is an object, with what a message names as fields."""
 
-from __future__ import annotations
-
 import io
 import json
 import logging
@@ -12,7 +10,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import suppress
 from datetime import UTC, datetime, timedelta
-from pathlib import Path
 
 import pytest
 
@@ -41,7 +38,7 @@ def objects(text: str) -> list[dict[str, str]]:
     return [json.loads(line) for line in text.splitlines()]
 
 
-def test_a_refused_change_names_its_map_and_robot(lines: io.StringIO, tmp_path: Path) -> None:
+def test_a_refused_change_names_its_map_and_robot(lines: io.StringIO, tmp_path):
     hub = MemoryHub()
     server, agent = Server(hub, tmp_path / "s0.sqlite"), HandAgent(hub)
     agent.serve(1, lambda asked: agent.answer(asked))
@@ -60,9 +57,7 @@ HOSTILE = "agent/r0/alive/\x1b[31mRED\x07\x9b2J\u202eabc\n2026-11-30 01:00:00 al
 
 
 @pytest.mark.parametrize("log_format", [TextFormatter(), JsonFormatter()])
-def test_what_others_have_written_controls_no_terminal_and_makes_no_line(
-    log_format: logging.Formatter,
-) -> None:
+def test_what_others_have_written_controls_no_terminal_and_makes_no_line(log_format: logging.Formatter):
     handler = logging.StreamHandler(stream := io.StringIO())
     handler.setFormatter(log_format)
     logger = logging.getLogger("mapweave.mapserver.test")
@@ -82,7 +77,7 @@ def test_what_others_have_written_controls_no_terminal_and_makes_no_line(
     assert stamped(HOSTILE).isprintable()
 
 
-def test_fields_are_those_of_the_message_and_those_that_are_given(lines: io.StringIO) -> None:
+def test_fields_are_those_of_the_message_and_those_that_are_given(lines: io.StringIO):
     log = logging.getLogger("mapweave.mapserver.test")
     log.warning("two\nlines of %s and %s", NodeId("r0", 1, 7), MapId("r1", 2), extra={"reason": "ünknown"})
     log.warning("100 % of nothing")
@@ -102,7 +97,7 @@ def test_fields_are_those_of_the_message_and_those_that_are_given(lines: io.Stri
     assert "ValueError: cause" in third["exception"] and third["level"] == "error"
 
 
-def test_every_line_of_a_process_is_an_object_also_its_last(tmp_path: Path) -> None:
+def test_every_line_of_a_process_is_an_object_also_its_last(tmp_path):
     port = free_port()
     words = [sys.executable, "-m", "mapweave", "router", "--listen", f"tcp/127.0.0.1:{port}"]
     pipes = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT, "text": True, "cwd": tmp_path}
@@ -120,7 +115,7 @@ def test_every_line_of_a_process_is_an_object_also_its_last(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("log_format", ["text", "json"])
-def test_a_refused_handshake_is_a_line_as_all_others(log_format: str, tmp_path: Path) -> None:
+def test_a_refused_handshake_is_a_line_as_all_others(log_format: str, tmp_path):
     """Zenoh, which refuses it, would write lines of its own."""
     port = free_port()
     KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, [], "s0", port)

@@ -1,7 +1,5 @@
 """No start of an agent loses a map: real processes that are killed, journals and map files."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 import threading
@@ -99,8 +97,8 @@ def network(tmp_path: Path) -> Iterator[tuple[Children, ZenohBus, str]]:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 def test_agents_that_are_killed_begun_again_and_robbed_of_their_disk_lose_no_map(
-    network: tuple[Children, ZenohBus, str], tmp_path: Path
-) -> None:
+    network: tuple[Children, ZenohBus, str], tmp_path
+):
     children, bus, endpoint = network
     data = tmp_path / "agents"
 
@@ -282,7 +280,7 @@ def loops(hybrid_map: HybridMap) -> int:
 
 
 @pytest.mark.slow
-def test_a_process_that_ends_after_an_episode_keeps_what_follows_from_it(tmp_path: Path) -> None:
+def test_a_process_that_ends_after_an_episode_keeps_what_follows_from_it(tmp_path):
     """Loop closures are made in the ticks after a node. Before, there was none, and they were lost."""
     robot, bus = Carried(), MemoryBus(MemoryHub())
     options = AgentOptions("r0", tmp_path, epoch=1, mission=MissionKind.CARRIED, patience=0.0)
@@ -307,9 +305,7 @@ def test_a_process_that_ends_after_an_episode_keeps_what_follows_from_it(tmp_pat
 
 
 @pytest.mark.parametrize("recorded", [False, True])
-def test_changes_that_no_disk_took_are_no_success(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, recorded: bool
-) -> None:
+def test_changes_that_no_disk_took_are_no_success(tmp_path, monkeypatch, recorded: bool):
     """Nor does who has ended say that they are written once there is room."""
 
     def full(*_: object) -> int:
@@ -349,7 +345,7 @@ class Ended:
         pass
 
 
-def test_a_map_file_that_does_not_fit_on_the_disk_leaves_a_whole_journal(tmp_path: Path) -> None:
+def test_a_map_file_that_does_not_fit_on_the_disk_leaves_a_whole_journal(tmp_path):
     """The journal was never closed: what waited for the disk was lost without a word."""
     bus = ZenohBus(BusSettings(endpoints=(f"tcp/127.0.0.1:{free_port()}",)))
     options = AgentOptions("r0", tmp_path, epoch=1, patience=0.0)
@@ -365,8 +361,8 @@ def test_a_map_file_that_does_not_fit_on_the_disk_leaves_a_whole_journal(tmp_pat
     ("router", "words"), [(True, "no map server s0 in reach"), (False, "no server in reach")]
 )
 def test_an_agent_that_ends_without_a_map_server_says_so_and_does_not_wait_for_it(
-    router: bool, words: str, tmp_path: Path, capfd, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    router: bool, words: str, tmp_path, capfd, monkeypatch
+):
     """It said that the server has not acknowledged everything, and ended only after all its patience."""
     monkeypatch.setattr(agent_process, "ARRIVAL", 0.3)
     at = (f"tcp/127.0.0.1:{free_port()}",)
@@ -381,8 +377,8 @@ def test_an_agent_that_ends_without_a_map_server_says_so_and_does_not_wait_for_i
 
 
 def test_an_agent_that_has_handed_over_everything_ends_at_once_without_its_server(
-    tmp_path: Path, capfd, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, capfd, monkeypatch
+):
     """It looked for the server again, and said that the map will be sent."""
     journal = Journal(tmp_path / "r0.sqlite", "r0")
     journal.append(map_id := journal.open_map(1), one_node(), 0)

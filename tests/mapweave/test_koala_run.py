@@ -1,7 +1,5 @@
 """A whole drive through a serial line: mapping, kidnapping, parking, by `mapweave agent` with a Koala."""
 
-from __future__ import annotations
-
 import time
 from pathlib import Path
 
@@ -75,9 +73,7 @@ wheel_noise = {d.wheel_noise}
         pytest.param(KoalaSilverInSimulation, 5, marks=pytest.mark.scenario),
     ],
 )
-def test_a_koala_maps_is_carried_off_and_parks(
-    kind: type[InSimulation], least_nodes: int, tmp_path: Path
-) -> None:
+def test_a_koala_maps_is_carried_off_and_parks(kind: type[InSimulation], least_nodes: int, tmp_path):
     keys, endpoint = Keys("serial"), f"tcp/127.0.0.1:{free_port()}"
     network = ["--fleet", "serial", "--connect", endpoint]
     bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))

@@ -1,7 +1,5 @@
 """A robot that is started again knows what it has learned of its camera, says so, and may forget it."""
 
-from __future__ import annotations
-
 import json
 import math
 import threading
@@ -51,7 +49,7 @@ def started(bus: MemoryBus, folder: Path, said: list[str], **options: object) ->
     return Agent(lambda: DESCRIPTION, bus, KEYS, AgentSettings(), given, print_line=said.append)
 
 
-def test_the_start_says_what_was_learned_and_how_to_forget_it(bus: MemoryBus, tmp_path: Path) -> None:
+def test_the_start_says_what_was_learned_and_how_to_forget_it(bus: MemoryBus, tmp_path):
     said: list[str] = []
     file = tmp_path / "r0.learned.toml"
     write_learned(file, learned_of(DESCRIPTION, math.radians(-0.3)), date(2026, 11, 29))
@@ -68,7 +66,7 @@ def test_the_start_says_what_was_learned_and_how_to_forget_it(bus: MemoryBus, tm
     assert not file.exists()
 
 
-def test_a_correction_is_on_the_disk_before_the_process_ends(bus: MemoryBus, tmp_path: Path) -> None:
+def test_a_correction_is_on_the_disk_before_the_process_ends(bus: MemoryBus, tmp_path):
     """It may be killed. That a correction is found is tested with the calibration."""
     agent = started(bus, tmp_path, [])
     calibration, file = agent.pipeline.calibration, tmp_path / "r0.learned.toml"
@@ -88,7 +86,7 @@ def test_a_correction_is_on_the_disk_before_the_process_ends(bus: MemoryBus, tmp
     agent.close()
 
 
-def test_a_recording_is_the_same_map_whatever_was_learned(bus: MemoryBus, tmp_path: Path) -> None:
+def test_a_recording_is_the_same_map_whatever_was_learned(bus: MemoryBus, tmp_path):
     write_learned(tmp_path / "r0.learned.toml", learned_of(DESCRIPTION), date(2026, 11, 29))
     agent = started(bus, tmp_path, [], recorded=True)
     assert agent.pipeline.calibration.geometry.heading == 0.0
@@ -96,9 +94,7 @@ def test_a_recording_is_the_same_map_whatever_was_learned(bus: MemoryBus, tmp_pa
 
 
 @pytest.mark.parametrize("damaged", [True, False])
-def test_what_cannot_be_used_is_said_and_stops_no_robot(
-    bus: MemoryBus, tmp_path: Path, damaged: bool
-) -> None:
+def test_what_cannot_be_used_is_said_and_stops_no_robot(bus: MemoryBus, tmp_path, damaged: bool):
     said: list[str] = []
     file = tmp_path / "r0.learned.toml"
     other = declaring(DESCRIPTION, replace(geometry_of(DESCRIPTION), forward=0.5))
@@ -114,7 +110,7 @@ def test_what_cannot_be_used_is_said_and_stops_no_robot(
     )
 
 
-def test_the_doctor_shows_it(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_doctor_shows_it(tmp_path, capfd):
     file = tmp_path / "r0.learned.toml"
     write_learned(file, learned_of(DESCRIPTION, math.radians(1.5)), date(2026, 11, 29))
     (tmp_path / "r1.learned.toml").write_text("learned_on = 1\n")
@@ -156,7 +152,7 @@ class Driven:
 
 
 @pytest.mark.slow
-def test_a_restarted_robot_maps_on_with_what_it_has_learned(bus: MemoryBus, tmp_path: Path) -> None:
+def test_a_restarted_robot_maps_on_with_what_it_has_learned(bus: MemoryBus, tmp_path):
     """A camera looks 3 degrees aside of what is declared. In between the process ends; its journal stays."""
     true = DriveGeometry(forward=0.08, height=0.25)
     camera = replace(CAMERA, width=160, height=120, fx=138.5, fy=138.5, cx=79.5, cy=59.5)

@@ -1,7 +1,5 @@
 """`import mapweave`: what it offers, that it loads nothing before it is used, and a map's way through it."""
 
-from __future__ import annotations
-
 import ast
 import json
 import subprocess
@@ -42,7 +40,7 @@ def python(code: str, *arguments: str) -> str:
     return process.stdout
 
 
-def test_nothing_is_loaded_before_it_is_used() -> None:
+def test_nothing_is_loaded_before_it_is_used():
     code = """
 import json, sys
 before = {*sys.modules}
@@ -60,7 +58,7 @@ print(json.dumps([from_import, [name for name in libraries if name in sys.module
     assert heavy == []
 
 
-def test_each_name_is_what_type_checkers_see() -> None:
+def test_each_name_is_what_type_checkers_see():
     """The block for type checkers lists the same names from the same modules."""
     (block,) = (node for node in ast.parse(SOURCE.read_text()).body if isinstance(node, ast.If))
     imports = [node for node in block.body if isinstance(node, ast.ImportFrom)]
@@ -72,13 +70,13 @@ def test_each_name_is_what_type_checkers_see() -> None:
         assert name in dir(mapweave)
 
 
-def test_what_is_public_is_this_list() -> None:
+def test_what_is_public_is_this_list():
     """Others' programs depend on these names: one that is added stays."""
     assert sorted(mapweave.__all__) == PUBLIC.split()
     assert set(dir(mapweave)) == {*mapweave.__all__, "__version__"}
 
 
-def test_advice_is_also_of_use_in_python() -> None:
+def test_advice_is_also_of_use_in_python():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with pytest.raises(mapweave.MapweaveError) as refused:
         mapweave.connect(endpoint)
@@ -86,18 +84,18 @@ def test_advice_is_also_of_use_in_python() -> None:
     assert str(refused.value) == f"no router at {endpoint}: {advice}"
 
 
-def test_what_is_not_there() -> None:
+def test_what_is_not_there():
     with pytest.raises(AttributeError, match="'mapweave' has no attribute 'merge_maps'"):
         _ = mapweave.merge_maps  # type: ignore[attr-defined]
     with pytest.raises(ImportError, match="cannot import name 'NoSuch'"):
         exec("from mapweave import NoSuch")
 
 
-def test_the_version_is_that_of_the_installed_package() -> None:
+def test_the_version_is_that_of_the_installed_package():
     assert mapweave.__version__ == version("mapweave")
 
 
-def test_a_name_whose_extra_is_missing_says_which() -> None:
+def test_a_name_whose_extra_is_missing_says_which():
     code = """
 import sys
 from tests.mapweave.without_libraries import Without
@@ -114,7 +112,7 @@ except ImportError as error:
     assert said.endswith("pip install 'mapweave[server]'")
 
 
-def test_maps_are_written_read_merged_and_say_where_a_view_was_taken(tmp_path: Path) -> None:
+def test_maps_are_written_read_merged_and_say_where_a_view_was_taken(tmp_path):
     rng = np.random.default_rng(2)
     paths = [tmp_path / f"{name}.mapweave" for name in ("r0", "r1")]
     places: dict[mapweave.NodeId, mapweave.Pose2] = {}
@@ -149,13 +147,13 @@ def test_maps_are_written_read_merged_and_say_where_a_view_was_taken(tmp_path: P
     assert mapweave.relocalizer_of(read).answer(view).certainty is mapweave.Certainty.UNKNOWN
 
 
-def test_one_path_is_no_list_of_map_files(tmp_path: Path) -> None:
+def test_one_path_is_no_list_of_map_files(tmp_path):
     for one in ("one.mapweave", tmp_path / "one.mapweave"):
         with pytest.raises(mapweave.MapweaveError, match="give a list of map files, such as"):
             mapweave.merge_map_files(one)  # type: ignore[arg-type]
 
 
-def test_a_path_may_be_text(tmp_path: Path) -> None:
+def test_a_path_may_be_text(tmp_path):
     """As of `mapweave.open`; what is wrong with one is an error of one line."""
     at = str(tmp_path / "empty.mapweave")
     mapweave.write_map_file(at, mapweave.MapFile("merged", "nothing", ()))

@@ -1,7 +1,5 @@
 """A map in Python: of a file and of a running fleet the same, held against other ways to the same numbers."""
 
-from __future__ import annotations
-
 import math
 import shutil
 from collections.abc import Iterator
@@ -74,9 +72,7 @@ def running(tmp_path: Path) -> Iterator[Running]:
         bus.close()
 
 
-def test_a_map_is_fetched_into_a_file_and_read_once(
-    running: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_is_fetched_into_a_file_and_read_once(running: Running, tmp_path, monkeypatch, capsys):
     """It was read twice, a second each for 250 nodes; that takes as long as fetching them."""
     read: list[int] = []
     monkeypatch.setattr(
@@ -92,7 +88,7 @@ def test_a_map_is_fetched_into_a_file_and_read_once(
     assert capsys.readouterr().out == f"{out}: {running.fleet.map().title}, {read[0] / 1e6:.1f} MB\n"
 
 
-def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path: Path) -> None:
+def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path):
     fleet = running.fleet
     fleet.annotate("place", "kitchen", node="r1.1.3")
     fleet.save(tmp_path / "both.mapweave")
@@ -184,7 +180,7 @@ def test_a_file_and_a_fleet_say_the_same(running: Running, tmp_path: Path) -> No
     assert [place.node for place in here.candidates] == [place.node for place in there.candidates]
 
 
-def test_a_fleet_tells_what_happens_and_its_map_is_fetched_again_on_request(running: Running) -> None:
+def test_a_fleet_tells_what_happens_and_its_map_is_fetched_again_on_request(running: Running):
     fleet, bus = running.fleet, running.bus
     before = fleet.hash
     events = fleet.events(60.0)
@@ -210,9 +206,7 @@ def test_a_fleet_tells_what_happens_and_its_map_is_fetched_again_on_request(runn
     assert list(fleet.events(0.0)) == []
 
 
-def test_a_robots_own_map_is_optimised_exported_and_drawn(
-    running: Running, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_robots_own_map_is_optimised_exported_and_drawn(running: Running, tmp_path, monkeypatch):
     monkeypatch.setenv("MPLBACKEND", "agg")
     own = [node for name, node in running.nodes.items() if name.startswith("r0")]
     edges = [edge for edge in map_of(running.fleet).edges.values() if edge.id.agent == "r0"]
@@ -239,7 +233,7 @@ def map_of(fleet: mapweave.Fleet) -> mapweave.HybridMap:
     return mapweave.HybridMap(fleet.content.changes)
 
 
-def test_what_is_no_image_of_the_camera_is_refused(running: Running, tmp_path: Path) -> None:
+def test_what_is_no_image_of_the_camera_is_refused(running: Running, tmp_path):
     camera = mapweave.Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3)
     noise = np.random.default_rng(0).integers(0, 255, (48, 64), dtype=np.uint8)
     assert running.fleet.relocalize(noise, camera).certainty is mapweave.Certainty.UNKNOWN
@@ -250,7 +244,7 @@ def test_what_is_no_image_of_the_camera_is_refused(running: Running, tmp_path: P
         running.fleet.relocalize(tmp_path / "none.png", camera)
 
 
-def test_without_a_server_one_line_says_so() -> None:
+def test_without_a_server_one_line_says_so():
     bus = MemoryBus(MemoryHub())
     fleet = mapweave.Fleet(fleet="fleet", bus=bus)
     for ask in (lambda: fleet.nodes, lambda: fleet.route("r0.1.1", "r0.1.3"), fleet.history, fleet.refresh):
@@ -260,5 +254,5 @@ def test_without_a_server_one_line_says_so() -> None:
     bus.close()
 
 
-def test_map_bytes_are_a_map_file(running: Running) -> None:
+def test_map_bytes_are_a_map_file(running: Running):
     assert len(unpack_map_file(running.fleet.map_bytes()).poses) == 8

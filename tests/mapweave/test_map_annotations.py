@@ -1,7 +1,5 @@
 """What is said about a map from Python: it leaves in a file what the shell's commands leave."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from dataclasses import replace
@@ -59,9 +57,7 @@ def by_shell(path: Path, *words: str) -> MapFile:
     return read_map_file(path)
 
 
-def test_python_and_shell_leave_the_same_file(
-    joined: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_python_and_shell_leave_the_same_file(joined: Path, tmp_path, capsys):
     path, picture = tmp_path / "shell.mapweave", tmp_path / "flat.png"
     path.write_bytes(joined.read_bytes())
     picture.write_bytes(png())
@@ -123,7 +119,7 @@ def test_python_and_shell_leave_the_same_file(
     assert len(room.annotations().made) == len(steps) - 1
 
 
-def test_what_is_said_holds_at_once_in_memory_and_not_in_the_file(joined: Path) -> None:
+def test_what_is_said_holds_at_once_in_memory_and_not_in_the_file(joined: Path):
     room, before = mapweave.open(joined), joined.read_bytes()
     assert room.route(FIRST, "r0.1.3").found
     assert room.place("kitchen", THIRD, check=True).startswith("only checked, nothing is changed: place")
@@ -140,7 +136,7 @@ def test_what_is_said_holds_at_once_in_memory_and_not_in_the_file(joined: Path) 
     assert joined.read_bytes() == before and not mapweave.open(joined).annotations().made
 
 
-def test_links_between_floors_fall_with_the_next_correction(joined: Path) -> None:
+def test_links_between_floors_fall_with_the_next_correction(joined: Path):
     room = mapweave.open(joined)
     room.floor(FIRST, "ground")
     with pytest.raises(mapweave.Refused):
@@ -151,7 +147,7 @@ def test_links_between_floors_fall_with_the_next_correction(joined: Path) -> Non
     assert not room.explain_maps("r0.1", "r1.1")[0].joined
 
 
-def test_a_store_stays_as_it_is(tmp_path: Path) -> None:
+def test_a_store_stays_as_it_is(tmp_path):
     store = write_store(tmp_path / "s0.sqlite", looked_around((MapId("r0", 1), MapId("r1", 1)), seed=6))
     before = store.read_bytes()
     room = mapweave.open(store, by="anna")
@@ -165,7 +161,7 @@ def test_a_store_stays_as_it_is(tmp_path: Path) -> None:
     assert store.read_bytes() == before
 
 
-def test_a_robots_own_map_is_pinned() -> None:
+def test_a_robots_own_map_is_pinned():
     """Its file has no poses: they follow from its edges."""
     (changes,) = looked_around((MapId("r0", 1),), seed=8).values()
     alone = mapweave.FileMap(MapFile("agent", "r0.1", tuple(changes)))
@@ -174,9 +170,7 @@ def test_a_robots_own_map_is_pinned() -> None:
     assert not alone.content.poses
 
 
-def test_what_is_refused_has_the_reason_of_the_shell(
-    joined: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_refused_has_the_reason_of_the_shell(joined: Path, tmp_path, capsys):
     path = tmp_path / "parted.mapweave"
     parted = mapweave.open(joined)
     parted.unlink("r0.1", "r1.1")
@@ -208,7 +202,7 @@ def test_what_is_refused_has_the_reason_of_the_shell(
     assert not room.annotations().made and path.read_bytes() == before
 
 
-def test_a_file_has_the_methods_of_a_fleet() -> None:
+def test_a_file_has_the_methods_of_a_fleet():
     own = [name for name in vars(AnnotationMethods) if not name.startswith("_")]
     assert {"place", "close_way", "prefer", "floor", "portal", "pin", "plan", "withdraw"} <= {*own}
     for kind in (mapweave.FileMap, mapweave.Fleet):

@@ -1,7 +1,5 @@
 """`mapweave map explain | unmerge | merge`, on files and against a real server process."""
 
-from __future__ import annotations
-
 import json
 import re
 import time
@@ -71,7 +69,7 @@ def links(path: Path) -> list[tuple[NodeId, NodeId]]:
     return [link.pair for link in merged_of(read_map_file(path)).links if not link.within]
 
 
-def test_merging_prints_joined_and_separate_maps(files: list[Path], said: Said, tmp_path: Path) -> None:
+def test_merging_prints_joined_and_separate_maps(files: list[Path], said: Said, tmp_path):
     out = said("map", "merge", *files[:3], "-o", tmp_path / "m.mapweave")
     assert "12 nodes, 3 maps, 2 components" in out and "r0.1 and r1.1 are one map now, by " in out
     assert "r0.1 and r2.1 are not one map: " in out
@@ -82,13 +80,13 @@ def test_merging_prints_joined_and_separate_maps(files: list[Path], said: Said, 
     assert values["links"] == len(links(files[3]))
 
 
-def test_merging_in_steps_is_merging_at_once(files: list[Path], said: Said, tmp_path: Path) -> None:
+def test_merging_in_steps_is_merging_at_once(files: list[Path], said: Said, tmp_path):
     said("map", "merge", files[1], files[2], "-o", tmp_path / "two.mapweave")
     said("map", "merge", tmp_path / "two.mapweave", files[0], "-o", tmp_path / "three.mapweave")
     assert (tmp_path / "three.mapweave").read_bytes() == files[3].read_bytes()
 
 
-def test_how_maps_are_merged_can_be_chosen(files: list[Path], said: Said, tmp_path: Path) -> None:
+def test_how_maps_are_merged_can_be_chosen(files: list[Path], said: Said, tmp_path):
     path, out = tmp_path / "strict.toml", tmp_path / "m.mapweave"
     usual = said("map", "merge", *files[:3], "-o", out, "--json")
     path.write_text("[merge.consistency]\ngate = 1e-6\n")
@@ -98,7 +96,7 @@ def test_how_maps_are_merged_can_be_chosen(files: list[Path], said: Said, tmp_pa
     assert main(["map", "merge", *map(str, files[:3]), "-o", str(out), "--settings", str(path)]) == 1
 
 
-def test_a_link_is_explained_and_drawn(files: list[Path], said: Said, tmp_path: Path) -> None:
+def test_a_link_is_explained_and_drawn(files: list[Path], said: Said, tmp_path):
     pair = links(files[3])[0]
     picture = tmp_path / "pictures" / "link.png"
     out = said("map", "explain", *pair, "--map", files[3], "--draw", picture)
@@ -122,9 +120,7 @@ def test_a_link_is_explained_and_drawn(files: list[Path], said: Said, tmp_path: 
     assert np.shape(values["a_from_b"]["covariance"]) == (3, 3)
 
 
-def test_a_route_is_explained(
-    files: list[Path], said: Said, capfd: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_route_is_explained(files: list[Path], said: Said, capfd, tmp_path):
     start, goal = links(files[3])[0]
     values = json.loads(said("map", "route", start, goal, "--json", "--map", files[3]))
     assert values["found"] and values["hops"][0]["a"] == str(start) and values["hops"][-1]["b"] == str(goal)
@@ -149,7 +145,7 @@ def test_a_route_is_explained(
     assert "r0.1 is a map: give one of its nodes" in capfd.readouterr().err
 
 
-def test_places_are_named_beside_their_nodes(files: list[Path], said: Said, tmp_path: Path) -> None:
+def test_places_are_named_beside_their_nodes(files: list[Path], said: Said, tmp_path):
     """Only the nodes were named: who had asked for `kitchen` could not see what was taken for it."""
     path = tmp_path / "m.mapweave"
     path.write_bytes(files[3].read_bytes())
@@ -164,7 +160,7 @@ def test_places_are_named_beside_their_nodes(files: list[Path], said: Said, tmp_
         assert out.startswith(f"{first} and kitchen ({second}) are linked: ")
 
 
-def test_maps_are_explained(files: list[Path], said: Said) -> None:
+def test_maps_are_explained(files: list[Path], said: Said):
     values = json.loads(said("map", "explain", "--map", files[3], "--json"))["maps"]
     assert [(item["first"], item["second"], item["joined"]) for item in values] == [
         ("r0.1", "r2.1", False), ("r1.1", "r2.1", False), ("r0.1", "r1.1", True),
@@ -173,7 +169,7 @@ def test_maps_are_explained(files: list[Path], said: Said) -> None:
     assert said("map", "explain", "--map", files[0]) == "there are no two maps\n"
 
 
-def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, tmp_path: Path) -> None:
+def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, tmp_path):
     path = tmp_path / "m.mapweave"
     path.write_bytes(files[3].read_bytes())
     out = said("map", "unmerge", "r0.1", "r1.1", "--because", "two kitchens", "--by", "anna", "--map", path)
@@ -200,9 +196,7 @@ def test_unmerging_in_a_file_and_taking_it_back(files: list[Path], said: Said, t
     assert links(tmp_path / "one.mapweave") == [other for other in links(path) if other != pair]
 
 
-def test_what_a_correction_says_for_a_script_takes_it_back(
-    files: list[Path], said: Said, tmp_path: Path
-) -> None:
+def test_what_a_correction_says_for_a_script_takes_it_back(files: list[Path], said: Said, tmp_path):
     path = tmp_path / "m.mapweave"
     path.write_bytes(files[3].read_bytes())
     checked = json.loads(said("map", "retire", "r1.1", "--check", "--json", "--map", path))
@@ -216,9 +210,7 @@ def test_what_a_correction_says_for_a_script_takes_it_back(
     assert apart["number"] == 4 and "r0.1 and r1.1 are not one map" in apart["said"]
 
 
-def test_an_entry_that_was_taken_back_is_not_undone_again(
-    files: list[Path], said: Said, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_entry_that_was_taken_back_is_not_undone_again(files: list[Path], said: Said, tmp_path, capfd):
     path = tmp_path / "m.mapweave"
     path.write_bytes(files[3].read_bytes())
     for undo, who in (([], "anna"), (["--undo"], "bob"), ([], "carl")):
@@ -230,7 +222,7 @@ def test_an_entry_that_was_taken_back_is_not_undone_again(
     assert path.read_bytes() == before, "what carl decided holds"
 
 
-def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Said, tmp_path: Path) -> None:
+def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Said, tmp_path):
     path = tmp_path / "m.mapweave"
     path.write_bytes(files[3].read_bytes())
     before = read_map_file(path)
@@ -265,9 +257,7 @@ def test_retiring_a_map_in_a_file_and_taking_it_back(files: list[Path], said: Sa
     )
 
 
-def test_linking_in_a_file_and_taking_it_back(
-    files: list[Path], said: Said, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_linking_in_a_file_and_taking_it_back(files: list[Path], said: Said, tmp_path, capfd):
     path = tmp_path / "m.mapweave"
     path.write_bytes(files[3].read_bytes())
     wrong = ["map", "link", "r0.1.1", "r2.1.3", "--map", str(path)]
@@ -334,8 +324,8 @@ def test_linking_in_a_file_and_taking_it_back(
     ],
 )
 def test_bad_input_is_reported_in_one_line(
-    files: list[Path], capfd: pytest.CaptureFixture[str], arguments: list[str], words: str, status: int
-) -> None:
+    files: list[Path], capfd, arguments: list[str], words: str, status: int
+):
     before = files[3].read_bytes()
     capfd.readouterr()
     assert main(["map", *arguments, "--map", str(files[3])]) == status
@@ -344,9 +334,7 @@ def test_bad_input_is_reported_in_one_line(
     assert files[3].read_bytes() == before and not Path("x.png").exists()
 
 
-def test_of_an_older_and_a_newer_file_the_newer_counts(
-    files: list[Path], said: Said, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_of_an_older_and_a_newer_file_the_newer_counts(files: list[Path], said: Said, tmp_path, capfd):
     out, older, other = (tmp_path / name for name in ("m.mapweave", "older.mapweave", "other.mapweave"))
     content = read_map_file(files[0])
     nodes = [change for change in content.changes if isinstance(change, NodePut)]
@@ -373,9 +361,7 @@ def test_of_an_older_and_a_newer_file_the_newer_counts(
     assert not (tmp_path / "none").exists()
 
 
-def test_a_time_window_that_ends_before_it_begins_is_named_as_it_was_given(
-    capfd: pytest.CaptureFixture[str],
-) -> None:
+def test_a_time_window_that_ends_before_it_begins_is_named_as_it_was_given(capfd):
     """It was said in nanoseconds since 1970."""
     window = ["--from", "2026-03-01T12:00", "--until", "2026-03-01T11:00"]
     assert main(["map", "retire", "r0.1", *window]) == USAGE
@@ -383,9 +369,7 @@ def test_a_time_window_that_ends_before_it_begins_is_named_as_it_was_given(
     assert capfd.readouterr().err == f"mapweave: {said}\n"
 
 
-def test_mismatched_files_are_reported_in_one_line(
-    files: list[Path], capfd: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_mismatched_files_are_reported_in_one_line(files: list[Path], capfd, tmp_path):
     capfd.readouterr()
     out = tmp_path / "m.mapweave"
     assert main(["map", "unmerge", "r0.1", "r1.1", "--map", str(files[0])]) == 1
@@ -414,7 +398,7 @@ def serving(folder: Path, port: int) -> Iterator[None]:
 
 
 @pytest.mark.slow
-def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Said, tmp_path: Path) -> None:
+def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Said, tmp_path):
     write_store(tmp_path / "s0.sqlite", logs())
     port = free_port()
     at = ["--fleet", "why", "--connect", f"tcp/127.0.0.1:{port}"]
@@ -478,13 +462,8 @@ def said_or_refused(text: Said, *arguments: object) -> str:
 
 @pytest.mark.parametrize("late", ["retire", "place"])
 def test_two_commands_on_one_file_at_once_lose_nothing_of_each_other(
-    files: list[Path],
-    tmp_path: Path,
-    said: Said,
-    capfd: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
-    late: str,
-) -> None:
+    files: list[Path], tmp_path, said: Said, capfd, monkeypatch, late: str
+):
     """The second one reads the file before the first one has written it."""
     path = tmp_path / "both.mapweave"
     path.write_bytes(files[-1].read_bytes())

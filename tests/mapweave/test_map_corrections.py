@@ -1,7 +1,5 @@
 """Corrections of a map from Python: what they leave is what the shell's commands leave in a file."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 
@@ -35,7 +33,7 @@ def by_shell(path: Path, *words: str) -> MapFile:
     return read_map_file(path)
 
 
-def test_python_and_shell_leave_the_same_file(joined: Path, tmp_path: Path) -> None:
+def test_python_and_shell_leave_the_same_file(joined: Path, tmp_path):
     path = tmp_path / "shell.mapweave"
     path.write_bytes(joined.read_bytes())
     room = mapweave.open(joined, by="anna")
@@ -59,7 +57,7 @@ def test_python_and_shell_leave_the_same_file(joined: Path, tmp_path: Path) -> N
     assert [one.who for one in room.constraints()] == ["anna"] * 4
 
 
-def test_a_map_is_changed_in_memory_until_it_is_saved(joined: Path) -> None:
+def test_a_map_is_changed_in_memory_until_it_is_saved(joined: Path):
     room, before = mapweave.open(joined), joined.read_bytes()
     assert room.unlink(*NAMES, check=True).startswith("only checked")
     assert not room.constraints()
@@ -68,7 +66,7 @@ def test_a_map_is_changed_in_memory_until_it_is_saved(joined: Path) -> None:
     assert joined.read_bytes() == before and not mapweave.open(joined).constraints()
 
 
-def test_a_link_by_hand_is_held_against_images_and_geometry(joined: Path) -> None:
+def test_a_link_by_hand_is_held_against_images_and_geometry(joined: Path):
     room, ends = mapweave.open(joined, by="anna"), ("r0.1.1", "r1.1.7")
     there, here = (room.pose(end).mean for end in ends)
     with pytest.raises(mapweave.Refused, match="do not show one place: "):
@@ -84,7 +82,7 @@ def test_a_link_by_hand_is_held_against_images_and_geometry(joined: Path) -> Non
     assert not room.graph().has_edge(*ends)
 
 
-def test_what_is_not_there_is_refused(joined: Path) -> None:
+def test_what_is_not_there_is_refused(joined: Path):
     room = mapweave.open(joined)
     for wrong in (lambda: room.undo(1), lambda: room.retire("r7.1"), lambda: room.unlink("r0.1", "r7.1")):
         with pytest.raises(mapweave.MapweaveError):

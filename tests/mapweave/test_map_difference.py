@@ -1,10 +1,7 @@
 """`mapweave map diff`: what a merge changed, by maps whose difference is known."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -41,7 +38,7 @@ def placed(merged: MergedMap, move: dict[NodeId, Pose2], frame: Pose2) -> Merged
     return replace(merged, poses=poses)
 
 
-def test_a_frame_is_no_change_and_a_node_that_moved_is_found(own: MergedMap) -> None:
+def test_a_frame_is_no_change_and_a_node_that_moved_is_found(own: MergedMap):
     (same,) = difference(own, placed(own, {}, Pose2(5.0, -3.0, 2.0))).moved
     assert same.nodes == 4 and same.largest == pytest.approx(0.0, abs=1e-9)
     assert same.turn == pytest.approx(0.0, abs=1e-9)
@@ -52,7 +49,7 @@ def test_a_frame_is_no_change_and_a_node_that_moved_is_found(own: MergedMap) -> 
     assert moved.median < moved.largest
 
 
-def test_what_a_merge_changed_is_said(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_a_merge_changed_is_said(tmp_path, capfd):
     paths = []
     for map_id in (R0, R1):
         paths.append(tmp_path / f"{map_id}.mapweave")
@@ -88,7 +85,7 @@ def test_what_a_merge_changed_is_said(tmp_path: Path, capfd: pytest.CaptureFixtu
     assert capfd.readouterr().out == said
 
 
-def test_what_people_said_is_a_difference(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_what_people_said_is_a_difference(tmp_path, capfd):
     path, named = tmp_path / "r0.mapweave", tmp_path / "named.mapweave"
     write_map_file(path, MapFile("agent", "r0.1", tuple(LOGS[R0])))
     words = ["place", "add", "kitchen", "r0.1.1", "--by", "anna", "--map", str(path), "-o", str(named)]

@@ -1,7 +1,5 @@
 """`mapweave map show` on files that are written here."""
 
-from __future__ import annotations
-
 import json
 import math
 import os

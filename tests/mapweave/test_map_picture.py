@@ -1,7 +1,5 @@
 """Pictures of maps: a PNG with what was asked for in it."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """The score against a numerical optimiser, and the rules of the false link."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

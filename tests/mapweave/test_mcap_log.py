@@ -1,7 +1,5 @@
 """What a replay writes for Foxglove, read back by the definitions that the file itself has."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2
@@ -39,9 +37,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_replay_is_read_back_as_it_was(
-    drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], signals: None
-) -> None:
+def test_a_replay_is_read_back_as_it_was(drive: Path, tmp_path, capfd, signals: None):
     out = tmp_path / "logs" / "walk"
     words = ["--offline", "--data", str(tmp_path), "--epoch", "1", "--mcap-log", str(out)]
     assert main(["replay", str(drive), *words]) == 0
@@ -105,7 +101,7 @@ def test_a_replay_is_read_back_as_it_was(
     assert said["/status"][-1][1].data.startswith("carried")
 
 
-def test_ellipsoids_have_the_covariance() -> None:
+def test_ellipsoids_have_the_covariance():
     rng = np.random.default_rng(3)
     roots, points = rng.normal(0, 0.2, (5, 3, 3)), rng.normal(0, 1, (5, 3))
     covariances = roots @ np.swapaxes(roots, 1, 2)
@@ -122,7 +118,7 @@ def test_ellipsoids_have_the_covariance() -> None:
         assert [at.x, at.y, at.z] == pytest.approx(point.tolist())
 
 
-def test_the_floor_lies_where_it_was_seen() -> None:
+def test_the_floor_lies_where_it_was_seen():
     camera = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3)
     robot = RobotDescription(camera, ranger_bearings=(0.0,), ranger_reach=2.0)
     grid = OccupancyGrid(robot)
@@ -137,7 +133,7 @@ def test_the_floor_lies_where_it_was_seen() -> None:
     assert cells[int((2.4 - at.y) / side), int((1.02 - at.x) / side)] == FREE
 
 
-def test_what_repeats_itself_takes_little_room(tmp_path: Path) -> None:
+def test_what_repeats_itself_takes_little_room(tmp_path):
     """Each floor is 230 kB, nearly all of it unknown."""
     log = McapLog(str(tmp_path / "log"))
     pipeline = Pipeline(MapId("r0", 1), RobotDescription(Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3)))
@@ -151,7 +147,7 @@ def test_what_repeats_itself_takes_little_room(tmp_path: Path) -> None:
     assert (tmp_path / "log" / "log.mcap").stat().st_size < messages / 5
 
 
-def test_a_full_disk_ends_the_log_and_not_the_robot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_ends_the_log_and_not_the_robot(tmp_path, monkeypatch):
     def full(*_: object, **__: object) -> None:
         raise OSError(28, "No space left on device")
 
@@ -164,18 +160,14 @@ def test_a_full_disk_ends_the_log_and_not_the_robot(tmp_path: Path, monkeypatch:
     assert "No space left on device" in log.close()
 
 
-def test_what_is_no_place_for_a_log_is_refused(
-    drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_place_for_a_log_is_refused(drive: Path, tmp_path, capfd):
     output = complaint(capfd, "replay", drive, "--offline", "--data", tmp_path, "--mcap-log", drive)
     assert "--mcap-log" in output and "not empty" in output
     with pytest.raises(SettingsError, match=r"--mcap-log .*camera\.toml"):
         McapLog(str(drive / "camera.toml" / "x"))
 
 
-def test_agents_in_processes_of_their_own_are_given_folders_for_their_logs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_agents_in_processes_of_their_own_are_given_folders_for_their_logs(tmp_path, monkeypatch):
     """As `mapweave sim run --mcap-log` starts them."""
     scenario = load_scenario(scenario_path("office"), ["robots=2"])
     fleet = ProcessFleet(TrialStage(scenario, 1, tmp_path, AgentSettings(), mcap_log=True))

@@ -1,7 +1,5 @@
 """Merging on a recording that is made here: a drive past photographs, cut into robots."""
 
-from __future__ import annotations
-
 import csv
 import json
 import shutil
@@ -15,7 +13,7 @@ import pytest
 
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.global_localization import resumption
-from mapweave.agent.global_localization.search_policy import TO_MAP
+from mapweave.agent.global_localization.resumption import TO_MAP
 from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
 from mapweave.evaluation.merging import changes
@@ -89,9 +87,7 @@ def evaluate(folder: Path, out: Path, capsys: pytest.CaptureFixture[str], *more:
 
 
 @pytest.mark.slow
-def test_two_robots_of_one_walk_become_one_map(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_two_robots_of_one_walk_become_one_map(recording: Path, tmp_path, capsys):
     report = evaluate(recording, tmp_path / "out", capsys)
     assert report["robots"] == {"one": 100, "two": 100} and report["truth"] is True
     assert report["components"] == 1 and int(str(report["links"])) >= 2
@@ -107,9 +103,7 @@ def test_two_robots_of_one_walk_become_one_map(
 
 
 @pytest.mark.slow
-def test_a_robot_that_cannot_localize_begins_another_map(
-    recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_robot_that_cannot_localize_begins_another_map(recording: Path, tmp_path, monkeypatch):
     """After 60 images it stands in a world upside down, which it then drives through."""
     folder = tmp_path / "carried off"
     (folder / "images").mkdir(parents=True)
@@ -130,9 +124,7 @@ def test_a_robot_that_cannot_localize_begins_another_map(
 
 
 @pytest.mark.slow
-def test_without_truth_nothing_is_scored_and_pieces_can_be_chosen(
-    recording: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_truth_nothing_is_scored_and_pieces_can_be_chosen(recording: Path, tmp_path, capsys):
     bare = tmp_path / "bare"
     shutil.copytree(recording, bare)
     for name in ("truth.csv", "splits.toml"):
@@ -144,7 +136,7 @@ def test_without_truth_nothing_is_scored_and_pieces_can_be_chosen(
 
 
 @pytest.mark.parametrize("robots", [2, 3, 5])
-def test_pieces_overlap_and_no_image_is_in_two(robots: int) -> None:
+def test_pieces_overlap_and_no_image_is_in_two(robots: int):
     cuts = cut(1000, robots)
     assert cuts[0].start == 0 and cuts[-1][-1] >= 998
     for first, second in pairwise(cuts):
@@ -178,13 +170,8 @@ def test_pieces_overlap_and_no_image_is_in_two(robots: int) -> None:
     ],
 )  # fmt: skip
 def test_an_unusable_recording_is_reported_in_one_line(
-    short: Path,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    break_it,
-    more: tuple[str, ...],
-    words: str,
-) -> None:
+    short: Path, tmp_path, capsys, break_it, more: tuple[str, ...], words: str
+):
     folder = tmp_path / "broken"
     shutil.copytree(short, folder)
     break_it(folder)
@@ -194,9 +181,7 @@ def test_an_unusable_recording_is_reported_in_one_line(
     assert not (tmp_path / "out").exists()
 
 
-def test_an_image_that_cannot_be_read_is_named(
-    short: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_image_that_cannot_be_read_is_named(short: Path, tmp_path, capsys):
     folder = Path(shutil.copytree(short, tmp_path / "spoilt"))
     image = sorted((folder / "images").iterdir())[3]
     image.write_bytes(image.read_bytes()[:200])

@@ -1,7 +1,5 @@
 """A carried robot that is lost begins a new map after a few seconds, and the two are joined later."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -48,7 +46,7 @@ class CutDrive:
 
 
 @pytest.mark.slow
-def test_a_lost_robot_begins_a_new_map_that_is_joined_to_the_old_one() -> None:
+def test_a_lost_robot_begins_a_new_map_that_is_joined_to_the_old_one():
     robot, merger, began = CutDrive(), Merger(), dict[int, int]()
     for tick, made in enumerate(changes("r0", robot, AgentSettings())):  # type: ignore[arg-type]
         for change in made:

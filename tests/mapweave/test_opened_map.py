@@ -1,7 +1,5 @@
 """One map in a map file, a store and a journal: every command reads them alike, and none is changed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import random
@@ -94,7 +92,7 @@ def state(folder: Path) -> dict[str, tuple[str, int]]:
     }
 
 
-def test_what_it_is_shows_the_content(folder: Path) -> None:
+def test_what_it_is_shows_the_content(folder: Path):
     before = state(folder)
     opened = {name: open_map(folder / name) for name in ("store", "journal", "own", "merged")}
     assert state(folder) == before
@@ -111,9 +109,7 @@ def test_what_it_is_shows_the_content(folder: Path) -> None:
     assert content_hash(opened["journal"].content) == content_hash(opened["own"].content)
 
 
-def test_python_and_shell_open_the_same_map(
-    folder: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_python_and_shell_open_the_same_map(folder: Path, tmp_path, capsys):
     """Of a store with a single map Python showed nodes as in use that a person had retired."""
     one = annotated_store(tmp_path / "one.sqlite", {R0: LOGS[R0]})
     corrected = annotated_store(tmp_path / "corrected.sqlite", {R0: LOGS[R0]})
@@ -134,9 +130,7 @@ def test_python_and_shell_open_the_same_map(
 
 
 @pytest.mark.slow
-def test_every_command_reads_all_three_alike(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_every_command_reads_all_three_alike(folder: Path, tmp_path, capfd):
     before = state(folder)
 
     def answers(name: str, start: str, goal: str) -> list[str]:
@@ -168,9 +162,7 @@ def test_every_command_reads_all_three_alike(
     assert state(folder) == before
 
 
-def test_commands_that_change_a_map_refuse_stores_and_journals(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_commands_that_change_a_map_refuse_stores_and_journals(folder: Path, tmp_path, capfd):
     for name in ("store", "journal", "own"):
         copy = tmp_path / name
         shutil.copyfile(folder / name, copy)
@@ -181,9 +173,7 @@ def test_commands_that_change_a_map_refuse_stores_and_journals(
         copy.unlink()
 
 
-def test_no_command_writes_over_a_store_a_journal_or_a_map(
-    folder: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_no_command_writes_over_a_store_a_journal_or_a_map(folder: Path, tmp_path, capfd):
     """With `-o` the file that is read, or another one, was replaced without a word."""
     for name in ("store", "journal", "merged"):
         shutil.copyfile(folder / name, tmp_path / name)
@@ -206,9 +196,7 @@ def test_no_command_writes_over_a_store_a_journal_or_a_map(
 
 
 @pytest.mark.parametrize("name", ["store", "merged"])
-def test_a_constraint_on_a_store_goes_into_a_file(
-    folder: Path, tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_constraint_on_a_store_goes_into_a_file(folder: Path, tmp_path, name: str, capfd):
     """They were refused with `-o`, too, while places and closures were taken."""
     before, out = state(folder), tmp_path / "out.mapweave"
     command = ("map", "unmerge", "r0.1", "r1.1", "--map", str(folder / name))
@@ -228,7 +216,7 @@ def test_a_constraint_on_a_store_goes_into_a_file(
 
 
 @pytest.mark.parametrize("name", ["journal", "own"])
-def test_a_constraint_on_a_robots_own_map_goes_into_a_file(folder: Path, tmp_path: Path, name: str) -> None:
+def test_a_constraint_on_a_robots_own_map_goes_into_a_file(folder: Path, tmp_path, name: str):
     before, out = state(folder), tmp_path / "out.mapweave"
     assert main(["map", "retire", "r0.1.3", "--map", str(folder / name), "-o", str(out)]) == 0
     assert state(folder) == before
@@ -237,7 +225,7 @@ def test_a_constraint_on_a_robots_own_map_goes_into_a_file(folder: Path, tmp_pat
 
 
 @pytest.mark.slow
-def test_a_store_whose_server_was_killed_is_read_with_its_last_commits(tmp_path: Path) -> None:
+def test_a_store_whose_server_was_killed_is_read_with_its_last_commits(tmp_path):
     path = tmp_path / "s0.sqlite"
     code = (
         "import os, sys; from pathlib import Path\n"
@@ -257,9 +245,7 @@ def test_a_store_whose_server_was_killed_is_read_with_its_last_commits(tmp_path:
 
 
 @pytest.mark.parametrize("name", ["store", "journal", "merged"])
-def test_a_cut_off_or_newer_file_is_reported_in_one_line(
-    folder: Path, tmp_path: Path, name: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_cut_off_or_newer_file_is_reported_in_one_line(folder: Path, tmp_path, name: str, capfd):
     data = (folder / name).read_bytes()
     path = tmp_path / name
     for length in (0, 3, 12, 50, len(data) // 2):
@@ -281,7 +267,7 @@ def test_a_cut_off_or_newer_file_is_reported_in_one_line(
 
 
 @pytest.mark.slow
-def test_a_map_is_served_to_people_and_never_changed(folder: Path, tmp_path: Path) -> None:
+def test_a_map_is_served_to_people_and_never_changed(folder: Path, tmp_path):
     before = state(folder)
     with Children(tmp_path) as children:
         port = free_port()
@@ -347,7 +333,7 @@ WHOLE = MapFile(
 
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(st.randoms(use_true_random=False), st.integers(0, len(NODES) - 1))
-def test_the_same_map_has_the_same_hash_however_it_is_written(shuffle: random.Random, gone: int) -> None:
+def test_the_same_map_has_the_same_hash_however_it_is_written(shuffle: random.Random, gone: int):
     edges = [body for body in WHOLE.changes if isinstance(body, EdgePut)]
     nodes = [body for body in WHOLE.changes if isinstance(body, NodePut)]
     # Drafts that are replaced, an edge and a node that are retired, all in another order.
@@ -385,11 +371,11 @@ def test_the_same_map_has_the_same_hash_however_it_is_written(shuffle: random.Ra
         replace(WHOLE, faded={NODES[0]: np.zeros(len(CONTENTS[0].node.landmarks), bool)}),  # type: ignore[union-attr]
     ],
 )
-def test_another_map_has_another_hash(other: MapFile) -> None:
+def test_another_map_has_another_hash(other: MapFile):
     assert content_hash(other) != content_hash(WHOLE)
 
 
-def test_the_map_of_an_agent_that_runs_is_said_to_be_in_its_journal(tmp_path: Path) -> None:
+def test_the_map_of_an_agent_that_runs_is_said_to_be_in_its_journal(tmp_path):
     """`no such file`, said `map show` of the map that the agent was making."""
     (tmp_path / "r0.sqlite").touch()
     for name, words in {

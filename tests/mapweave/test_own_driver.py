@@ -1,7 +1,5 @@
 """`mapweave agent` with a driver from a file; a router without server; a second agent is refused."""
 
-from __future__ import annotations
-
 import re
 import signal
 import subprocess
@@ -67,7 +65,7 @@ def started_agent(folder: Path, name: str, endpoint: str, driver: str) -> Starte
 
 @pytest.mark.slow
 @pytest.mark.waits
-def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path: Path) -> None:
+def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     router = Started(tmp_path, "router", "router", "--listen", endpoint)
     started = [router]
@@ -110,7 +108,7 @@ def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path:
     ("stamp", "words"),
     [("time.time()", "stamp_ns .* whole nanoseconds"), ("7", "stamp_ns stands still at 7")],
 )
-def test_a_mistake_of_the_driver_is_one_line(stamp: str, words: str, tmp_path: Path, closed: str) -> None:
+def test_a_mistake_of_the_driver_is_one_line(stamp: str, words: str, tmp_path, closed: str):
     agent = started_agent(tmp_path, "agent", closed, DRIVER.replace("{stamp}", stamp))
     assert agent.process.wait(60) == 1
     *_, last = agent.said.read_text().splitlines()
@@ -120,7 +118,7 @@ def test_a_mistake_of_the_driver_is_one_line(stamp: str, words: str, tmp_path: P
 
 @pytest.mark.slow
 @pytest.mark.waits
-def test_a_driver_that_hangs_does_not_keep_the_process(tmp_path: Path, closed: str) -> None:
+def test_a_driver_that_hangs_does_not_keep_the_process(tmp_path, closed: str):
     hangs = DRIVER.replace("time.sleep(0.1)", "print('hangs', file=self.log); time.sleep(1000)")
     agent = started_agent(tmp_path, "agent", closed, hangs.replace("{stamp}", "time.time_ns()"))
     try:

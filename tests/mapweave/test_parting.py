@@ -1,7 +1,5 @@
 """A merge that loses its support is undone by itself: a real server process, two robots that map on."""
 
-from __future__ import annotations
-
 import json
 import re
 import time
@@ -110,8 +108,8 @@ def fleet(tmp_path: Path) -> Iterator[tuple[Children, list[str], list[Robot], in
 
 @pytest.mark.slow
 def test_a_merge_that_loses_its_support_is_undone_and_reported(
-    fleet: tuple[Children, list[str], list[Robot], int], tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+    fleet: tuple[Children, list[str], list[Robot], int], tmp_path, capfd
+):
     children, serve, robots, http = fleet
 
     def status() -> dict[str, object]:

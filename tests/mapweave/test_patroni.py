@@ -1,7 +1,5 @@
 """Map servers on a PostgreSQL that Patroni keeps, configured as docs/operations.md says."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Mapping
@@ -87,7 +85,7 @@ def stored(cluster: PatroniCluster) -> dict[MapId, list[tuple[int, bytes]]]:
 @pytest.mark.slow
 @pytest.mark.waits
 @pytest.mark.timeout(900)
-def test_a_fleet_outlives_its_primaries_and_nothing_acknowledged_is_lost(tmp_path: Path) -> None:
+def test_a_fleet_outlives_its_primaries_and_nothing_acknowledged_is_lost(tmp_path):
     with patroni_cluster() as cluster, Children(tmp_path / "logs") as servers:
         admin = f"{cluster.address('postgres', 'postgres')}?target_session_attrs=read-write"
         with psycopg.connect(admin, autocommit=True) as people:

@@ -1,7 +1,5 @@
 """Files and folders that the user may not use: one line says so, and what to do."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -112,7 +110,7 @@ def ended(places: dict[str, Path], tmp_path_factory: pytest.TempPathFactory) -> 
 @pytest.mark.parametrize("name", COMMANDS)
 def test_what_the_user_may_not_do_is_one_line(
     name: str, places: dict[str, Path], ended: dict[str, tuple[int, str]]
-) -> None:
+):
     status, output = ended[name]
     (line,) = output.splitlines()
     assert WORDS in line and ADVICE in line and "Errno" not in line, line

@@ -1,7 +1,5 @@
 """A map of photographs: from pictures of a simulated room with known truth, and by the command."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -49,7 +47,7 @@ def stretch(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Pose2]
     return folder, [place.world_from_camera for place in taken]
 
 
-def test_nodes_are_where_the_photographs_were_taken_up_to_scale(stretch) -> None:
+def test_nodes_are_where_the_photographs_were_taken_up_to_scale(stretch):
     folder, truth = stretch
     images = [folder / f"{number}.png" for number in range(COUNT)]
     changes = map_of_photographs(images, PHONE.intrinsics, PHONE.distortion, SPACING, MapId("hall", 1))
@@ -77,7 +75,7 @@ def test_nodes_are_where_the_photographs_were_taken_up_to_scale(stretch) -> None
         assert edge.a_from_b.covariance[0, 0] > (0.8 * SCALE_SHARE * edge.a_from_b.mean.x) ** 2
 
 
-def test_a_map_file_says_where_a_photograph_was_taken(stretch) -> None:
+def test_a_map_file_says_where_a_photograph_was_taken(stretch):
     folder, _ = stretch
     images = [folder / f"{number}.png" for number in range(COUNT)]
     camera, distortion = read_camera(folder / "camera.toml")
@@ -90,7 +88,7 @@ def test_a_map_file_says_where_a_photograph_was_taken(stretch) -> None:
     assert answer.candidates[0].node.number == 4
 
 
-def test_the_command_writes_a_map_file(stretch, tmp_path: Path, capfd) -> None:
+def test_the_command_writes_a_map_file(stretch, tmp_path, capfd):
     folder, _ = stretch
     out = tmp_path / "hall.mapweave"
     assert main(["map", "from-photos", str(folder), "--spacing", "0.5", "-o", str(out), "--json"]) == 0
@@ -102,7 +100,7 @@ def test_the_command_writes_a_map_file(stretch, tmp_path: Path, capfd) -> None:
     assert not list(tmp_path.glob("*.sqlite"))
 
 
-def test_an_invalid_stretch_is_reported_in_one_line(stretch, tmp_path: Path, capfd) -> None:
+def test_an_invalid_stretch_is_reported_in_one_line(stretch, tmp_path, capfd):
     folder, _ = stretch
     out = tmp_path / "hall.mapweave"
 
@@ -128,7 +126,7 @@ def test_an_invalid_stretch_is_reported_in_one_line(stretch, tmp_path: Path, cap
 
 
 @pytest.mark.slow
-def test_a_walk_is_repeatable_and_keeps_clear() -> None:
+def test_a_walk_is_repeatable_and_keeps_clear():
     world = world_from_table({"kind": "office", "rooms": 2}, 4, Path())
     first, again = (walk(world, PHONE, 4, 0.5, 9) for _ in range(2))
     for one, other in zip(first, again, strict=True):

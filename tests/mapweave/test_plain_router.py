@@ -1,7 +1,5 @@
 """A fleet behind a plain router of Zenoh, by the configuration that is printed for a zenohd."""
 
-from __future__ import annotations
-
 import sqlite3
 import subprocess
 import sys
@@ -119,7 +117,7 @@ def fleet(
 @pytest.mark.timeout(300)
 def test_changes_and_questions_pass_and_forged_ones_do_not(
     fleet: tuple[PlainRouter, Robot, Robot, Path, bool],
-) -> None:
+):
     router, first, second, data, keys = fleet
     first.map_on()
     second.map_on()

@@ -1,7 +1,5 @@
 """Answers in the coordinates of a floor plan: robots of `status`, places of `relocalize`."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -29,14 +27,14 @@ def robot(component: int) -> RobotEntry:
     return RobotEntry("r0", True, 0.0, AgentStatus(status, 1), Pose2(2.0, 1.0, 0.0), component)
 
 
-def test_a_robot_is_shown_on_the_plan() -> None:
+def test_a_robot_is_shown_on_the_plan():
     at = COLUMNS.index("at")
     assert cells(robot(1), PLAN)[at] == "9.00,7.00 90°"
     assert cells(robot(0), PLAN)[at] == "not on plan office"
     assert cells(robot(0))[at] == "2.00,1.00 0°"
 
 
-def test_nothing_is_minus_nothing() -> None:
+def test_nothing_is_minus_nothing():
     """A robot at the first node of its map was at -0.00,-0.00 m, -0 deg."""
     least = Pose2(-1e-5, -1e-5, -1e-5)
     there = replace(robot(0), merged_from_robot=least)
@@ -45,7 +43,7 @@ def test_nothing_is_minus_nothing() -> None:
     assert Pin(NodeId("r0", 1, 1), least).words == "at 0.000,0.000 m, 0.0 deg"
 
 
-def test_a_place_of_a_photograph_is_given_on_the_plan(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_place_of_a_photograph_is_given_on_the_plan(capsys):
     pose = PoseGaussian.from_sigmas(Pose2(2.0, 1.0, 0.0), 0.02, 0.01)
     found = replace(ANSWER.candidates[0], merged_from_robot=pose, component=1)
     answer = replace(ANSWER, candidates=(found, replace(found, component=0), ANSWER.candidates[0]))

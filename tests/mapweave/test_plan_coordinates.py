@@ -1,7 +1,5 @@
 """Coordinates of a floor plan, where commands and Python take and give positions in the merged map."""
 
-from __future__ import annotations
-
 import json
 import math
 from pathlib import Path
@@ -79,7 +77,7 @@ def farthest(room: mapweave.Map) -> tuple[str, str]:
     return str(room.nodes.ids[k]), f"{x:.3f},{y:.3f}"
 
 
-def test_nodes_exports_and_plots_of_python(planned: Path, tmp_path: Path) -> None:
+def test_nodes_exports_and_plots_of_python(planned: Path, tmp_path):
     room = mapweave.open(planned)
     expected = on_plan(positions(room))
     nodes = room.nodes_on("flat")
@@ -105,7 +103,7 @@ def test_nodes_exports_and_plots_of_python(planned: Path, tmp_path: Path) -> Non
         room.export(tmp_path / "no.g2o", component=1, plan="flat")
 
 
-def test_places_and_closures(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_places_and_closures(copy: Path, capsys):
     node, at = farthest(mapweave.open(copy))
     words = ["--map", str(copy), "--plan", "flat"]
     assert main(["place", "add", "far", at, *words]) == 0
@@ -141,7 +139,7 @@ def test_places_and_closures(copy: Path, capsys: pytest.CaptureFixture[str]) -> 
     assert "no plan 'none'; there are: flat" in capsys.readouterr().err
 
 
-def test_a_route_from_position_to_position(planned: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_route_from_position_to_position(planned: Path, capsys):
     room = mapweave.open(planned)
     goal, at = farthest(room)
     first, points = str(room.nodes.ids[0]), on_plan(positions(room))
@@ -162,7 +160,7 @@ def test_a_route_from_position_to_position(planned: Path, capsys: pytest.Capture
     assert str(way.goal) == goal and way.found
 
 
-def test_floors_and_portals_on_the_plan(copy: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_floors_and_portals_on_the_plan(copy: Path, capsys):
     room = mapweave.open(copy)
     node, at = farthest(room)
     points, used = on_plan(positions(room)), ~room.nodes.superseded
@@ -210,9 +208,7 @@ def apart(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
-def test_positions_are_in_the_part_of_the_map_that_near_names(
-    apart: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_positions_are_in_the_part_of_the_map_that_near_names(apart: Path, tmp_path, capsys):
     room = mapweave.open(apart)
     of_second = np.array([str(one).startswith("r1.") for one in room.nodes.ids])
     assert set(room.nodes.component[of_second]) == {1} and set(room.nodes.component[~of_second]) == {0}
@@ -250,7 +246,7 @@ def test_positions_are_in_the_part_of_the_map_that_near_names(
     assert (str(gate.a), str(gate.b)) == (ids[first], ids[last])
 
 
-def test_an_area_of_the_plan_is_retired(copy: Path) -> None:
+def test_an_area_of_the_plan_is_retired(copy: Path):
     room = mapweave.open(copy)
     node, at = farthest(room)
     x, y = map(float, at.split(","))
@@ -266,9 +262,7 @@ def test_an_area_of_the_plan_is_retired(copy: Path) -> None:
     assert main(["map", "retire", node, "--map", str(copy), "--plan", "flat"]) == USAGE
 
 
-def test_a_pin_gives_the_map_the_coordinates_of_the_plan(
-    copy: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_pin_gives_the_map_the_coordinates_of_the_plan(copy: Path, capsys):
     room = mapweave.open(copy)
     node, _ = farthest(room)
     expected = on_plan(positions(room))
@@ -291,9 +285,7 @@ def test_a_pin_gives_the_map_the_coordinates_of_the_plan(
         room.pin(node, mapweave.Pose2(), plan="flat")
 
 
-def test_a_name_for_a_superseded_node_says_where_robots_go(
-    copy: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_name_for_a_superseded_node_says_where_robots_go(copy: Path, capsys):
     room = mapweave.open(copy)
     node = str(room.nodes.ids[room.nodes.superseded][0])
     by = room.content.superseded[mapweave.NodeId.parse(node)].by
@@ -305,9 +297,7 @@ def test_a_name_for_a_superseded_node_says_where_robots_go(
 
 
 @pytest.mark.parametrize("form", ["rmf", "nav2", "tf", "json"])
-def test_an_export_of_a_plan_as_one_object(
-    planned: Path, form: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_export_of_a_plan_as_one_object(planned: Path, form: str, capsys):
     """`--json` was taken, and the other text was printed all the same."""
     words = ["plan", "export", "flat", "--format", form, "--map", str(planned)]
     assert main(words) == 0

@@ -1,7 +1,5 @@
 """Exports of floor plans, read as those who want them read them."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -57,7 +55,7 @@ def estimated(source: Array, target: Array) -> tuple[float, float, Array]:
     return math.atan2(r, s), math.hypot(s, r), np.array(shift)
 
 
-def test_rmf_estimates_the_transform_from_the_reference_coordinates(placed: PlacedPlan) -> None:
+def test_rmf_estimates_the_transform_from_the_reference_coordinates(placed: PlacedPlan):
     text = export_rmf(placed, placed.part())
     ((level, coordinates),) = YAML(typ="safe").load(text)["reference_coordinates"].items()
     assert level == placed.name
@@ -75,7 +73,7 @@ def test_rmf_estimates_the_transform_from_the_reference_coordinates(placed: Plac
     assert [float(word) for word in words.groups()] == pytest.approx([rotation, *shift], abs=5e-3)
 
 
-def test_nav2_puts_each_pixel_under_the_map(placed: PlacedPlan) -> None:
+def test_nav2_puts_each_pixel_under_the_map(placed: PlacedPlan):
     fields = YAML(typ="safe").load(export_nav2(placed, placed.part()))
     assert fields["image"] == "office.pgm" and fields["resolution"] == SCALE
     x, y, yaw = fields["origin"]
@@ -90,13 +88,13 @@ def test_nav2_puts_each_pixel_under_the_map(placed: PlacedPlan) -> None:
 
 
 @pytest.mark.parametrize("name", ["!!python/object/apply:os.system [id]", "a: b # c.png", "'\"*&.png"])
-def test_the_name_of_an_image_is_a_text_and_no_yaml(placed: PlacedPlan, name: str) -> None:
+def test_the_name_of_an_image_is_a_text_and_no_yaml(placed: PlacedPlan, name: str):
     """Some programs of ROS 1 read a map.yaml with a loader that runs what such a tag names."""
     named = replace(placed, plan=replace(placed.plan, image=replace(placed.plan.image, file=name)))
     assert YAML(typ="safe").load(export_nav2(named, named.part()))["image"] == name
 
 
-def test_tf_places_the_frame_of_the_plan_in_that_of_the_map(placed: PlacedPlan) -> None:
+def test_tf_places_the_frame_of_the_plan_in_that_of_the_map(placed: PlacedPlan):
     words = export_tf(placed, placed.part()).split()
     options = dict(zip(words[4::2], words[5::2], strict=True))
     assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
@@ -108,7 +106,7 @@ def test_tf_places_the_frame_of_the_plan_in_that_of_the_map(placed: PlacedPlan) 
     )
 
 
-def test_json_has_both_directions_and_every_pair(placed: PlacedPlan) -> None:
+def test_json_has_both_directions_and_every_pair(placed: PlacedPlan):
     content = json.loads(export_json(placed, placed.part()))
     there, back = Pose2(*content["plan_from_merged"]), Pose2(*content["merged_from_plan"])
     assert np.allclose((there @ back).vector, 0.0, atol=1e-9)

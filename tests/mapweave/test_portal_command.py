@@ -1,9 +1,6 @@
 """The command that takes a robot through a portal: real processes, and a clock that the test moves."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -32,7 +29,7 @@ class Trial:
         return bool(self.done or self.lines)
 
 
-def test_it_is_run_once_a_request_and_knows_where_the_robot_is_to_go(tmp_path: Path) -> None:
+def test_it_is_run_once_a_request_and_knows_where_the_robot_is_to_go(tmp_path):
     report = (
         'echo "$MAPWEAVE_ROBOT, $MAPWEAVE_KIND $MAPWEAVE_PORTAL, $MAPWEAVE_FLOOR, $MAPWEAVE_ASKED" >> report'
     )
@@ -53,7 +50,7 @@ def test_it_is_run_once_a_request_and_knows_where_the_robot_is_to_go(tmp_path: P
         (("/nowhere/lift",), "the portal command cannot be run: [Errno 2]"),
     ],
 )  # fmt: skip
-def test_one_that_fails_leaves_the_robot_to_people(command: tuple[str, ...], line: str) -> None:
+def test_one_that_fails_leaves_the_robot_to_people(command: tuple[str, ...], line: str):
     trial = Trial(*command)
     eventually(lambda: trial.seen(PortalWait(LIFT)))
     assert len(trial.lines) == 1 and trial.lines[0].startswith(line) and trial.done == []
@@ -61,9 +58,7 @@ def test_one_that_fails_leaves_the_robot_to_people(command: tuple[str, ...], lin
     assert len(trial.lines) == 1, "it is not tried again"
 
 
-def test_one_that_hangs_is_ended_with_its_children_and_so_is_one_that_is_needed_no_more(
-    tmp_path: Path,
-) -> None:
+def test_one_that_hangs_is_ended_with_its_children_and_so_is_one_that_is_needed_no_more(tmp_path):
     hang = f"echo $$ > '{tmp_path}/pid'; sleep 600 & wait"
     for leave in (False, True):
         trial = Trial("sh", "-c", hang)
@@ -77,7 +72,7 @@ def test_one_that_hangs_is_ended_with_its_children_and_so_is_one_that_is_needed_
         assert trial.lines == ([] if leave else ["the portal command took longer than 60 s and was ended"])
 
 
-def test_a_person_may_be_faster() -> None:
+def test_a_person_may_be_faster():
     def late(by: str) -> None:
         raise InvalidValue("r0 does not wait at a portal")
 

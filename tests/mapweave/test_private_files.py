@@ -1,7 +1,5 @@
 """With keys, what server and agent write is for their own user alone; without, as the umask says."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
@@ -45,7 +43,7 @@ def modes(folder: Path) -> dict[str, int]:
     ("process", "keys"),
     first_quick([("server", False), ("server", True), ("agent", True), ("agent", False)], 3),
 )
-def test_files_are_for_their_owner_alone_if_there_are_keys(keys: bool, process: str, tmp_path: Path) -> None:
+def test_files_are_for_their_owner_alone_if_there_are_keys(keys: bool, process: str, tmp_path):
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, [], "s0", free_port())
     folder.add("r0", Role.ROBOT)
     (tmp_path / "standing.py").write_text(DRIVER)

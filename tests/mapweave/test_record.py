@@ -1,7 +1,5 @@
 """`mapweave record` and `mapweave agent --record` with a driver of one's own."""
 
-from __future__ import annotations
-
 import errno
 from pathlib import Path
 
@@ -44,7 +42,7 @@ def driver(tmp_path: Path) -> str:
 
 
 @pytest.mark.parametrize("by", ["record", "agent"])
-def test_what_a_robot_senses_is_replayed(by: str, driver: str, tmp_path: Path) -> None:
+def test_what_a_robot_senses_is_replayed(by: str, driver: str, tmp_path):
     out = tmp_path / "drive"
     nowhere = ["--robot", driver, "--connect", "tcp/127.0.0.1:1"]
     if by == "record":
@@ -58,9 +56,7 @@ def test_what_a_robot_senses_is_replayed(by: str, driver: str, tmp_path: Path) -
     assert steps[1:] == [pytest.approx((0.02, 0.01))] * 19
 
 
-def test_a_recording_is_not_overwritten(
-    driver: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_is_not_overwritten(driver: str, tmp_path, capfd):
     (tmp_path / "drive").mkdir()
     (tmp_path / "drive" / "notes.txt").write_text("mine")
     nowhere = ["--robot", driver, "--connect", "tcp/127.0.0.1:1"]
@@ -69,9 +65,7 @@ def test_a_recording_is_not_overwritten(
     assert [p.name for p in (tmp_path / "drive").iterdir()] == ["notes.txt"]
 
 
-def test_no_robot_is_opened_for_a_folder_that_is_in_use(
-    driver: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_no_robot_is_opened_for_a_folder_that_is_in_use(driver: str, tmp_path, capfd):
     """It stayed open, and the thread of its camera aborted the process while that ended: status 134."""
     (tmp_path / "rolling.py").write_text(DRIVER.replace("self.count = 0", "raise SystemExit('it is opened')"))
     (tmp_path / "drive").mkdir()
@@ -81,9 +75,7 @@ def test_no_robot_is_opened_for_a_folder_that_is_in_use(
     assert "not empty" in capfd.readouterr().err
 
 
-def test_a_full_disk_ends_the_command(
-    driver: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_ends_the_command(driver: str, tmp_path, monkeypatch, capfd):
     endless = (tmp_path / "rolling.py").read_text().replace("self.count > 20", "time.sleep(0.01)")
     (tmp_path / "rolling.py").write_text(f"import time\n{endless}")
 

@@ -1,7 +1,5 @@
 """A map of which a server refused a change is implausible: also without that server."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -62,7 +60,7 @@ def merged(out: Path, *files: Path) -> Path:
     return out
 
 
-def test_a_merge_without_the_server_knows_it(stores: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_merge_without_the_server_knows_it(stores: tuple[Path, Path], tmp_path):
     sound, unsound = stores
     assert implausible(sound) == set() and implausible(unsound) == {R1}
     whole = merged(tmp_path / "unsound", unsound)
@@ -76,7 +74,7 @@ def test_a_merge_without_the_server_knows_it(stores: tuple[Path, Path], tmp_path
     assert implausible(apart) == {R1} and read_map_file(apart).refused_changes.keys() == {R1}
 
 
-def test_a_correction_keeps_what_is_left_of_pruned_nodes(stores: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_correction_keeps_what_is_left_of_pruned_nodes(stores: tuple[Path, Path], tmp_path):
     """The links between their neighbours, which no comparison of images finds again."""
     path = merged(tmp_path / "whole", stores[0])
     content = read_map_file(path)
@@ -89,7 +87,7 @@ def test_a_correction_keeps_what_is_left_of_pruned_nodes(stores: tuple[Path, Pat
     assert [(edge.a, edge.b) for edge in marginal_links(read_map_file(path))] == [(a, b)]
 
 
-def test_a_server_that_begins_with_the_file_knows_it(stores: tuple[Path, Path], tmp_path: Path) -> None:
+def test_a_server_that_begins_with_the_file_knows_it(stores: tuple[Path, Path], tmp_path):
     for store, known in zip(stores, (set(), {R1}), strict=True):
         base = BaseMap.of(store.name, open_map(store).content)
         with MapServer(
@@ -98,7 +96,7 @@ def test_a_server_that_begins_with_the_file_knows_it(stores: tuple[Path, Path], 
             assert server.settle(60) and server.merged().implausible.keys() == known
 
 
-def test_a_damaged_store_still_says_which_map(stores: tuple[Path, Path]) -> None:
+def test_a_damaged_store_still_says_which_map(stores: tuple[Path, Path]):
     sound, unsound = stores
     assert salvage(sound).refused_changes == {}
     found = salvage(unsound).refused_changes

@@ -1,7 +1,5 @@
 """`mapweave relocalize` and its picture, against a map server over Zenoh in this process."""
 
-from __future__ import annotations
-
 import json
 import re
 import socket
@@ -85,7 +83,7 @@ def photo(tmp_path: Path) -> Path:
     return tmp_path / "moved.png"
 
 
-def test_a_photograph_is_found_and_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:
+def test_a_photograph_is_found_and_drawn(served: str, photo: Path, tmp_path, capfd):
     drawn = tmp_path / "matches.png"
     assert main(["relocalize", str(photo), "--connect", served, "--json", "--draw", str(drawn)]) == 0
     answer = json.loads(capfd.readouterr().out)
@@ -102,7 +100,7 @@ def test_a_photograph_is_found_and_drawn(served: str, photo: Path, tmp_path: Pat
     assert result is not None and float(result[1]) == pytest.approx(MOVED.x, abs=0.03)
 
 
-def test_a_map_file_answers_without_a_server(node: Node, photo: Path, tmp_path: Path, capfd) -> None:
+def test_a_map_file_answers_without_a_server(node: Node, photo: Path, tmp_path, capfd):
     path, drawn = tmp_path / "place.mapweave", tmp_path / "matches.png"
     write_map_file(path, MapFile("agent", "r0.1", (NodePut(node),)))
     journal = Journal(tmp_path / "r0.sqlite", "r0")
@@ -125,7 +123,7 @@ def test_a_map_file_answers_without_a_server(node: Node, photo: Path, tmp_path: 
     assert "is neither a map file" in capfd.readouterr().err
 
 
-def test_unknown_values_are_not_drawn(served: str, photo: Path, tmp_path: Path, capfd) -> None:
+def test_unknown_values_are_not_drawn(served: str, photo: Path, tmp_path, capfd):
     cv2.imwrite(str(photo), np.full((240, 320), 90, np.uint8))
     drawn = tmp_path / "matches.png"
     assert main(["relocalize", str(photo), "--connect", served, "--draw", str(drawn)]) == NO
@@ -137,7 +135,7 @@ def test_unknown_values_are_not_drawn(served: str, photo: Path, tmp_path: Path, 
     assert "end its name with .png" in capfd.readouterr().err
 
 
-def test_a_busy_server_is_asked_again(served: str, photo: Path, capfd, monkeypatch) -> None:
+def test_a_busy_server_is_asked_again(served: str, photo: Path, capfd, monkeypatch):
     real, asked = Services.locate, []
 
     def busy_twice(self: Services, *question) -> Future[RelocalizeAnswer]:
@@ -154,7 +152,7 @@ def test_a_busy_server_is_asked_again(served: str, photo: Path, capfd, monkeypat
     assert "the map server is busy, retry after 60.0 s" in capfd.readouterr().err
 
 
-def test_matches_that_agree_are_explained_by_the_pose(node: Node) -> None:
+def test_matches_that_agree_are_explained_by_the_pose(node: Node):
     """By hand, match by match; a pose that is wrong explains next to nothing."""
     view = view_of(picture(MOVED))
     overlay = Overlay.of(node, view, MOVED)
@@ -169,7 +167,7 @@ def test_matches_that_agree_are_explained_by_the_pose(node: Node) -> None:
     assert wrong.agreeing.sum() < 0.1 * len(wrong.pairs)
 
 
-def test_wide_images_are_stacked(node: Node, tmp_path: Path) -> None:
+def test_wide_images_are_stacked(node: Node, tmp_path):
     view = view_of(picture(MOVED))
     wide = Camera(640, 240, 277.0, 277.0, 319.5, 119.5, mount_height=0.3)
     moved = View(view.pixels + np.array([160, 0], np.float32), view.codes, wide)

@@ -1,7 +1,5 @@
 """`mapweave eval replay` against evo, and what it says of frames that were not used."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from pathlib import Path
@@ -34,7 +32,7 @@ def trajectory(poses: np.ndarray) -> PoseTrajectory3D:
     )
 
 
-def test_errors_are_those_of_evo() -> None:
+def test_errors_are_those_of_evo():
     """Steps of 0.25 m make a metre four frames, which evo can be asked for."""
     rng = np.random.default_rng(3)
     pose, rows = Pose2(2.0, 1.0, 0.4), []
@@ -60,7 +58,7 @@ def test_errors_are_those_of_evo() -> None:
         assert measured == pytest.approx(relative.get_statistic(metrics.StatisticsType.rmse), rel=0.02)
 
 
-def test_parts_are_aligned_one_by_one() -> None:
+def test_parts_are_aligned_one_by_one():
     """Two maps of a drive, each exact in a frame of its own, have no error."""
     true = np.array([[0.1 * k, 0.02 * k * k, 0.1 * k] for k in range(40)])
     moved = [Pose2(9.0, 9.0, 1.0) @ Pose2.from_vector(row) if k < 20 else Pose2.from_vector(row)
@@ -72,9 +70,7 @@ def test_parts_are_aligned_one_by_one() -> None:
     assert errors(mine[:0], true[:0], np.zeros(0)) == (None, None, None)
 
 
-def test_a_geometry_that_is_declared_wrongly_is_named(
-    recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_geometry_that_is_declared_wrongly_is_named(recording: Path, tmp_path, capfd, monkeypatch):
     """As `mapweave replay` does. What finds it is tested with the calibration."""
     begin = OnlineCalibration.__init__
     cause = Cause(Parameter.TURN_SCALE, 1.0, 1.1, 0.01, 10.0)
@@ -88,9 +84,7 @@ def test_a_geometry_that_is_declared_wrongly_is_named(
     assert str(cause) in " ".join(capfd.readouterr().err.split())
 
 
-def test_a_recording_is_scored_and_its_trajectory_is_read_by_evo(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_recording_is_scored_and_its_trajectory_is_read_by_evo(tmp_path, capfd):
     """A drive towards two walls, whose odometry is 3 % long."""
     walls, folder, out = PhotoWalls(), tmp_path / "walk", tmp_path / "out"
     (folder / "images").mkdir(parents=True)
@@ -126,9 +120,7 @@ def test_a_recording_is_scored_and_its_trajectory_is_read_by_evo(
     assert f"{missing}: no such file" in complaint(capfd, "eval", "replay", folder, "--truth", missing)
 
 
-def test_a_corrected_geometry_makes_no_jump_in_the_trajectories(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_corrected_geometry_makes_no_jump_in_the_trajectories(tmp_path, capfd, monkeypatch):
     """In the middle of a drive the camera is found to be 0.4 m further ahead of the axle than declared.
 
     That it is found is tested with the calibration.
@@ -166,9 +158,7 @@ def test_a_corrected_geometry_makes_no_jump_in_the_trajectories(
 
 
 @pytest.mark.parametrize(("times", "words"), [(1.0, ""), (-1.0, "the other way than the odometry")])
-def test_odometry_with_reversed_turns_is_named(
-    times: float, words: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_odometry_with_reversed_turns_is_named(times: float, words: str, tmp_path, capfd):
     """What else is named is tested with `OdometryConvention`."""
     walls, folder = PhotoWalls(), tmp_path / "walk"
     (folder / "images").mkdir(parents=True)

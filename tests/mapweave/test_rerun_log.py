@@ -1,7 +1,5 @@
 """What a replay writes for the Rerun viewer, read back by Rerun's reader as Arrow tables."""
 
-from __future__ import annotations
-
 import threading
 import time
 from importlib.util import find_spec
@@ -45,9 +43,7 @@ def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.slow
-def test_a_replay_is_read_back_as_it_was(
-    drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], signals: None
-) -> None:
+def test_a_replay_is_read_back_as_it_was(drive: Path, tmp_path, capfd, signals: None):
     out = tmp_path / "logs" / "walk.rrd"
     words = ["--offline", "--data", str(tmp_path), "--epoch", "1", "--rerun", str(out)]
     assert main(["replay", str(drive), *words]) == 0
@@ -114,7 +110,7 @@ def test_a_replay_is_read_back_as_it_was(
 
 
 @pytest.mark.slow
-def test_ellipsoids_have_the_covariance_and_the_floor_lies_where_it_was_seen() -> None:
+def test_ellipsoids_have_the_covariance_and_the_floor_lies_where_it_was_seen():
     from rerun.components import Colormap
 
     from mapweave.processes.rerun_log import _ellipsoids, _floor
@@ -152,7 +148,7 @@ def test_ellipsoids_have_the_covariance_and_the_floor_lies_where_it_was_seen() -
     assert map_.colormap.as_arrow_array().to_pylist() == [Colormap.RvizMap.value]
 
 
-def test_the_loop_never_waits_for_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_loop_never_waits_for_the_log(tmp_path, monkeypatch):
     """A disk that stands still costs ticks of the log, and no time of the robot."""
     from mapweave.processes.rerun_log import RerunLog
     from mapweave.processes.tick_log import QUEUED
@@ -172,9 +168,7 @@ def test_the_loop_never_waits_for_the_log(tmp_path: Path, monkeypatch: pytest.Mo
     assert len(rows_of(tmp_path / "r0.rrd")["/r0/tracked:scalars"]) == QUEUED + 40 - log.left_out
 
 
-def test_what_is_no_place_for_a_log_is_refused(
-    drive: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_place_for_a_log_is_refused(drive: Path, tmp_path, capfd):
     from mapweave.processes.rerun_log import RerunLog
 
     output = complaint(capfd, "replay", drive, "--offline", "--data", tmp_path, "--rerun", tmp_path / "x.txt")
@@ -186,7 +180,7 @@ def test_what_is_no_place_for_a_log_is_refused(
             RerunLog(address, "r0")
 
 
-def test_while_navigating_it_shows_the_landmarks_of_the_node_where_the_image_has_them() -> None:
+def test_while_navigating_it_shows_the_landmarks_of_the_node_where_the_image_has_them():
     from mapweave.processes.tick_log import tracked_of
 
     walls, start = PhotoWalls(), Pose2(0.25, -0.1, 0.08)

@@ -1,7 +1,5 @@
 """The drills of docs/operations.md, by its own commands: a dump is restored, and a moment of the past."""
 
-from __future__ import annotations
-
 import os
 import pwd
 import shutil
@@ -96,9 +94,7 @@ def shown(address: str, capsys: pytest.CaptureFixture[str]) -> str:
     return line.split()[-1]
 
 
-def test_a_dump_is_restored(
-    postgres: PostgresServer, place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_dump_is_restored(postgres: PostgresServer, place: Path, tmp_path, capsys):
     shell = PageShell(postgres, place)
     shell.run("createdb --owner mapweave maps")
     backup, restore = commands("## Backup and restore")
@@ -124,9 +120,7 @@ def test_a_dump_is_restored(
     fleet.close()
 
 
-def test_a_moment_of_the_past_is_restored(
-    postgres: PostgresServer, place: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_moment_of_the_past_is_restored(postgres: PostgresServer, place: Path, tmp_path, capsys):
     """Someone deletes everything; PostgreSQL goes back to the moment before, and robots add the rest."""
     if os.geteuid() == 0 and "postgres" not in {user.pw_name for user in pwd.getpwall()}:
         pytest.skip("there is no user postgres")

@@ -1,7 +1,5 @@
 """Settings of a robot that are not finished: one line says what to add, before anything is waited for."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -21,9 +19,7 @@ WORDS = "which the driver remote, the default, does not use: name the robot's dr
 
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize("table", TABLES)
-def test_a_robot_without_a_driver_is_refused(
-    table: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_robot_without_a_driver_is_refused(table: str, tmp_path, capfd):
     """Without this line the agent waited for a base behind the network without end."""
     settings = tmp_path / "robot.toml"
     settings.write_text(TABLES[table])
@@ -35,7 +31,7 @@ def test_a_robot_without_a_driver_is_refused(
         assert f"the settings have [robot.{table}], {WORDS}" in said and "`mapweave robots`" in said
 
 
-def test_doctor_says_it_as_well(tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_doctor_says_it_as_well(tmp_path, capfd):
     settings = tmp_path / "robot.toml"
     settings.write_text(TABLES["options"])
     words = ["doctor", "--settings", str(settings), "--data", str(tmp_path), "--offline", "--json"]
@@ -45,9 +41,7 @@ def test_doctor_says_it_as_well(tmp_path: Path, capfd: pytest.CaptureFixture[str
     assert WORDS in driver["detail"] and driver["advice"] == "name the driver of the robot in [robot]"
 
 
-def test_the_settings_file_of_a_robot_is_given_as_the_robot(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_the_settings_file_of_a_robot_is_given_as_the_robot(tmp_path, capfd):
     """`doctor --robot robot.toml` said that it is no driver."""
     settings = tmp_path / "robot.toml"
     settings.write_text('[robot]\ndriver = "koalla"\n')
@@ -62,8 +56,8 @@ def test_the_settings_file_of_a_robot_is_given_as_the_robot(
     "words", [["agent", "r0"], ["record", "r0", "--out", "drive"], ["calibrate", "drive", "--name", "r0"]]
 )
 def test_each_command_of_a_robot_takes_its_settings_file_as_the_robot(
-    words: list[str], tmp_path: Path, capfd: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    words: list[str], tmp_path, capfd, monkeypatch
+):
     monkeypatch.chdir(tmp_path)
     Path("robot.toml").write_text('[robot]\ndriver = "koalla"\n')
     command = [*words, "--connect", "tcp/127.0.0.1:9", "--robot", "robot.toml"]

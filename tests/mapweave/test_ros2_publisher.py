@@ -1,14 +1,11 @@
 """What an agent publishes for rviz and Nav2, read by a second implementation of the wire format."""
 
-from __future__ import annotations
-
 import argparse
 import math
 import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -117,9 +114,7 @@ def read_markers(data: bytes) -> dict[str, list[tuple[float, float]]]:
     return out
 
 
-def test_pose_tf_path_and_map(
-    ros: tuple[RosPeer, Ros2Publisher], walls: PhotoWalls, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_pose_tf_path_and_map(ros: tuple[RosPeer, Ros2Publisher], walls: PhotoWalls, monkeypatch):
     monkeypatch.setattr(ros2_publisher, "SLOWLY", 0.05)
     robot, publisher = ros
     pipeline, placed = on(Carried()), Placed()
@@ -214,8 +209,8 @@ def test_pose_tf_path_and_map(
 
 
 def test_without_an_odometry_frame_of_others_it_publishes_its_own(
-    ros: tuple[RosPeer, Ros2Publisher], walls: PhotoWalls, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    ros: tuple[RosPeer, Ros2Publisher], walls: PhotoWalls, monkeypatch
+):
     monkeypatch.setattr(ros2_publisher, "PATIENCE", 0.0)
     robot, publisher = ros
     transforms = robot.subscriber("/tf", KINDS["/tf"], TF_HASH)
@@ -239,7 +234,7 @@ def test_without_an_odometry_frame_of_others_it_publishes_its_own(
     assert whole.x == pytest.approx(x, abs=0.03)
 
 
-def test_names_of_agents_become_names_of_topics() -> None:
+def test_names_of_agents_become_names_of_topics():
     router = ZenohFleet()
     publisher = Ros2Publisher(Ros2Link(router.endpoints[0], domain=0, namespace="/a"), "2-kitchen")
     robot = RosPeer(router.endpoints[0])
@@ -251,7 +246,7 @@ def test_names_of_agents_become_names_of_topics() -> None:
         router.close()
 
 
-def test_an_agent_publishes_where_the_topics_of_its_robot_are(tmp_path: Path) -> None:
+def test_an_agent_publishes_where_the_topics_of_its_robot_are(tmp_path):
     emulator = Ros2Robot()
     path = tmp_path / "robot.toml"
     path.write_text(f"""

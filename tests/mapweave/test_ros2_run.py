@@ -1,13 +1,10 @@
 """A whole drive over ROS 2 topics: an agent maps in the simulator, is lifted, and begins a new map."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time
 from bisect import bisect_left
 from collections.abc import Iterator
-from pathlib import Path
 
 import cv2
 import pytest
@@ -118,7 +115,7 @@ def robot() -> Iterator[RosInSimulation]:
 @pytest.mark.slow
 @pytest.mark.waits
 @pytest.mark.timeout(400)
-def test_a_ros2_robot_maps_is_lifted_and_begins_a_new_map(robot: RosInSimulation, tmp_path: Path) -> None:
+def test_a_ros2_robot_maps_is_lifted_and_begins_a_new_map(robot: RosInSimulation, tmp_path):
     d = robot.simulation.describe("r0")
     path = tmp_path / "robot.toml"
     path.write_text(f"""

@@ -1,10 +1,6 @@
 """A server whose store no other has names the others of its fleet, each once."""
 
-from __future__ import annotations
-
 from contextlib import closing
-
-import pytest
 
 from mapweave.processes.separate_stores import SeparateStores
 from mapweave.wire.keys import Keys
@@ -12,7 +8,7 @@ from mapweave.wire.memory import MemoryBus, MemoryHub
 from tests.waiting import eventually
 
 
-def test_another_server_is_named_once(caplog: pytest.LogCaptureFixture) -> None:
+def test_another_server_is_named_once(caplog):
     hub, keys = MemoryHub(), Keys("fleet")
     with closing(MemoryBus(hub)) as own, closing(MemoryBus(hub)) as other:
         own.announce(keys.server_alive("s0"))

@@ -1,7 +1,5 @@
 """`mapweave server --demo` in a process of its own, watched and commanded through a real browser."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -11,7 +9,6 @@ import sys
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from pathlib import Path
 from urllib.request import Request, urlopen
 
 import pytest
@@ -87,7 +84,7 @@ def post(http: int, path: str, content: dict) -> dict:
         return json.load(reply)
 
 
-def test_the_port_is_open_before_large_libraries_are_loaded() -> None:
+def test_the_port_is_open_before_large_libraries_are_loaded():
     """They are a thousand files, which take a second to read where none is in memory."""
     code = (
         "import sys\n"
@@ -108,7 +105,7 @@ def test_the_port_is_open_before_large_libraries_are_loaded() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("soon", [0.0, 0.5, 1.5])
-def test_a_demo_that_is_stopped_while_it_starts_leaves_no_folder(tmp_path: Path, soon: float) -> None:
+def test_a_demo_that_is_stopped_while_it_starts_leaves_no_folder(tmp_path, soon: float):
     command = [
         sys.executable, "-m", "mapweave", "server", "--demo", "--http", str(free_port()),
         "--listen", f"tcp/127.0.0.1:{free_port()}",
@@ -123,7 +120,7 @@ def test_a_demo_that_is_stopped_while_it_starts_leaves_no_folder(tmp_path: Path,
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_goal_that_is_not_there_is_refused_with_the_reason(tmp_path: Path) -> None:
+def test_a_goal_that_is_not_there_is_refused_with_the_reason(tmp_path):
     """Of a node of its own map that there is not, a robot said that it knows its own map alone."""
     prepare(tmp_path, tmp_path / "s0.sqlite", NOTHING)
     with (
@@ -140,7 +137,7 @@ def test_a_goal_that_is_not_there_is_refused_with_the_reason(tmp_path: Path) -> 
     assert taken.state is MissionState.RUNNING
 
 
-def test_a_robot_drives_over_what_it_must_pass_and_shows_its_way(tmp_path: Path) -> None:
+def test_a_robot_drives_over_what_it_must_pass_and_shows_its_way(tmp_path):
     """It left out `--via`, and the page showed no way of any robot of the demo."""
     prepare(tmp_path, tmp_path / "s0.sqlite", NOTHING)
     via, goal = NodeId.parse("bo.1.33"), NodeId.parse("bo.1.9")
@@ -171,7 +168,7 @@ def test_a_robot_drives_over_what_it_must_pass_and_shows_its_way(tmp_path: Path)
             assert (report.state, report.passed) == (MissionState.DONE, 1)
 
 
-def test_the_recording_is_small_and_whole() -> None:
+def test_the_recording_is_small_and_whole():
     assert RECORDING.stat().st_size < 200_000
     maps = recorded_maps()
     assert {map_id.agent for map_id in maps} == {"ada", "bo", "cy", "dee"}
@@ -181,7 +178,7 @@ def test_the_recording_is_small_and_whole() -> None:
         assert all(encode_body(change) for change in changes)
 
 
-def test_what_was_found_of_the_recording_is_kept_and_holds(tmp_path: Path) -> None:
+def test_what_was_found_of_the_recording_is_kept_and_holds(tmp_path):
     """`python -m synthetic.recorded_fleet` makes it again, for another version or other settings."""
     prepare(tmp_path, tmp_path / "s0.sqlite", NOTHING)
     merged = []
@@ -209,7 +206,7 @@ def test_what_was_found_of_the_recording_is_kept_and_holds(tmp_path: Path) -> No
 
 @pytest.mark.slow
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
+def test_the_demo_is_watched_and_commanded(tmp_path):
     http, zenoh = free_port(), free_port()
     with Browser(tmp_path / "profile") as page:
         page.look(1280, 800)
@@ -298,7 +295,7 @@ def test_the_demo_is_watched_and_commanded(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_robots_events_and_links_are_there_before_the_server_is_loaded() -> None:
+def test_robots_events_and_links_are_there_before_the_server_is_loaded():
     http = free_port()
     with demo(http, free_port()):
         messages: dict[str, dict] = {}
@@ -326,7 +323,7 @@ def test_robots_events_and_links_are_there_before_the_server_is_loaded() -> None
 
 
 @pytest.mark.slow
-def test_the_page_is_filled_within_a_second_of_the_start_of_the_process() -> None:
+def test_the_page_is_filled_within_a_second_of_the_start_of_the_process():
     """A person sees its nodes, robots and events at once, and the server has them once it is loaded."""
     http = free_port()
     with demo(http, free_port()) as server:
@@ -351,7 +348,7 @@ def test_the_page_is_filled_within_a_second_of_the_start_of_the_process() -> Non
 
 
 @pytest.mark.slow
-def test_the_demo_keeps_nothing(tmp_path: Path) -> None:
+def test_the_demo_keeps_nothing(tmp_path):
     begin = time.monotonic()
     command = [sys.executable, "-m", "mapweave", "server", "--demo", "--data", str(tmp_path)]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60)

@@ -1,7 +1,5 @@
 """`mapweave server --map FILE`: real agents begin anywhere, and their maps join the one that is loaded."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -20,9 +18,7 @@ from tests.waiting import eventually
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_an_agent_begins_a_new_map_which_joins_the_loaded_one(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_agent_begins_a_new_map_which_joins_the_loaded_one(tmp_path, capfd):
     def mapped(robot: str, data: Path, *more: str) -> str:
         """A server, and an agent that maps four nodes; what the server says then of its maps."""
         endpoint = f"tcp/127.0.0.1:{free_port()}"

@@ -1,12 +1,9 @@
 """Two map servers of one name in one fleet: the second is refused, and where they meet later both say so."""
 
-from __future__ import annotations
-
 import logging
 import subprocess
 import sys
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -38,7 +35,7 @@ def answers(bus: Bus, name: str) -> object:
     return bus.serve(KEYS.server_status(name), reply)
 
 
-def test_a_second_server_of_one_name_is_refused(hub: MemoryHub) -> None:
+def test_a_second_server_of_one_name_is_refused(hub: MemoryHub):
     first, second = MemoryBus(hub), MemoryBus(hub)
     refuse_second(second, KEYS, "s0", patience=0.01)
     answers(first, "s0")
@@ -49,9 +46,7 @@ def test_a_second_server_of_one_name_is_refused(hub: MemoryHub) -> None:
     refuse_second(second, KEYS, "s1", patience=0.01)
 
 
-def test_servers_of_one_name_that_meet_later_say_so_once(
-    hub: MemoryHub, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_servers_of_one_name_that_meet_later_say_so_once(hub: MemoryHub, caplog):
     caplog.set_level(logging.INFO, "mapweave.processes")
     own, other = MemoryBus(hub), MemoryBus(hub)
     answers(own, "s0")
@@ -68,9 +63,7 @@ def test_servers_of_one_name_that_meet_later_say_so_once(
     assert "end one of them, and start it again with another --name" in caplog.messages[0]
 
 
-def test_the_command_ends_before_it_serves_under_the_name(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], signals: None
-) -> None:
+def test_the_command_ends_before_it_serves_under_the_name(tmp_path, capfd, signals: None):
     """As a client of the router, and as a router that joins it."""
     at = f"tcp/127.0.0.1:{free_port()}"
     bus = ZenohBus(BusSettings(mode="router", listen=(at,)))
@@ -84,7 +77,7 @@ def test_the_command_ends_before_it_serves_under_the_name(
     assert not (tmp_path / "data").exists()
 
 
-def test_a_server_looks_for_another_one_while_it_loads_its_libraries(tmp_path: Path) -> None:
+def test_a_server_looks_for_another_one_while_it_loads_its_libraries(tmp_path):
     """The look takes a third of a second, and the libraries take longer; it was a third of a restart."""
     code = (
         "import sys, threading\n"

@@ -1,7 +1,5 @@
 """A map server that starts again: its page has the map of before at once."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
@@ -10,7 +8,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from itertools import takewhile
-from pathlib import Path
 from urllib.request import urlopen
 
 import pytest
@@ -53,7 +50,7 @@ class Started:
 
 
 @pytest.mark.parametrize(("nodes", "merged", "said"), [(9, False, True), (9, True, False), (0, False, False)])
-def test_the_log_says_that_maps_are_not_merged_yet(nodes: int, merged: bool, said: bool) -> None:
+def test_the_log_says_that_maps_are_not_merged_yet(nodes: int, merged: bool, said: bool):
     """The first line after a start was that of maps without any link, as if they had come apart."""
     words = summary_of(Started(nodes, merged))  # type: ignore[arg-type]
     assert words.endswith(", still merging") == said
@@ -78,7 +75,7 @@ def first_messages(http: int) -> dict[str, dict]:
 
 
 @pytest.mark.slow
-def test_the_page_shows_the_map_of_before_while_the_server_loads(tmp_path: Path) -> None:
+def test_the_page_shows_the_map_of_before_while_the_server_loads(tmp_path):
     http = free_port()
     for map_id, log in looked_around((MapId("r0", 1), MapId("r1", 1)), seed=4).items():
         write_map_file(tmp_path / f"{map_id}.mapweave", MapFile("agent", str(map_id), tuple(log)))
@@ -121,7 +118,7 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
-def test_a_server_that_reads_its_store_can_be_stopped(tmp_path: Path) -> None:
+def test_a_server_that_reads_its_store_can_be_stopped(tmp_path):
     command = [
         sys.executable, "-c", SLOW_START, "server", "--data", str(tmp_path), "--listen",
         f"tcp/127.0.0.1:{free_port()}",
@@ -158,7 +155,7 @@ threading.Event().wait()
 """
 
 
-def test_a_server_that_is_stopped_while_it_starts_ends_the_answers_that_it_has_begun() -> None:
+def test_a_server_that_is_stopped_while_it_starts_ends_the_answers_that_it_has_begun():
     """A page that asked in that moment got the head of an answer without its content."""
     command = [sys.executable, "-c", ANSWER_IN_TWO_PARTS]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as running:
@@ -168,7 +165,7 @@ def test_a_server_that_is_stopped_while_it_starts_ends_the_answers_that_it_has_b
         assert running.wait(20) == 0
 
 
-def test_a_server_that_begins_a_store_beside_those_of_others_says_so(tmp_path: Path) -> None:
+def test_a_server_that_begins_a_store_beside_those_of_others_says_so(tmp_path):
     """As after a restore under another name: it began with nothing, and did not say so."""
     SqliteStore(tmp_path / "monday.sqlite").close()
     Journal(tmp_path / "r0.sqlite", "r0").close()

@@ -1,11 +1,9 @@
 """A map server that is missing is reported once, and so is that it is there again."""
 
-from __future__ import annotations
-
 from mapweave.processes.server_watch import PATIENCE, ServerWatch
 
 
-def test_a_missing_server_is_reported_once() -> None:
+def test_a_missing_server_is_reported_once():
     watch, long = ServerWatch("s0"), round((PATIENCE + 1.0) * 1e9)
     lines = [
         watch.see(False, 1),

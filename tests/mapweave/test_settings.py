@@ -1,7 +1,5 @@
 """Settings: TOML over defaults, and one line for each error."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import subprocess
@@ -235,7 +233,7 @@ def test_what_settings_refuse_themselves_names_the_file(table, words):
         settings_from(table, "file")
 
 
-def test_a_camera_is_written_into_a_file_of_an_editor_of_windows(tmp_path: Path) -> None:
+def test_a_camera_is_written_into_a_file_of_an_editor_of_windows(tmp_path):
     path = tmp_path / "robot.toml"
     path.write_bytes(b'\xef\xbb\xbf[robot.camera]\r\nsource = "1"\r\n')
     write_camera(path, {"fx": 300.0})

@@ -1,7 +1,5 @@
 """The printed settings file and its page: complete, true, and few enough to be read."""
 
-from __future__ import annotations
-
 import dataclasses
 import re
 import tomllib
@@ -36,7 +34,7 @@ EVERY = leaves(dataclasses.asdict(Settings()))
 OPTIONAL = {*dataclasses.fields(CameraSettings), *dataclasses.fields(Geometry)}
 
 
-def test_the_printed_file_holds_every_setting_with_its_default(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_printed_file_holds_every_setting_with_its_default(capsys):
     assert main(["settings"]) == 0
     printed = capsys.readouterr().out
     assert printed == as_toml()
@@ -45,7 +43,7 @@ def test_the_printed_file_holds_every_setting_with_its_default(capsys: pytest.Ca
     assert leaves(table).keys() - {"robot.geometry"} == EVERY.keys(), "nothing of the geometry has a default"
 
 
-def test_what_has_no_default_is_printed_as_a_comment() -> None:
+def test_what_has_no_default_is_printed_as_a_comment():
     """Filled in, the comments are a file."""
     off = re.findall(r"^#(\w+) =", as_toml(), re.MULTILINE)
     assert sorted(off) == sorted(item.name for item in OPTIONAL)
@@ -59,7 +57,7 @@ def test_what_has_no_default_is_printed_as_a_comment() -> None:
     assert settings.robot.camera is not None and settings.robot.geometry.axle == 0.3
 
 
-def test_each_has_a_text_and_the_page_counts_them() -> None:
+def test_each_has_a_text_and_the_page_counts_them():
     every = [setting for section in sections() for setting in section.settings]
     assert len(every) == len(EVERY) + len(OPTIONAL) <= 150
     assert all(len(setting.text) > 3 and setting.text.endswith(".") for setting in every)
@@ -67,12 +65,12 @@ def test_each_has_a_text_and_the_page_counts_them() -> None:
 
 
 @pytest.mark.skipif(not PAGE.parent.is_dir(), reason="installed without the documentation")
-def test_the_page_is_current() -> None:
+def test_the_page_is_current():
     assert PAGE.read_text() == as_markdown(), "run: mapweave settings --markdown > docs/settings.md"
 
 
 @pytest.mark.parametrize("name", [name for name, value in EVERY.items() if type(value) in (int, float)])
-def test_no_number_may_be_anything(name: str) -> None:
+def test_no_number_may_be_anything(name: str):
     """Each has a range that keeps out a large negative number."""
     *path, last = name.split(".")
     table: dict[str, Any] = {last: -(10**9)}

@@ -1,7 +1,5 @@
 """Servers on one PostgreSQL as people run them: killed, and restored from a backup."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -53,9 +51,7 @@ def robot_of(folder: Path, bus: Bus, bodies: list[ChangeBody], name: str) -> tup
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_either_of_two_servers_may_be_killed(
-    postgres: PostgresServer, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_either_of_two_servers_may_be_killed(postgres: PostgresServer, tmp_path, capfd):
     address = postgres.database()
     ports = {"s0": free_port(), "s1": free_port()}
     endpoints = {name: f"tcp/127.0.0.1:{port}" for name, port in ports.items()}
@@ -131,7 +127,7 @@ def test_either_of_two_servers_may_be_killed(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_name_is_that_of_one_server(postgres: PostgresServer, tmp_path: Path) -> None:
+def test_a_name_is_that_of_one_server(postgres: PostgresServer, tmp_path):
     """A second is refused, others run beside it, a killed one is followed, and a displaced one ends."""
     address = postgres.database()
     endpoints = {name: f"tcp/127.0.0.1:{free_port()}" for name in ("s0", "s1")}
@@ -227,9 +223,7 @@ def restore(postgres: PostgresServer, database: str, dump: str) -> None:
 
 
 @pytest.mark.slow
-def test_what_a_robot_retired_after_a_backup_goes_when_that_is_restored(
-    postgres: PostgresServer, tmp_path: Path
-) -> None:
+def test_what_a_robot_retired_after_a_backup_goes_when_that_is_restored(postgres: PostgresServer, tmp_path):
     """The robot has dropped the retirement, since the server had it."""
     need_programs("pg_dump", "pg_restore", "psql")
     address, hub = postgres.database(), MemoryHub()
@@ -260,9 +254,7 @@ def test_what_a_robot_retired_after_a_backup_goes_when_that_is_restored(
 
 
 @pytest.mark.slow
-def test_a_restored_backup_has_the_map_and_robots_add_what_is_newer(
-    postgres: PostgresServer, tmp_path: Path
-) -> None:
+def test_a_restored_backup_has_the_map_and_robots_add_what_is_newer(postgres: PostgresServer, tmp_path):
     """Into a database of the same name; `test_restore_drills` runs the commands of the page."""
     need_programs("pg_dump", "pg_restore")
     address, hub = postgres.database(), MemoryHub()

@@ -44,7 +44,7 @@ STAMP = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d "
 
 
 @pytest.mark.parametrize("words", parsers())
-def test_every_command_says_what_it_does_with_examples_that_parse(words: str) -> None:
+def test_every_command_says_what_it_does_with_examples_that_parse(words: str):
     command = parsers()[words]
     assert command.description and command.description.rstrip().endswith("."), "a sentence"
     assert command.epilog and "example" in command.epilog, "add one to mapweave/commands/examples.py"
@@ -61,7 +61,7 @@ def test_every_command_says_what_it_does_with_examples_that_parse(words: str) ->
 
 
 @pytest.mark.parametrize("words", parsers())
-def test_every_argument_has_its_help_and_every_default_is_named(words: str) -> None:
+def test_every_argument_has_its_help_and_every_default_is_named(words: str):
     for action in parsers()[words]._actions:
         if isinstance(action, argparse._SubParsersAction):
             continue
@@ -72,11 +72,11 @@ def test_every_argument_has_its_help_and_every_default_is_named(words: str) -> N
             assert default in named, action.option_strings
 
 
-def test_no_example_is_of_a_command_that_is_gone() -> None:
+def test_no_example_is_of_a_command_that_is_gone():
     assert set(EXAMPLES) == set(parsers())
 
 
-def test_the_cheat_sheet_is_that_of_these_commands() -> None:
+def test_the_cheat_sheet_is_that_of_these_commands():
     page = Path("docs/cheat-sheet.md")
     assert page.read_text(encoding="utf-8") == as_markdown(), f"python -m mapweave.cheat_sheet > {page}"
 
@@ -114,7 +114,7 @@ SHELL_COMMANDS = {
 
 
 @pytest.mark.parametrize("shell", [*SHELL_COMMANDS])
-def test_a_shell_completes_what_is_typed(shell: str, shell_folder: Path) -> None:
+def test_a_shell_completes_what_is_typed(shell: str, shell_folder: Path):
     """At a terminal, which asks the program itself."""
     program = shutil.which(shell)
     if program is None:
@@ -176,7 +176,7 @@ def completed(*words: str) -> set[str]:
 
 
 @pytest.mark.parametrize("words", ["", *parsers()])
-def test_all_of_every_command_is_completed(words: str) -> None:
+def test_all_of_every_command_is_completed(words: str):
     """As its help names it: options, commands below it, and what may stand behind an option."""
     command = parsers()[words] if words else parser()
     shown = [action for action in command._actions if action.help != argparse.SUPPRESS]
@@ -190,7 +190,7 @@ def test_all_of_every_command_is_completed(words: str) -> None:
 
 
 @pytest.mark.parametrize("shell", SHELLS)
-def test_the_code_for_completion_is_that_shells(shell: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_the_code_for_completion_is_that_shells(shell: str, capfd):
     assert main(["completion", shell]) == 0
     code = capfd.readouterr().out
     assert "mapweave" in code
@@ -199,9 +199,7 @@ def test_the_code_for_completion_is_that_shells(shell: str, capfd: pytest.Captur
         assert checked.returncode == 0, checked.stderr
 
 
-def test_an_agents_log_in_a_file_has_one_line_an_event_with_the_time(
-    recording: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_agents_log_in_a_file_has_one_line_an_event_with_the_time(recording: Path, tmp_path, capfd):
     long = tmp_path / ("a folder with a name that is longer than a terminal is wide " * 2).strip()
     arguments = ["replay", recording, "--offline", "--data", long, "--epoch", 1]
     assert main([str(a) for a in arguments]) == 0
@@ -216,7 +214,7 @@ def plain() -> tuple[Console, io.StringIO]:
     return Console(file=file, width=PLAIN_WIDTH), file
 
 
-def test_an_event_is_one_line_whatever_is_in_it() -> None:
+def test_an_event_is_one_line_whatever_is_in_it():
     console, file = plain()
     EventLog(console)("give [robot.options] a port,\nfor example [bold]" + 30 * " /dev/ttyUSB0")
     line = file.getvalue()
@@ -225,7 +223,7 @@ def test_an_event_is_one_line_whatever_is_in_it() -> None:
     )
 
 
-def test_progress_is_a_plain_line_now_and_then_where_there_is_no_terminal() -> None:
+def test_progress_is_a_plain_line_now_and_then_where_there_is_no_terminal():
     console, file = plain()
     now = [0.0]
     with Bar(console, "frames", 1000, clock=lambda: now[0]) as bar:
@@ -240,7 +238,7 @@ def test_progress_is_a_plain_line_now_and_then_where_there_is_no_terminal() -> N
 
 
 @pytest.mark.parametrize("words", ["/cam[/b]/image_raw", "[link=file:///etc/passwd]press[/]", "[red]bad"])
-def test_words_in_brackets_are_no_markup(words: str, capfd: pytest.CaptureFixture[str]) -> None:
+def test_words_in_brackets_are_no_markup(words: str, capfd):
     """Topics of bags, names of folders and words of robots ended a command, or were links."""
     table = Table("", title=words)
     table.add_row(words)
@@ -250,7 +248,7 @@ def test_words_in_brackets_are_no_markup(words: str, capfd: pytest.CaptureFixtur
     assert capfd.readouterr().out.count(words) == 3
 
 
-def test_progress_goes_on_while_one_step_takes_long(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_progress_goes_on_while_one_step_takes_long(monkeypatch):
     """Of a store of 484 nodes `map diff` said nothing for a minute: joining its maps is one step."""
     monkeypatch.setattr(terminal, "EVERY", 0.05)
     (console, file), before = plain(), threading.active_count()
@@ -263,7 +261,7 @@ def test_progress_goes_on_while_one_step_takes_long(monkeypatch: pytest.MonkeyPa
     assert threading.active_count() == before
 
 
-def test_what_has_no_steps_is_not_counted(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_has_no_steps_is_not_counted(monkeypatch):
     """Of a map that a server packs nothing is known but that it takes long."""
     monkeypatch.setattr(terminal, "EVERY", 0.05)
     console, file = plain()
@@ -272,7 +270,7 @@ def test_what_has_no_steps_is_not_counted(monkeypatch: pytest.MonkeyPatch) -> No
     assert all(re.fullmatch(r"fetching the map, \d+ s", line) for line in file.getvalue().splitlines())
 
 
-def test_a_long_detail_leaves_the_numbers_of_a_bar() -> None:
+def test_a_long_detail_leaves_the_numbers_of_a_bar():
     """On 80 columns they were cut away: `d… 11 nodes, 51 of 53 features left ...`."""
     file = io.StringIO()
     with Bar(Console(file=file, force_terminal=True, width=80, color_system=None), "drive", 1475) as bar:
@@ -282,7 +280,7 @@ def test_a_long_detail_leaves_the_numbers_of_a_bar() -> None:
 
 
 @pytest.mark.parametrize("words", ["agent r0", "router", "server", "sim serve office"])
-def test_warnings_of_any_part_have_the_time(words: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_warnings_of_any_part_have_the_time(words: str, monkeypatch):
     """`a tick took 459 ms instead of 100` stood without it among lines that have it."""
 
     class Asked(Exception):
@@ -296,7 +294,7 @@ def test_warnings_of_any_part_have_the_time(words: str, monkeypatch: pytest.Monk
         main(words.split())
 
 
-def test_an_option_that_is_none_names_the_help_of_its_command(capfd: pytest.CaptureFixture[str]) -> None:
+def test_an_option_that_is_none_names_the_help_of_its_command(capfd):
     with pytest.raises(SystemExit) as ended:
         main(["map", "show", "office.mapweave", "--colour"])
     assert ended.value.code == USAGE
@@ -307,9 +305,7 @@ def test_an_option_that_is_none_names_the_help_of_its_command(capfd: pytest.Capt
 
 
 @pytest.mark.parametrize("line", ["map show -r0.mapweave", "map merge a.mapweave -o -r0.mapweave"])
-def test_a_file_whose_name_begins_with_a_dash_is_named(
-    line: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_file_whose_name_begins_with_a_dash_is_named(line: str, tmp_path, monkeypatch, capfd):
     """It was said that no file is given."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "-r0.mapweave").touch()
@@ -336,9 +332,7 @@ def test_a_file_whose_name_begins_with_a_dash_is_named(
         ("replay {tmp}/walk --offline --data {tmp}/replayed", "finding where the images were taken"),
     ],
 )  # fmt: skip
-def test_work_that_may_take_long_is_shown(
-    arguments: str, words: str, recording: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_work_that_may_take_long_is_shown(arguments: str, words: str, recording: Path, tmp_path, monkeypatch):
     """With thousands of nodes, vertices or images each is silent for longer than a person waits."""
     graph = tmp_path / "in.g2o"
     graph.write_text("VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 1 0 0\nEDGE_SE2 0 1 1 0 0 1 0 0 1 0 1\n")
@@ -353,7 +347,7 @@ def test_work_that_may_take_long_is_shown(
 
 
 @pytest.mark.parametrize("module", ["mapweave.cli", "argcomplete"])
-def test_ctrl_c_while_the_command_line_is_read_is_one_line(module: str) -> None:
+def test_ctrl_c_while_the_command_line_is_read_is_one_line(module: str):
     """While it is imported, and while its parser is made."""
     program = """
 import os
@@ -390,7 +384,7 @@ def started(*arguments: object, **options: Any) -> subprocess.CompletedProcess[A
 
 
 @pytest.mark.parametrize("arguments", ["--version", "--help", "completion zsh", "sim list --json"])
-def test_a_reader_that_ends_first_is_no_error_of_pythons_own(arguments: str) -> None:
+def test_a_reader_that_ends_first_is_no_error_of_pythons_own(arguments: str):
     """As in `mapweave ... | head -1`."""
     reading, writing = os.pipe()
     os.close(reading)
@@ -401,7 +395,7 @@ def test_a_reader_that_ends_first_is_no_error_of_pythons_own(arguments: str) -> 
     assert (done.stderr, done.returncode) == (b"", FAILED)
 
 
-def test_what_a_replay_says_first_comes_first_into_a_pipe_as_well(recording: Path, tmp_path: Path) -> None:
+def test_what_a_replay_says_first_comes_first_into_a_pipe_as_well(recording: Path, tmp_path):
     """As in `mapweave replay ... 2>&1 | cat`: what it takes from the recording, then what the agent says."""
     (recording / "times.txt").unlink()
     out = {"stdout": subprocess.PIPE, "stderr": subprocess.STDOUT}
@@ -413,14 +407,14 @@ def test_what_a_replay_says_first_comes_first_into_a_pipe_as_well(recording: Pat
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="Linux has it")
 @pytest.mark.parametrize("arguments", ["--version", "completion zsh", "sim list --json"])
-def test_a_full_disk_behind_stdout_is_one_line(arguments: str) -> None:
+def test_a_full_disk_behind_stdout_is_one_line(arguments: str):
     with Path("/dev/full").open("wb") as full:
         done = started(*arguments.split(), stdout=full)
     words = f"mapweave: standard output cannot be written ({NO_ROOM})\n"
     assert (done.stderr.decode(), done.returncode) == (words, FAILED)
 
 
-def test_a_command_whose_stdout_is_closed_does_its_work() -> None:
+def test_a_command_whose_stdout_is_closed_does_its_work():
     """As the shell's `>&-` does."""
     done = started("sim", "list", preexec_fn=lambda: os.close(1))
     assert (done.stderr, done.returncode) == (b"", 0)
@@ -436,8 +430,8 @@ def test_a_command_whose_stdout_is_closed_does_its_work() -> None:
     ],
 )
 def test_a_name_that_the_locale_cannot_show_is_shown_by_its_codes(
-    name: bytes, encoding: str, printed: str, tmp_path: Path
-) -> None:
+    name: bytes, encoding: str, printed: str, tmp_path
+):
     path = tmp_path / os.fsdecode(name)
     write_map_file(path, MapFile("merged", "nothing", ()))
     encoding, _, errors = encoding.partition(":")
@@ -447,7 +441,7 @@ def test_a_name_that_the_locale_cannot_show_is_shown_by_its_codes(
     assert printed in done.stdout.decode(encoding)
 
 
-def test_a_home_that_cannot_be_written_is_no_matter(tmp_path: Path) -> None:
+def test_a_home_that_cannot_be_written_is_no_matter(tmp_path):
     """As that of a service: two lines of Matplotlib about its cache came before what was asked for."""
     path = tmp_path / "r0.1.mapweave"
     (log,) = looked_around((MapId("r0", 1),), seed=8).values()

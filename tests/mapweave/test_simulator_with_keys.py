@@ -1,7 +1,5 @@
 """Simulated robots in a fleet with keys: their bodies are beside it, and what cannot be is refused."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -32,8 +30,8 @@ def keys_of(folder: Path, profile: Profile) -> KeyFolder:
 @pytest.mark.parametrize("profile", PROFILES)
 @pytest.mark.parametrize("command", [["sim", "serve", "office"], ["agent", "r0", "--lockstep"]])
 def test_what_a_router_with_keys_denies_is_refused_at_once(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str], command: list[str], profile: Profile
-) -> None:
+    tmp_path, capfd, command: list[str], profile: Profile
+):
     """Before, the agent waited 90 s for the other robots, and said that its base was gone."""
     keys = keys_of(tmp_path / "keys", profile)
     assert main([*command, "--keys", str(keys.key_file("r0"))]) == USAGE
@@ -46,9 +44,7 @@ def test_what_a_router_with_keys_denies_is_refused_at_once(
 @pytest.mark.slow
 @needs_simulator
 @pytest.mark.parametrize("profile", PROFILES)
-def test_an_agent_with_a_key_drives_a_body_beside_the_fleet_in_lock_step(
-    tmp_path: Path, profile: Profile
-) -> None:
+def test_an_agent_with_a_key_drives_a_body_beside_the_fleet_in_lock_step(tmp_path, profile: Profile):
     keys = keys_of(tmp_path / "keys", profile)
     scenario, body = tmp_path / "alone.toml", f"tcp/127.0.0.1:{free_port()}"
     scenario.write_text(WORLD)

@@ -1,7 +1,5 @@
 """A server that starts before its database: it waits where that can help, and ends with a line where not."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -66,13 +64,13 @@ def short_pauses(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("mapweave.processes.store_wait.EVERY", 0.01)
 
 
-def test_a_store_that_is_there_is_not_waited_for() -> None:
+def test_a_store_that_is_there_is_not_waited_for():
     store = Store()
     assert store.wait() == "made"
     assert (store.log, store.shown, store.asked) == ([], [], 0)
 
 
-def test_a_wait_is_one_line_and_its_end_another() -> None:
+def test_a_wait_is_one_line_and_its_end_another():
     store = Store(*[StoreAway("refused")] * 3, *[StoreAway("it starts")] * 3)
     assert store.wait() == "made"
     assert store.log == ["waiting for at most 60 s: refused", "the map store is there, after 0 s"]
@@ -80,7 +78,7 @@ def test_a_wait_is_one_line_and_its_end_another() -> None:
     assert store.asked == 2, "only a failure with other words is looked into"
 
 
-def test_what_waiting_does_not_mend_ends_at_once_also_later() -> None:
+def test_what_waiting_does_not_mend_ends_at_once_also_later():
     store = Store(StoreAway("no such database"))
     store.helps = False
     with pytest.raises(StoreAway, match="no such database"):
@@ -91,7 +89,7 @@ def test_what_waiting_does_not_mend_ends_at_once_also_later() -> None:
         store.wait()
 
 
-def test_a_wait_ends_after_its_time_and_when_it_is_stopped() -> None:
+def test_a_wait_ends_after_its_time_and_when_it_is_stopped():
     store = Store(*[StoreAway("refused")] * 1000)
     with pytest.raises(StoreAway, match="refused"):
         store.wait(0.1)
@@ -100,7 +98,7 @@ def test_a_wait_ends_after_its_time_and_when_it_is_stopped() -> None:
     assert store.wait(60.0, stop) is None
 
 
-def test_who_asks_for_a_servers_status_hears_that_it_waits() -> None:
+def test_who_asks_for_a_servers_status_hears_that_it_waits():
     hub, keys = MemoryHub(), Keys("fleet")
     bus, asker = MemoryBus(hub), MemoryBus(hub)
     waits = WaitingServer(bus, keys, "s0")
@@ -120,8 +118,8 @@ def test_who_asks_for_a_servers_status_hears_that_it_waits() -> None:
 
 
 def test_a_database_that_goes_again_while_the_server_is_made_is_waited_for(
-    postgres: PostgresServer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    postgres: PostgresServer, tmp_path, monkeypatch
+):
     """What was opened is closed: its session would hold the server's name against the next attempt."""
     address, away = postgres.database(), [StoreAway("gone again")]
 
@@ -161,7 +159,7 @@ def server(folder: Path, store: str, *options: str, **environment: str) -> Itera
 @pytest.mark.slow
 @pytest.mark.waits
 @pytest.mark.timeout(300)
-def test_a_server_waits_for_a_database_that_starts_later(tmp_path: Path) -> None:
+def test_a_server_waits_for_a_database_that_starts_later(tmp_path):
     databases = started()
     database, http = next(databases), free_port()
     address = database.database()
@@ -206,9 +204,7 @@ def test_a_server_waits_for_a_database_that_starts_later(tmp_path: Path) -> None
 
 @pytest.mark.slow
 @pytest.mark.waits
-def test_a_server_ends_at_once_where_there_is_no_such_database(
-    postgres: PostgresServer, tmp_path: Path
-) -> None:
+def test_a_server_ends_at_once_where_there_is_no_such_database(postgres: PostgresServer, tmp_path):
     with server(tmp_path, postgres.address("none")) as process:
         assert process.wait(PATIENCE) == FAILED
     (line,) = (tmp_path / "log").read_text().splitlines()
@@ -217,9 +213,7 @@ def test_a_server_ends_at_once_where_there_is_no_such_database(
 
 @pytest.mark.slow
 @pytest.mark.waits
-def test_a_server_that_waits_can_be_stopped_and_gives_up(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_server_that_waits_can_be_stopped_and_gives_up(tmp_path, capfd):
     pytest.importorskip("psycopg")
     nowhere, router = f"postgresql://anna@127.0.0.1:{free_port()}/maps", f"tcp/127.0.0.1:{free_port()}"
     with server(tmp_path, nowhere, "--listen", router) as process:

@@ -1,7 +1,5 @@
 """Structure from motion, against a walk whose truth is known, by a camera that is not level."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -67,7 +65,7 @@ class Walk:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", range(5))
-def test_a_walk_is_found_again_up_to_its_scale(seed: int) -> None:
+def test_a_walk_is_found_again_up_to_its_scale(seed: int):
     walk = Walk(seed)
     errors, turns, scale = walk.off(reconstruct(walk.views, 0.6))
     assert errors.max() < 0.05
@@ -79,7 +77,7 @@ def test_a_walk_is_found_again_up_to_its_scale(seed: int) -> None:
     assert again == pytest.approx(scale / 1.5, rel=0.05)
 
 
-def test_points_lie_where_their_features_are_seen() -> None:
+def test_points_lie_where_their_features_are_seen():
     walk = Walk(3)
     structure = reconstruct(walk.views, 0.6)
     assert len(structure.points) > 150
@@ -94,7 +92,7 @@ def test_points_lie_where_their_features_are_seen() -> None:
 
 
 @pytest.mark.parametrize("size", [100.0, 1.0, 1e-3, 1e-5])
-def test_a_camera_is_placed_by_points_of_any_size(size: float) -> None:
+def test_a_camera_is_placed_by_points_of_any_size(size: float):
     """Bearings to a scene of any size, anywhere, and as far off in proportion, are the same."""
     rng = np.random.default_rng(5)
     local = rng.uniform([-1.0, -0.7, 2.0], [1.0, 0.7, 4.0], (40, 3))
@@ -114,11 +112,11 @@ def test_a_camera_is_placed_by_points_of_any_size(size: float) -> None:
 @pytest.mark.parametrize(
     "points", [np.ones((20, 3)), np.full((20, 3), np.arange(20)[:, None]), np.ones((5, 3))]
 )
-def test_points_that_determine_no_camera_place_none(points: np.ndarray) -> None:
+def test_points_that_determine_no_camera_place_none(points: np.ndarray):
     assert pose_by_points(points * 1e-3, np.full((len(points), 2), 100.0), CAMERA) is None
 
 
-def test_far_points_place_every_camera() -> None:
+def test_far_points_place_every_camera():
     """Things so far away that only the first and the fourth photograph, and so on, determine them, and few.
 
     They begin the map, the two cameras between are placed by their steps, the third before the second.
@@ -140,7 +138,7 @@ def test_far_points_place_every_camera() -> None:
     assert turns.magnitude().max() < math.radians(1.0)
 
 
-def test_invalid_walks_are_refused() -> None:
+def test_invalid_walks_are_refused():
     walk, other = Walk(1), Walk(2)
     with pytest.raises(InvalidValue, match="two photographs"):
         reconstruct(walk.views[:1], 0.6)

@@ -1,7 +1,5 @@
 """The systemd units: systemd takes them, their commands exist, and the processes report to it."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import socket
@@ -30,13 +28,13 @@ def analyzed(unit: Path, folder: Path, *words: str) -> subprocess.CompletedProce
 
 
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
-def test_systemd_has_nothing_to_say_about_a_unit(unit: Path, tmp_path: Path) -> None:
+def test_systemd_has_nothing_to_say_about_a_unit(unit: Path, tmp_path):
     done = analyzed(unit, tmp_path, "verify")
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
 
 
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
-def test_its_command_parses(unit: Path) -> None:
+def test_its_command_parses(unit: Path):
     (line,) = [line for line in unit.read_text().splitlines() if line.startswith("ExecStart=")]
     program, *words = line.removeprefix("ExecStart=").replace("%i", "r0").split()
     assert program == INSTALLED
@@ -55,7 +53,7 @@ def directives(unit: Path) -> dict[str, list[str]]:
 
 
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
-def test_it_is_hardened_and_writes_only_where_it_may(unit: Path) -> None:
+def test_it_is_hardened_and_writes_only_where_it_may(unit: Path):
     given = directives(unit)
     for name in ("NoNewPrivileges", "PrivateTmp", "ProtectHome", "DynamicUser", "RestrictSUIDSGID"):
         assert given[name] == ["yes"], name
@@ -76,12 +74,12 @@ def test_it_is_hardened_and_writes_only_where_it_may(unit: Path) -> None:
 
 
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)
-def test_systemd_finds_little_exposure(unit: Path, tmp_path: Path) -> None:
+def test_systemd_finds_little_exposure(unit: Path, tmp_path):
     done = analyzed(unit, tmp_path, "security", "--offline=true", "--threshold=20", "--no-pager")
     assert done.returncode == 0, done.stdout[-300:] + done.stderr
 
 
-def test_an_agent_may_compile_at_its_first_start() -> None:
+def test_an_agent_may_compile_at_its_first_start():
     """It took 102 s until it was ready on a busy PC, and a small computer is slower."""
     (unit,) = [unit for unit in UNITS if "agent" in unit.name]
     assert int(directives(unit)["TimeoutStartSec"][0]) >= 300
@@ -96,7 +94,7 @@ def manager(tmp_path: Path) -> Iterator[socket.socket]:
         yield listening
 
 
-def test_an_agent_may_open_every_port_that_find_port_finds() -> None:
+def test_an_agent_may_open_every_port_that_find_port_finds():
     """The UART of a Raspberry Pi with Bluetooth is /dev/ttyS0, that of a Jetson /dev/ttyTHS1."""
     (unit,) = [unit for unit in UNITS if "agent" in unit.name]
     allowed = directives(unit)["DeviceAllow"]
@@ -104,7 +102,7 @@ def test_an_agent_may_open_every_port_that_find_port_finds() -> None:
         assert f"char-{name} rw" in allowed
 
 
-def test_an_agent_is_ready_and_alive(manager, recording, monkeypatch, tmp_path) -> None:
+def test_an_agent_is_ready_and_alive(manager, recording, monkeypatch, tmp_path):
     monkeypatch.setenv("NOTIFY_SOCKET", manager.getsockname())
     assert (
         main(["replay", str(recording), "--offline", "--data", str(tmp_path / "agents"), "--name", "walk"])
@@ -114,7 +112,7 @@ def test_an_agent_is_ready_and_alive(manager, recording, monkeypatch, tmp_path) 
 
 
 @pytest.mark.slow
-def test_a_server_is_ready_and_alive(manager, tmp_path) -> None:
+def test_a_server_is_ready_and_alive(manager, tmp_path):
     command = [sys.executable, "-m", "mapweave", "server", "--listen", f"tcp/127.0.0.1:{free_port()}"]
     environment = os.environ | {"NOTIFY_SOCKET": manager.getsockname()}
     with subprocess.Popen(

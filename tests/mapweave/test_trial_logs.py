@@ -1,9 +1,6 @@
 """The logs for Foxglove and for Rerun of the robots of a trial."""
 
-from __future__ import annotations
-
 from importlib.util import find_spec
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +13,7 @@ from tests.simulator import needs_simulator
 
 @needs_simulator
 @pytest.mark.skipif(find_spec("rerun") is None, reason='needs the extra "rerun"')
-def test_each_robot_of_a_trial_has_logs_and_one_that_is_started_again_others(tmp_path: Path) -> None:
+def test_each_robot_of_a_trial_has_logs_and_one_that_is_started_again_others(tmp_path):
     from mapweave.scenarios.local_fleet import LocalFleet
 
     scenario = load_scenario(scenario_path("office"), ["robots=2", "world.rooms=3"])

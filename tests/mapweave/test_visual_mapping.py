@@ -1,7 +1,5 @@
 """Videos without odometry: a simulated walk with known truth becomes a map up to scale, always the same."""
 
-from __future__ import annotations
-
 import json
 from itertools import pairwise
 from pathlib import Path
@@ -79,7 +77,7 @@ def made(video: tuple[Path, list[Pose2]], tmp_path_factory: pytest.TempPathFacto
     return file
 
 
-def test_a_video_becomes_one_map_that_is_right_up_to_one_scale(video, made: Path) -> None:
+def test_a_video_becomes_one_map_that_is_right_up_to_one_scale(video, made: Path):
     _, truth = video
     nodes, edges = contents(made)
     assert len(nodes) > 6, "more than one window"
@@ -94,7 +92,7 @@ def test_a_video_becomes_one_map_that_is_right_up_to_one_scale(video, made: Path
     assert all(edge.evidence["shared"] == len(edge.shared) >= 12 for edge in edges)
 
 
-def test_the_trajectory_has_every_image_as_exactly_as_the_keyframes(video, made: Path) -> None:
+def test_the_trajectory_has_every_image_as_exactly_as_the_keyframes(video, made: Path):
     """Only the keyframes were written."""
     _, truth = video
     lines = made.with_suffix(".tum").read_text().splitlines()
@@ -113,7 +111,7 @@ def test_the_trajectory_has_every_image_as_exactly_as_the_keyframes(video, made:
     assert np.abs((turned + np.pi) % (2 * np.pi) - np.pi).max() < 0.03
 
 
-def test_rerun_and_a_robot_that_is_not_there_are_refused(video, tmp_path: Path, capfd) -> None:
+def test_rerun_and_a_robot_that_is_not_there_are_refused(video, tmp_path, capfd):
     """Both were ignored."""
     path, _ = video
     command = ["replay", path, "--camera", path.with_name("camera.toml"), "--offline", "--data", tmp_path]
@@ -122,7 +120,7 @@ def test_rerun_and_a_robot_that_is_not_there_are_refused(video, tmp_path: Path, 
     assert "splits.toml" in said and not list(tmp_path.iterdir())
 
 
-def test_a_lost_robot_gets_the_place_but_not_the_distance(video, made: Path) -> None:
+def test_a_lost_robot_gets_the_place_but_not_the_distance(video, made: Path):
     path, truth = video
     relocalizer, (nodes, _) = relocalizer_of(read_map_file(made)), contents(made)
     where = {node.id: truth[round(node.stamp_ns * RATE / 1e9)] for node in nodes}
@@ -145,14 +143,14 @@ def test_a_lost_robot_gets_the_place_but_not_the_distance(video, made: Path) -> 
 
 
 @pytest.mark.slow
-def test_the_same_video_gives_the_same_map(video, made: Path, tmp_path: Path) -> None:
+def test_the_same_video_gives_the_same_map(video, made: Path, tmp_path):
     path, _ = video
     (again,) = replayed(path, path.with_name("camera.toml"), tmp_path)
     assert again.read_bytes() == made.read_bytes()
 
 
 @pytest.mark.slow
-def test_a_cut_and_a_turn_on_the_spot_begin_another_map(video, tmp_path: Path) -> None:
+def test_a_cut_and_a_turn_on_the_spot_begin_another_map(video, tmp_path):
     """The second half is mirrored; between the halves the camera turns by 60 degrees, by homographies."""
     path, _ = video
     images, c = frames(path), PHONE.intrinsics
@@ -169,7 +167,7 @@ def test_a_cut_and_a_turn_on_the_spot_begin_another_map(video, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_a_folder_of_images_without_odometry_is_mapped_as_the_video_is(made, video, tmp_path: Path) -> None:
+def test_a_folder_of_images_without_odometry_is_mapped_as_the_video_is(made, video, tmp_path):
     path, _ = video
     folder = tmp_path / "walk"
     (folder / "images").mkdir(parents=True)
@@ -181,7 +179,7 @@ def test_a_folder_of_images_without_odometry_is_mapped_as_the_video_is(made, vid
     assert len(np.loadtxt(file.with_suffix(".tum"))) == COUNT
 
 
-def test_info_says_what_is_missing_and_damage_is_said(video, tmp_path: Path, capfd) -> None:
+def test_info_says_what_is_missing_and_damage_is_said(video, tmp_path, capfd):
     path, _ = video
     camera = path.with_name("camera.toml")
     assert main(["info", str(path), "--camera", str(camera), "--json"]) == 0
@@ -195,7 +193,7 @@ def test_info_says_what_is_missing_and_damage_is_said(video, tmp_path: Path, cap
     assert output[-1].startswith(f"mapweave: {blank}: no two of its") and "Traceback" not in output
 
 
-def test_an_evaluation_says_what_is_used_and_the_error_up_to_scale(video, tmp_path: Path, capfd) -> None:
+def test_an_evaluation_says_what_is_used_and_the_error_up_to_scale(video, tmp_path, capfd):
     """It refused recordings without odometry."""
     path, truth = video
     (tmp_path / "truth.csv").write_text(
@@ -215,7 +213,7 @@ def test_an_evaluation_says_what_is_used_and_the_error_up_to_scale(video, tmp_pa
     assert "frames_used" in lines and "100 %" in lines and "unknown" in lines, "nothing is scored"
 
 
-def test_an_evaluation_counts_images_that_no_map_has(video, tmp_path: Path, capfd) -> None:
+def test_an_evaluation_counts_images_that_no_map_has(video, tmp_path, capfd):
     path, _ = video
     grey = [np.full((240, 320), 90, np.uint8)] * 6
     write(tmp_path / "walk.avi", [*frames(path)[:12], *grey])

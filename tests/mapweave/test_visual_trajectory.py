@@ -1,7 +1,5 @@
 """Images between keyframes: found by what is followed of a keyframe, however the camera is held."""
 
-from __future__ import annotations
-
 import math
 
 import cv2
@@ -49,7 +47,7 @@ def followed(stretch: Stretch, k: int, stamp_ns: int, seen: Array) -> TrackedIma
     return TrackedImage(stamp_ns, pixels)
 
 
-def test_a_camera_that_is_tilted_and_held_higher_is_placed_upright(stretch: Stretch) -> None:
+def test_a_camera_that_is_tilted_and_held_higher_is_placed_upright(stretch: Stretch):
     """A third of the points are followed wrongly."""
     rng, ways = np.random.default_rng(3), [Pose2(0.2, 0.1, 0.05), Pose2(0.4, -0.1, -0.1)]
     images = []
@@ -65,7 +63,7 @@ def test_a_camera_that_is_tilted_and_held_higher_is_placed_upright(stretch: Stre
         assert math.hypot(off.x, off.y) < 0.03 and abs(off.heading) < 0.01
 
 
-def test_images_without_features_are_interpolated_and_said_to_be(stretch: Stretch, tmp_path) -> None:
+def test_images_without_features_are_interpolated_and_said_to_be(stretch: Stretch, tmp_path):
     nothing = np.full((COUNT, 2), np.nan)
     wrong = np.random.default_rng(1).uniform((0, 0), (640, 480), (COUNT, 2))
     images = [followed(stretch, 0, 25, nothing), followed(stretch, 0, 50, wrong)]

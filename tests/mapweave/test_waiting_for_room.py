@@ -1,7 +1,5 @@
 """A robot that needs a new map on a full disk stands, and says why, until there is room."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import closing
@@ -81,7 +79,7 @@ def full(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Iterator[None]:
     assert left == [0]
 
 
-def test_it_stands_and_systemd_and_its_fleet_hear_why(tmp_path: Path) -> None:
+def test_it_stands_and_systemd_and_its_fleet_hear_why(tmp_path):
     hub, robot = MemoryHub(), Lifted()
     said, alive, seen = list[str](), list[int](), list[AgentStatus]()
     there: set[str] = set()

@@ -1,7 +1,5 @@
 """Every command with a file that is not what it needs: one line says so, and nothing is lost or left."""
 
-from __future__ import annotations
-
 import shlex
 import sqlite3
 from collections.abc import Callable
@@ -140,9 +138,8 @@ def state(folder: Path) -> dict[str, bytes]:
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize("line", LINES)
 def test_a_wrong_file_is_one_line_and_nothing_is_lost(
-    line: str, files: Path, recording: Path, closed: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
-) -> None:  # fmt: skip
+    line: str, files: Path, recording: Path, closed: str, tmp_path, monkeypatch, capfd
+):
     monkeypatch.chdir(tmp_path)
     for kind in [kind for kind in KINDS if kind not in LINES[line]]:
         values = {
@@ -196,8 +193,8 @@ MADE = {
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize("line", OUTS)
 def test_a_place_where_nothing_can_be_written_is_one_line(
-    line: str, files: Path, recording: Path, closed: str, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+    line: str, files: Path, recording: Path, closed: str, tmp_path, capfd
+):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("keep me")
     (tmp_path / "full.png").mkdir()
@@ -226,8 +223,8 @@ def test_a_place_where_nothing_can_be_written_is_one_line(
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize(("line", "kind"), sorted(one for one in MADE if "--robot" not in one[0]))
 def test_a_folder_that_is_there_or_made_keeps_what_was_in_it(
-    line: str, kind: str, files: Path, recording: Path, tmp_path: Path
-) -> None:
+    line: str, kind: str, files: Path, recording: Path, tmp_path
+):
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "mine.txt").write_text("keep me")
     values = {"map": files / "map", "journal": files / "journal", "recording": recording}
@@ -248,8 +245,8 @@ def test_a_folder_that_is_there_or_made_keeps_what_was_in_it(
     ],
 )  # fmt: skip
 def test_what_a_running_server_does_not_know_is_one_line_and_nothing_is_kept(
-    line: str, words: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+    line: str, words: str, tmp_path, monkeypatch, capfd
+):
     hub, keys = MemoryHub(), Keys("demo")
     path = write_store(tmp_path / "s0.sqlite", LOGS)
     with (

@@ -1,7 +1,5 @@
 """A recording of a short drive: forward before two walls."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import cv2

@@ -4,8 +4,6 @@ It writes how far it has driven, m, into the file that `WALL_ROBOT` names. Its c
 the file says that `WALL_ROBOT_CLOCK` names, if there is one.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import time

@@ -5,8 +5,6 @@
 It prints a JSON list of [exit status, stdout, stderr].
 """
 
-from __future__ import annotations
-
 import io
 import json
 import sys

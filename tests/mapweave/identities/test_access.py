@@ -4,8 +4,6 @@ Denials are observed at the other end: there is a listener that may hear the mes
 allowed before and after.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Iterator
@@ -93,7 +91,7 @@ def asked(bus: ZenohBus, key: str) -> bool:
     return any(reply.payload == b"yes" for reply in bus.ask(key, b"", SOON))
 
 
-def test_a_robot_writes_under_its_own_name_alone(fleet: Fleet) -> None:
+def test_a_robot_writes_under_its_own_name_alone(fleet: Fleet):
     got: list[str] = []
     fleet.router.subscribe("mapweave/**", lambda sample: got.append(sample.key))
     r0 = fleet.join("r0")
@@ -112,7 +110,7 @@ def test_a_robot_writes_under_its_own_name_alone(fleet: Fleet) -> None:
     assert not set(forged) & set(got)
 
 
-def test_a_robot_hears_what_is_for_it_alone(fleet: Fleet) -> None:
+def test_a_robot_hears_what_is_for_it_alone(fleet: Fleet):
     r0, r1 = fleet.join("r0"), fleet.join("r1")
     got: list[str] = []
     for pattern in (KEYS.acks("r0"), KEYS.acks("r1"), "mapweave/**", KEYS.changes(), KEYS.agent_statuses()):
@@ -130,7 +128,7 @@ def test_a_robot_hears_what_is_for_it_alone(fleet: Fleet) -> None:
     assert set(got) == {KEYS.ack("s0", "r0")}
 
 
-def test_a_robot_cannot_be_alive_or_answer_as_another(fleet: Fleet) -> None:
+def test_a_robot_cannot_be_alive_or_answer_as_another(fleet: Fleet):
     alive: list[str] = []
     fleet.router.watch(KEYS.agents_alive(), lambda key, is_alive: alive.append(key) if is_alive else None)
     r0 = fleet.join("r0")
@@ -164,7 +162,7 @@ IN_ANOTHERS_NAME = {f"{what}/{name}" for what in OF_ROBOTS for name in ("r1", "*
         ("anna", frozenset(ASKS)),
     ],
 )
-def test_each_role_asks_what_it_may(certified: Fleet, name: str, may: frozenset[str]) -> None:
+def test_each_role_asks_what_it_may(certified: Fleet, name: str, may: frozenset[str]):
     asks = {*ASKS, *IN_ANOTHERS_NAME, *(f"{what}/r0" for what in OF_ROBOTS)}
     root = f"{KEYS.root}/server/s0"
     every = {what: sent_by(f"{root}/{what}", name if what in SIGNED else "") for what in asks}
@@ -187,7 +185,7 @@ def test_each_role_asks_what_it_may(certified: Fleet, name: str, may: frozenset[
     assert answered == may
 
 
-def test_a_viewer_moves_no_robot(fleet: Fleet) -> None:
+def test_a_viewer_moves_no_robot(fleet: Fleet):
     r0 = fleet.join("r0")
     r0.serve(KEYS.agent_status("r0"), answer)
     commands = KEYS.mission("r0"), KEYS.portal("r0"), KEYS.drive("r0")
@@ -202,7 +200,7 @@ def test_a_viewer_moves_no_robot(fleet: Fleet) -> None:
         assert not any(asked(anna, sent_by(key, who)) for who in ("", "bob")), "under her own name alone"
 
 
-def test_a_robot_moves_no_other(certified: Fleet) -> None:
+def test_a_robot_moves_no_other(certified: Fleet):
     """Neither by an order nor by a step of the wheels, whatever name it gives."""
     r1 = certified.join("r1")
     orders = KEYS.mission("r1"), KEYS.portal("r1"), KEYS.drive("r1")
@@ -222,7 +220,7 @@ def test_a_robot_moves_no_other(certified: Fleet) -> None:
         assert not any(pool.map(lambda key: asked(r0, key), forged))
 
 
-def test_the_views_of_a_robot_are_for_servers_alone(fleet: Fleet) -> None:
+def test_the_views_of_a_robot_are_for_servers_alone(fleet: Fleet):
     """People get them by a server, which checks them; other robots do not get them."""
     alive: list[str] = []
     fleet.router.watch(KEYS.views(), lambda key, is_alive: alive.append(key) if is_alive else None)
@@ -241,7 +239,7 @@ def test_the_views_of_a_robot_are_for_servers_alone(fleet: Fleet) -> None:
     assert not asked(fleet.join("r1"), KEYS.view("r0"))
 
 
-def test_an_operator_commands_under_the_own_name_alone(fleet: Fleet) -> None:
+def test_an_operator_commands_under_the_own_name_alone(fleet: Fleet):
     """Whatever a message says, its key has the name that is recorded; patterns are no way around it."""
     senders: list[tuple[str, str]] = []
 
@@ -280,7 +278,7 @@ def test_an_operator_commands_under_the_own_name_alone(fleet: Fleet) -> None:
         senders.clear()
 
 
-def test_who_has_no_good_key_is_not_let_in(certified: Fleet) -> None:
+def test_who_has_no_good_key_is_not_let_in(certified: Fleet):
     good = read_key_file(certified.folder.key_file("r0")).credentials
     foreign, _ = Authority.create("demo")
     theirs = foreign.issue("r0", Role.ROBOT, timedelta(days=1))
@@ -304,7 +302,7 @@ def test_who_has_no_good_key_is_not_let_in(certified: Fleet) -> None:
     assert not any(bus.wait_connected(0.5) for bus in (*strangers, plain))
 
 
-def test_a_wrong_password_is_not_let_in(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_wrong_password_is_not_let_in(tmp_path, caplog):
     caplog.set_level(logging.INFO, "mapweave.wire")
     fleet = Fleet(tmp_path / "keys", Profile.LAB)
     try:
@@ -320,7 +318,7 @@ def test_a_wrong_password_is_not_let_in(tmp_path: Path, caplog: pytest.LogCaptur
         fleet.close()
 
 
-def test_a_robot_is_no_router(certified: Fleet) -> None:
+def test_a_robot_is_no_router(certified: Fleet):
     """Its certificate is none of a server, so no client connects to a router that has it."""
     endpoint = f"tls/127.0.0.1:{free_port()}"
     stolen = read_key_file(certified.folder.key_file("r0")).credentials
@@ -336,7 +334,7 @@ def test_a_robot_is_no_router(certified: Fleet) -> None:
     assert not victim.wait_connected(0.5)
 
 
-def test_a_key_that_ends_ends_its_connection(certified: Fleet) -> None:
+def test_a_key_that_ends_ends_its_connection(certified: Fleet):
     good = read_key_file(certified.folder.key_file("r0")).credentials
     own = Authority(good.authority, (certified.folder.path / "authority.key").read_text())
     soon = own.issue("r0", Role.ROBOT, timedelta(seconds=2.5))
@@ -345,9 +343,7 @@ def test_a_key_that_ends_ends_its_connection(certified: Fleet) -> None:
     assert not bus.wait_connected(0.5)
 
 
-def test_a_revoked_key_is_of_no_use_and_nothing_else_changes(
-    fleet: Fleet, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_revoked_key_is_of_no_use_and_nothing_else_changes(fleet: Fleet, caplog):
     caplog.set_level(logging.INFO, "mapweave.wire")
     stolen = read_key_file(fleet.folder.key_file("r0")).credentials
     got: list[bytes] = []
@@ -376,7 +372,7 @@ def test_a_revoked_key_is_of_no_use_and_nothing_else_changes(
         assert "stolen" in caplog.text
 
 
-def test_who_was_alive_is_so_after_the_keys_have_changed_unless_revoked(fleet: Fleet) -> None:
+def test_who_was_alive_is_so_after_the_keys_have_changed_unless_revoked(fleet: Fleet):
     alive: set[str] = set()
 
     def hear(key: str, is_alive: bool) -> None:
@@ -404,20 +400,20 @@ def test_who_was_alive_is_so_after_the_keys_have_changed_unless_revoked(fleet: F
         "tcp/0.0.0.0:1?a=127.0.0.1:1",
     ],
 )
-def test_without_keys_a_router_listens_on_its_own_machine_alone(endpoint: str) -> None:
+def test_without_keys_a_router_listens_on_its_own_machine_alone(endpoint: str):
     with pytest.raises(SettingsError, match="mapweave keys init"):
         BusSettings(mode="router", listen=(endpoint,))
     BusSettings(mode="router", listen=("tcp/127.0.0.1:7447", "tcp/[::1]:7447", "tcp/localhost:7447"))
 
 
-def test_without_keys_a_router_takes_no_connections_of_pages_in_a_browser() -> None:
+def test_without_keys_a_router_takes_no_connections_of_pages_in_a_browser():
     """Pages of any site may open WebSockets to this machine, and Zenoh answered them as all others."""
     with pytest.raises(SettingsError, match="takes no WebSockets"):
         BusSettings(mode="router", listen=("tcp/127.0.0.1:7447", "ws/127.0.0.1:7448"))
     BusSettings(endpoints=("ws/127.0.0.1:7448",))
 
 
-def test_a_server_with_keys_is_a_client_of_routers(fleet: Fleet) -> None:
+def test_a_server_with_keys_is_a_client_of_routers(fleet: Fleet):
     """Given routers and not where to listen; robots ask it through the router."""
     fleet.folder.add("s1", Role.SERVER)
     fleet.renew()
@@ -434,13 +430,13 @@ def test_a_server_with_keys_is_a_client_of_routers(fleet: Fleet) -> None:
     eventually(lambda: r0.publish(KEYS.agent_status("r0"), b"x") or got)
 
 
-def test_a_server_that_listens_is_a_router() -> None:
+def test_a_server_that_listens_is_a_router():
     listens, joins = ("tcp/127.0.0.1:7448",), ("tcp/127.0.0.1:7447",)
     settings, _ = server_settings(NetworkSettings(endpoints=listens, routers=joins), "s0")
     assert (settings.mode, settings.listen, settings.routers) == ("router", listens, joins)
 
 
-def test_a_map_server_needs_the_key_of_one(tmp_path: Path) -> None:
+def test_a_map_server_needs_the_key_of_one(tmp_path):
     """Before, one with a robot's key started, and no robot took anything from it."""
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.LAB, [], "s0", 7447)
     with pytest.raises(
@@ -455,14 +451,14 @@ def test_a_map_server_needs_the_key_of_one(tmp_path: Path) -> None:
     assert folder.router("s1").mode == "router"
 
 
-def test_routers_with_passwords_do_not_join(tmp_path: Path) -> None:
+def test_routers_with_passwords_do_not_join(tmp_path):
     """Who connects would not know to which router."""
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.LAB, [], "s0", 7447)
     with pytest.raises(SettingsError, match="with certificates, not with the passwords"):
         folder.router("s0", (), ["tcp/127.0.0.1:7448"])
 
 
-def test_routers_with_keys_join_each_other_and_each_holds_to_the_rules(certified: Fleet) -> None:
+def test_routers_with_keys_join_each_other_and_each_holds_to_the_rules(certified: Fleet):
     """A robot at one router, a server at the other."""
     fleet = certified
     fleet.folder.add("s1", Role.SERVER)

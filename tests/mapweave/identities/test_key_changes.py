@@ -1,7 +1,5 @@
 """Changes of a folder of keys: by several processes at once, with files moved away or damaged."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import json
@@ -77,7 +75,7 @@ def users(folder: KeyFolder) -> list[str]:
     return [line.partition(":")[0] for line in (folder.path / "passwords").read_text().splitlines()]
 
 
-def test_changes_of_several_processes_are_all_kept(folder: KeyFolder) -> None:
+def test_changes_of_several_processes_are_all_kept(folder: KeyFolder):
     new = [f"a{k}" for k in range(4)]
     at_once(folder.path, "folder.revoke('r1')", *(f"folder.add('{name}', Role.ROBOT)" for name in new))
     good = {one.name for one in KeyFolder(folder.path).catalogue.identities if not one.revoked}
@@ -87,7 +85,7 @@ def test_changes_of_several_processes_are_all_kept(folder: KeyFolder) -> None:
 
 
 @pytest.mark.slow
-def test_tokens_of_several_processes_are_all_kept(folder: KeyFolder) -> None:
+def test_tokens_of_several_processes_are_all_kept(folder: KeyFolder):
     folder.token("r1", 1.0)
     tokens = [f"[folder.token('{name}', 1.0) for _ in range(10)]" for name in ("r0", "r2", "s0")]
     at_once(folder.path, "folder.end_tokens('r1')", *tokens)
@@ -95,7 +93,7 @@ def test_tokens_of_several_processes_are_all_kept(folder: KeyFolder) -> None:
     assert {name: names.count(name) for name in names} == {"r0": 10, "r2": 10, "s0": 10}
 
 
-def test_to_make_keys_again_changes_nothing(folder: KeyFolder) -> None:
+def test_to_make_keys_again_changes_nothing(folder: KeyFolder):
     """The mode of the folder neither: the server of another user may read it by its group."""
     folder.path.chmod(0o750)
     with pytest.raises(InvalidFile, match="there are keys already"):
@@ -103,7 +101,7 @@ def test_to_make_keys_again_changes_nothing(folder: KeyFolder) -> None:
     assert folder.path.stat().st_mode & 0o777 == 0o750
 
 
-def test_of_two_authorities_at_once_one_is_made(tmp_path: Path) -> None:
+def test_of_two_authorities_at_once_one_is_made(tmp_path):
     create = (
         "try:\n    KeyFolder.create(path, 'demo', Profile.PRODUCTION, [], 's0')\n"
         "    Path(f'{path}.made').open('x')\n"
@@ -116,7 +114,7 @@ def test_of_two_authorities_at_once_one_is_made(tmp_path: Path) -> None:
     assert certificate is not None and certificate.authority == (folder.path / "authority.pem").read_text()
 
 
-def test_a_share_that_locks_no_folders_takes_keys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_share_that_locks_no_folders_takes_keys(tmp_path, monkeypatch):
     """NFS locks only what is open for writing, which no folder is."""
     flock = fcntl.flock
 
@@ -133,9 +131,7 @@ def test_a_share_that_locks_no_folders_takes_keys(tmp_path: Path, monkeypatch: p
     assert {path.name for path in folder.path.iterdir()} == names, "no lock is left"
 
 
-def test_who_waits_in_vain_for_another_command_changes_no_keys(
-    folder: KeyFolder, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_who_waits_in_vain_for_another_command_changes_no_keys(folder: KeyFolder, monkeypatch, capfd):
     monkeypatch.setattr(folder_changes, "PATIENCE", 0.05)
     before = {path.name: path.read_bytes() for path in folder.path.iterdir()}
     with locked(folder.path):
@@ -145,7 +141,7 @@ def test_who_waits_in_vain_for_another_command_changes_no_keys(
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="only root acts as another user")
-def test_what_root_leaves_when_it_is_killed_holds_up_no_server(folder: KeyFolder) -> None:
+def test_what_root_leaves_when_it_is_killed_holds_up_no_server(folder: KeyFolder):
     """Its lock belongs to the folder's owner, the server's user, as what it writes does."""
     os.chown(folder.path, 12345, 12345)
     before = {*folder.path.iterdir()}
@@ -153,7 +149,7 @@ def test_what_root_leaves_when_it_is_killed_holds_up_no_server(folder: KeyFolder
         assert [path.stat().st_uid for path in {*folder.path.iterdir()} - before] == [12345]
 
 
-def test_a_key_file_that_was_moved_holds_up_no_change(folder: KeyFolder, tmp_path: Path) -> None:
+def test_a_key_file_that_was_moved_holds_up_no_change(folder: KeyFolder, tmp_path):
     """To its robot, instead of a copy: its own password stays good."""
     (folder.path / "r0.key.toml").rename(tmp_path / "r0.key.toml")
     folder.revoke("r1")
@@ -167,9 +163,7 @@ def test_a_key_file_that_was_moved_holds_up_no_change(folder: KeyFolder, tmp_pat
 
 
 @pytest.mark.parametrize("file", ["passwords", "fleet.json"])
-def test_a_revocation_that_fails_changes_nothing(
-    file: str, folder: KeyFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_revocation_that_fails_changes_nothing(file: str, folder: KeyFolder, monkeypatch):
     folder.token("r1", 1.0)
     before = {path.name: path.read_bytes() for path in folder.path.iterdir()}
 
@@ -191,9 +185,7 @@ def test_a_revocation_that_fails_changes_nothing(
     assert read_tokens(folder.path) == () and not (folder.path / "r1.key.toml").exists()
 
 
-def test_tokens_that_a_broken_off_revocation_left_do_not_come_back(
-    folder: KeyFolder, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_tokens_that_a_broken_off_revocation_left_do_not_come_back(folder: KeyFolder, monkeypatch):
     token = folder.token("r1", 1.0)
 
     def interrupted(folder: Path, name: str) -> int:
@@ -208,9 +200,7 @@ def test_tokens_that_a_broken_off_revocation_left_do_not_come_back(
     assert Logins(folder.path).login(token) is None
 
 
-def test_the_only_server_is_revoked_by_force_alone(
-    folder: KeyFolder, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_the_only_server_is_revoked_by_force_alone(folder: KeyFolder, capfd):
     """A running router keeps its key, and no other could be started."""
     assert "s0 is the only server: add another one first" in complaint(
         capfd,
@@ -231,9 +221,7 @@ def test_the_only_server_is_revoked_by_force_alone(
     folder.revoke("s1")
 
 
-def test_what_is_no_text_is_one_line_and_lets_no_client_in(
-    folder: KeyFolder, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_no_text_is_one_line_and_lets_no_client_in(folder: KeyFolder, capfd):
     token = folder.token("r1", 1.0)
     logins = Logins(folder.path)
     for name in (TOKENS, "fleet.json"):
@@ -246,9 +234,7 @@ def test_what_is_no_text_is_one_line_and_lets_no_client_in(
 
 
 @pytest.mark.parametrize("expires", ["2027-01-01T00:00:00x", "2027-01-01T00:00:00", "soon"])
-def test_a_damaged_date_is_one_line_and_lets_no_client_in(
-    expires: str, folder: KeyFolder, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_damaged_date_is_one_line_and_lets_no_client_in(expires: str, folder: KeyFolder, capfd):
     token = folder.token("r1", 1.0)
     logins = Logins(folder.path)
     assert logins.login(token) is not None
@@ -279,8 +265,8 @@ def test_a_damaged_date_is_one_line_and_lets_no_client_in(
     ],
 )
 def test_a_name_that_leaves_its_folder_or_key_is_one_line(
-    field: str, value: object, folder: KeyFolder, capfd: pytest.CaptureFixture[str]
-) -> None:
+    field: str, value: object, folder: KeyFolder, capfd
+):
     """Names are parts of files and of the keys in the router's rules. Before, any was taken."""
     path = folder.path / "fleet.json"
     content = json.loads(path.read_text())

@@ -1,7 +1,5 @@
 """A running router with keys that come and go."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from datetime import UTC, datetime, timedelta
@@ -69,7 +67,7 @@ def answered(bus: ZenohBus, name: str) -> bool:
     return any(reply.payload == b"yes" for reply in bus.ask(sent_by(KEYS.route("s0"), name), b"", 1.0))
 
 
-def test_revocations_hold_also_without_a_key_of_the_server(running: Running) -> None:
+def test_revocations_hold_also_without_a_key_of_the_server(running: Running):
     """The old rules stayed, for ever, once the server's own key was revoked."""
     stolen = running.key_of("r1")
     r0, r1 = running.join(running.key_of("r0")), running.join(stolen)
@@ -90,7 +88,7 @@ def test_revocations_hold_also_without_a_key_of_the_server(running: Running) -> 
     assert not answered(again, "r1") and not answered(r1, "r1")
 
 
-def test_a_server_takes_its_new_key_when_that_can_be_read(running: Running) -> None:
+def test_a_server_takes_its_new_key_when_that_can_be_read(running: Running):
     before = running.key_of("s0")
     running.folder.revoke("s0", force=True)
     running.renewal.check()
@@ -117,8 +115,8 @@ def test_a_server_takes_its_new_key_when_that_can_be_read(running: Running) -> N
     ],
 )
 def test_a_server_whose_own_certificate_does_not_hold_says_so_once(
-    running: Running, monkeypatch: pytest.MonkeyPatch, now: timedelta, words: str
-) -> None:
+    running: Running, monkeypatch, now: timedelta, words: str
+):
     """It was up, and no one could connect: the reason was on the machines of the others alone."""
     running.renewal.check()
     assert not running.said

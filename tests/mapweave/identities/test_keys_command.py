@@ -1,7 +1,5 @@
 """`mapweave keys`, and who may read what it writes."""
 
-from __future__ import annotations
-
 import base64
 import errno
 import json
@@ -41,7 +39,7 @@ def keys(request: pytest.FixtureRequest, tmp_path: Path) -> Path:
     return folder
 
 
-def test_secrets_are_their_owners_alone(keys: Path) -> None:
+def test_secrets_are_their_owners_alone(keys: Path):
     public = {"fleet.json", "authority.pem"}
     assert stat.S_IMODE(keys.stat().st_mode) == 0o700
     for path in keys.iterdir():
@@ -52,7 +50,7 @@ def test_secrets_are_their_owners_alone(keys: Path) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="needs root")
-def test_what_root_adds_to_a_servers_keys_the_server_can_read(keys: Path) -> None:
+def test_what_root_adds_to_a_servers_keys_the_server_can_read(keys: Path):
     """Systemd runs the server as a user of its own, which owns the folder; people add keys with sudo."""
     for path in (keys, *keys.iterdir()):
         os.chown(path, 64_999, 64_998)
@@ -65,7 +63,7 @@ def test_what_root_adds_to_a_servers_keys_the_server_can_read(keys: Path) -> Non
     assert set(owners.values()) == {(64_999, 64_998)}, owners
 
 
-def test_a_key_file_is_refused_if_others_may_read_it(keys: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_key_file_is_refused_if_others_may_read_it(keys: Path, capfd):
     path = keys / "r0.key.toml"
     path.chmod(0o640)
     assert f"chmod 600 {path}" in complaint(capfd, "status", "--keys", path)
@@ -76,9 +74,7 @@ def test_a_key_file_is_refused_if_others_may_read_it(keys: Path, capfd: pytest.C
     assert "is no key file" in complaint(capfd, "status", "--keys", authority)
 
 
-def test_a_key_says_where_the_server_is_and_is_for_one_name_and_fleet(
-    keys: Path, capfd: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_key_says_where_the_server_is_and_is_for_one_name_and_fleet(keys: Path, capfd, tmp_path):
     path = keys / "r0.key.toml"
     assert "10.0.0.5:7447" in read_key_file(path).endpoints[0]
     assert "is the key of r0, not of r1" in complaint(
@@ -87,7 +83,7 @@ def test_a_key_says_where_the_server_is_and_is_for_one_name_and_fleet(
     assert "fleet f1, not of other" in complaint(capfd, "status", "--keys", path, "--fleet", "other")
 
 
-def test_who_has_a_key_is_listed(keys: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_who_has_a_key_is_listed(keys: Path, capsys):
     where = ["--keys", str(keys)]
     assert main(["keys", "revoke", "r0", "--because", "lost", *where]) == 0
     capsys.readouterr()
@@ -98,9 +94,7 @@ def test_who_has_a_key_is_listed(keys: Path, capsys: pytest.CaptureFixture[str])
     assert not (keys / "r0.key.toml").exists()
 
 
-def test_a_token_is_shown_once_and_its_hash_alone_is_kept(
-    keys: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_token_is_shown_once_and_its_hash_alone_is_kept(keys: Path, capfd):
     where = ["--keys", str(keys)]
     assert main(["keys", "token", "r0", *where]) == 0
     token = capfd.readouterr().out.strip()
@@ -118,7 +112,7 @@ def test_a_token_is_shown_once_and_its_hash_alone_is_kept(
     assert "r9 has no good key" in complaint(capfd, "keys", "token", "r9", *where, status=NO)
 
 
-def test_a_question_with_a_robots_key_is_said_to_need_anothers(keys: Path) -> None:
+def test_a_question_with_a_robots_key_is_said_to_need_anothers(keys: Path):
     """The router drops it without a word: it looks like a server that is not there."""
     robot, nowhere = read_key_file(keys / "r0.key.toml").credentials, MemoryBus(MemoryHub())
     assert "its key is a robot's, use a viewer's or an operator's" in str(
@@ -127,7 +121,7 @@ def test_a_question_with_a_robots_key_is_said_to_need_anothers(keys: Path) -> No
     assert "a robot's" not in str(no_server(nowhere, Keys("f1"), replace(robot, role=Role.VIEWER)))
 
 
-def test_a_robot_that_is_not_let_in_hears_that_its_key_may_be_no_longer_good(keys: Path) -> None:
+def test_a_robot_that_is_not_let_in_hears_that_its_key_may_be_no_longer_good(keys: Path):
     """An agent heard that it should use an operator's key."""
     robot = read_key_file(keys / "r0.key.toml").credentials
     with socket.create_server(("127.0.0.1", 0)) as there:
@@ -146,16 +140,14 @@ def test_a_robot_that_is_not_let_in_hears_that_its_key_may_be_no_longer_good(key
         "map retire r0.1 --check", "map undo 1", "place add kitchen r0.1.1", "drive r0 --gamepad /dev/null",
     ],
 )  # fmt: skip
-def test_a_command_with_a_viewers_key_is_said_to_need_anothers(
-    keys: Path, words: str, role: str, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_with_a_viewers_key_is_said_to_need_anothers(keys: Path, words: str, role: str, capfd):
     """The router drops it without a word: it was said that no map server answers."""
     assert main(["keys", "add", "vic", "--role", role, "--keys", str(keys)]) == 0
     said = complaint(capfd, *words.split(), "--keys", keys / "vic.key.toml")
     assert f"this is the key of a {role}: missions and corrections need an operator's" in said
 
 
-def test_mistakes_are_one_line(keys: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_mistakes_are_one_line(keys: Path, tmp_path, capfd):
     where = ("--keys", keys)
     assert "there are keys already" in complaint(capfd, "keys", "init", *where)
     assert "no keys are here" in complaint(capfd, "keys", "list", "--keys", tmp_path)
@@ -183,16 +175,14 @@ def test_mistakes_are_one_line(keys: Path, tmp_path: Path, capfd: pytest.Capture
     assert "fleet.json" in complaint(capfd, "keys", "list", *where)
 
 
-def test_a_copy_is_the_same_key(keys: Path, tmp_path: Path) -> None:
+def test_a_copy_is_the_same_key(keys: Path, tmp_path):
     copy = tmp_path / "r0.key.toml"
     assert main(["keys", "bundle", "r0", "-o", str(copy), "--keys", str(keys)]) == 0
     assert read_key_file(copy) == read_key_file(keys / "r0.key.toml")
     assert stat.S_IMODE(copy.stat().st_mode) == 0o600
 
 
-def test_no_copy_is_made_of_a_key_that_lets_no_one_in(
-    keys: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_copy_is_made_of_a_key_that_lets_no_one_in(keys: Path, tmp_path, capsys):
     """What is left in the folder by commands that were killed half-way, and what has expired."""
     copy, left = tmp_path / "copy.key.toml", (keys / "r0.key.toml").read_bytes()
     folder = KeyFolder(keys)
@@ -212,9 +202,7 @@ def test_no_copy_is_made_of_a_key_that_lets_no_one_in(
         assert not copy.exists()
 
 
-def test_a_key_that_ends_before_the_one_of_before_does_not_end_that(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_key_that_ends_before_the_one_of_before_does_not_end_that(tmp_path, capsys):
     """The list said that all ended tomorrow, and the router let in the key of before for a year."""
     where = ["--keys", str(tmp_path / "keys")]
     assert main(["keys", "init", *where]) == 0
@@ -232,9 +220,7 @@ def test_a_key_that_ends_before_the_one_of_before_does_not_end_that(
     assert folder.changed() and folder.find("r0").expires < before.expires
 
 
-def test_an_authority_signs_nothing_with_the_key_of_another(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_an_authority_signs_nothing_with_the_key_of_another(tmp_path, capsys):
     """The certificate comes from another backup: who got a key by it was let in nowhere."""
     mine, other = tmp_path / "mine", tmp_path / "other"
     for folder in (mine, other):
@@ -250,7 +236,7 @@ def test_an_authority_signs_nothing_with_the_key_of_another(
     assert main(["keys", "add", "r0", "--keys", str(mine)]) == 0
 
 
-def test_certificates_are_what_they_say(tmp_path: Path) -> None:
+def test_certificates_are_what_they_say(tmp_path):
     """Read by the library of certificates itself: the chain, the name, what it may be used for, the hosts."""
     assert main(["keys", "init", "--keys", str(tmp_path), "--at", "maps.local", "--at", "10.0.0.5"]) == 0
     folder = KeyFolder(tmp_path)
@@ -290,9 +276,7 @@ def contents(folder: Path) -> dict[str, bytes]:
 
 
 @pytest.mark.parametrize("profile", ["production", "lab"])
-def test_a_full_disk_leaves_no_half_authority(
-    profile: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_leaves_no_half_authority(profile: str, tmp_path, monkeypatch, capfd):
     """With a catalogue and without a server's key `init` said that there are keys already."""
     folder, disk, count = tmp_path / "keys", FullDisk(monkeypatch), 0
     while True:
@@ -309,9 +293,7 @@ def test_a_full_disk_leaves_no_half_authority(
 
 
 @pytest.mark.parametrize("name", ["r0", "r1"])
-def test_a_full_disk_leaves_keys_as_they_were(
-    name: str, keys: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_full_disk_leaves_keys_as_they_were(name: str, keys: Path, monkeypatch, capfd):
     """Of a robot that has a key and of one that has none: half of a new one is a key that no server knows."""
     disk, before, count = FullDisk(monkeypatch), contents(keys), 0
     while True:
@@ -326,7 +308,7 @@ def test_a_full_disk_leaves_keys_as_they_were(
     assert not [path for path in keys.iterdir() if path.name.startswith(".")]
 
 
-def test_a_disk_that_is_really_full_is_one_line(tmp_path: Path) -> None:
+def test_a_disk_that_is_really_full_is_one_line(tmp_path):
     words = [sys.executable, "-m", "mapweave", "keys", "init", "--keys", "keys", "--profile", "lab"]
     # No bytecode: on a disk that takes half of a file, Python keeps the half, and no process starts again.
     done = subprocess.run(
@@ -342,24 +324,22 @@ def test_a_disk_that_is_really_full_is_one_line(tmp_path: Path) -> None:
     "host",
     ["127.0.0.1:7447", "10.0.0.5/24", "fe80::1%eth0", "-x", "a b", "192.168.1.300", "192.168.1"],
 )
-def test_a_host_is_a_name_or_an_address_without_a_port(
-    host: str, capfd: pytest.CaptureFixture[str], tmp_path: Path
-) -> None:
+def test_a_host_is_a_name_or_an_address_without_a_port(host: str, capfd, tmp_path):
     where = tmp_path / "keys"
     assert "without a port" in complaint(capfd, "keys", "init", f"--at={host}", "--keys", where, status=USAGE)
     assert not where.exists()
 
 
-def test_a_key_that_is_not_there_is_named(capfd: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+def test_a_key_that_is_not_there_is_named(capfd, tmp_path):
     said = complaint(capfd, "status", "--keys", tmp_path / "r0.key.toml")
     assert "r0.key.toml: no such key file; `mapweave keys add NAME` at the server makes one" in said
 
 
-def test_a_folder_is_no_key_file(keys: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_folder_is_no_key_file(keys: Path, capfd):
     assert "is a folder; give one of the key files in it" in complaint(capfd, "status", "--keys", keys)
 
 
-def test_a_second_router_has_a_key_of_its_own(keys: Path, capfd: pytest.CaptureFixture[str]) -> None:
+def test_a_second_router_has_a_key_of_its_own(keys: Path, capfd):
     """On another machine there is no key of the first server."""
     assert main(["keys", "add", "s1", "--role", "server", "--keys", str(keys)]) == 0
     (keys / "s0.key.toml").unlink()
@@ -371,9 +351,7 @@ def test_a_second_router_has_a_key_of_its_own(keys: Path, capfd: pytest.CaptureF
     assert secret in written
 
 
-def test_a_password_that_would_not_expire_is_not_promised_to(
-    tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_password_that_would_not_expire_is_not_promised_to(tmp_path, capfd):
     keys = tmp_path / "lab"
     assert main(["keys", "init", "--keys", str(keys), "--at", "10.0.0.5", "--profile", "lab"]) == 0
     capfd.readouterr()
@@ -381,9 +359,7 @@ def test_a_password_that_would_not_expire_is_not_promised_to(
     assert "do not expire" in said and not (keys / "guest.key.toml").exists()
 
 
-def test_a_server_that_comes_later_may_be_on_another_machine(
-    keys: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_server_that_comes_later_may_be_on_another_machine(keys: Path, capfd):
     """The fleet's keys were made for one machine: they stay as they are."""
     where = ["--keys", str(keys)]
     before = (keys / "r0.key.toml").read_bytes()
@@ -415,9 +391,7 @@ def test_a_server_that_comes_later_may_be_on_another_machine(
         (["r1", "--at", "maps2"], "is for a server"),
     ],
 )
-def test_where_a_server_is_reached_is_said_of_servers_alone(
-    keys: Path, capfd: pytest.CaptureFixture[str], words: list[str], said: str
-) -> None:
+def test_where_a_server_is_reached_is_said_of_servers_alone(keys: Path, capfd, words: list[str], said: str):
     before = contents(keys)
     capfd.readouterr()
     assert said in complaint(capfd, "keys", "add", *words, "--keys", keys, status=USAGE)

@@ -1,7 +1,5 @@
 """What is not protected, as SECURITY.md says: the page must not promise less, or more, than is true."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Iterator
@@ -72,7 +70,7 @@ class Listener:
 
 
 @pytest.mark.parametrize("profile", list(Profile))
-def test_who_listens_reads_a_lab_and_not_a_fleet_with_certificates(profile: Profile, tmp_path: Path) -> None:
+def test_who_listens_reads_a_lab_and_not_a_fleet_with_certificates(profile: Profile, tmp_path):
     fleet = Fleet(tmp_path / "keys", profile)
     scheme, _, place = fleet.endpoint.partition("/")
     listener = Listener(int(place.rpartition(":")[2]))
@@ -91,7 +89,7 @@ def test_who_listens_reads_a_lab_and_not_a_fleet_with_certificates(profile: Prof
         fleet.close()
 
 
-def test_without_keys_any_program_of_this_machine_commands_under_any_name() -> None:
+def test_without_keys_any_program_of_this_machine_commands_under_any_name():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     router = ZenohBus(BusSettings(mode="router", listen=(endpoint,)))
     program = ZenohBus(BusSettings(endpoints=(endpoint,)))
@@ -107,7 +105,7 @@ def test_without_keys_any_program_of_this_machine_commands_under_any_name() -> N
         router.close()
 
 
-def test_who_has_the_key_of_the_authority_is_any_member(certified: Fleet) -> None:
+def test_who_has_the_key_of_the_authority_is_any_member(certified: Fleet):
     """As root on the machine of the server has it."""
     r0 = certified.join("r0")
     serve_senders(r0, KEYS.mission("r0"), lambda request, who: answer(request))
@@ -119,7 +117,7 @@ def test_who_has_the_key_of_the_authority_is_any_member(certified: Fleet) -> Non
     eventually(lambda: asked(bus, sent_by(KEYS.mission("r0"), "anna")))
 
 
-def test_a_robot_learns_whether_others_subscribe_to_its_keys(certified: Fleet) -> None:
+def test_a_robot_learns_whether_others_subscribe_to_its_keys(certified: Fleet):
     """Zenoh tells a publisher, so that it need not send what has no receiver."""
     certified.router.subscribe(KEYS.changes(), lambda sample: None)
     r0 = certified.join("r0")

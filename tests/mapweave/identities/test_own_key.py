@@ -1,7 +1,5 @@
 """A running agent whose key file is replaced."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from datetime import timedelta
 from pathlib import Path
@@ -63,7 +61,7 @@ def enrolled(tmp_path: Path) -> Iterator[Enrolled]:
     enrolled.router.close()
 
 
-def test_a_robot_goes_on_with_the_key_that_is_copied_to_it(enrolled: Enrolled) -> None:
+def test_a_robot_goes_on_with_the_key_that_is_copied_to_it(enrolled: Enrolled):
     """It was cut off for good once its certificate had expired, until its agent was started again."""
     alive: dict[str, bool] = {}
     enrolled.router.watch(KEYS.agents_alive(), alive.__setitem__)
@@ -82,7 +80,7 @@ def test_a_robot_goes_on_with_the_key_that_is_copied_to_it(enrolled: Enrolled) -
         bus.close()
 
 
-def test_what_is_no_better_key_is_not_taken(enrolled: Enrolled) -> None:
+def test_what_is_no_better_key_is_not_taken(enrolled: Enrolled):
     good = enrolled.good.credentials
     bus, own = enrolled.start(good, SELDOM)
     try:
@@ -106,7 +104,7 @@ def test_what_is_no_better_key_is_not_taken(enrolled: Enrolled) -> None:
         bus.close()
 
 
-def test_a_key_that_comes_while_there_is_no_router_is_used_once_there_is(enrolled: Enrolled) -> None:
+def test_a_key_that_comes_while_there_is_no_router_is_used_once_there_is(enrolled: Enrolled):
     settings = enrolled.keys.router("s0", enrolled.keys.catalogue.endpoints)
     enrolled.router.close()
     stranger = KeyFolder.create(enrolled.path.parent / "others", "demo", Profile.PRODUCTION, [], "s0", 1)

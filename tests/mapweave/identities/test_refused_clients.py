@@ -1,7 +1,5 @@
 """Which clients a router with keys refuses, and why: lines of its log in both formats, over real TLS."""
 
-from __future__ import annotations
-
 import json
 import signal
 import socket
@@ -99,7 +97,7 @@ def with_certificate(good: Credentials, authority: Authority, age: timedelta = t
 
 
 @FORMATS
-def test_each_refused_client_is_logged_with_the_reason(log_format: str, tmp_path: Path) -> None:
+def test_each_refused_client_is_logged_with_the_reason(log_format: str, tmp_path):
     with running(tmp_path, log_format) as router:
         own = Authority(router.good.authority, (router.folder.path / "authority.key").read_text())
         foreign, _ = Authority.create("demo")
@@ -140,7 +138,7 @@ def test_each_refused_client_is_logged_with_the_reason(log_format: str, tmp_path
         router.end()
 
 
-def test_a_client_that_tries_on_is_counted(tmp_path: Path) -> None:
+def test_a_client_that_tries_on_is_counted(tmp_path):
     """It tries each second, for ever."""
     with running(tmp_path, "text") as router:
         assert not router.connect("tcp", None, 2.5)

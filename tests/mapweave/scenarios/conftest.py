@@ -1,7 +1,5 @@
 """A trial that never was: robots that drive through three rooms, with maps as good as one wants them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 

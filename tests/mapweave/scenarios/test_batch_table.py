@@ -1,7 +1,5 @@
 """A batch's table: medians and worsts against numpy, failures by seed."""
 
-from __future__ import annotations
-
 import io
 import json
 from dataclasses import replace

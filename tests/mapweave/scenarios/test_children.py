@@ -1,7 +1,5 @@
 """Child processes: none is left behind, whatever happens to their parent."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal
@@ -46,7 +44,7 @@ def runs(pid: int) -> bool:
 
 
 @pytest.mark.parametrize("how", first_quick([signal.SIGKILL, signal.SIGTERM], 1))
-def test_children_of_a_process_that_is_killed_end_by_themselves(tmp_path: Path, how: signal.Signals) -> None:
+def test_children_of_a_process_that_is_killed_end_by_themselves(tmp_path, how: signal.Signals):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     command = [sys.executable, "-c", PARENT, str(tmp_path), endpoint]
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as parent:
@@ -62,7 +60,7 @@ def test_children_of_a_process_that_is_killed_end_by_themselves(tmp_path: Path, 
 
 
 @pytest.mark.slow
-def test_a_child_is_ended_and_a_failed_one_is_reported(tmp_path: Path) -> None:
+def test_a_child_is_ended_and_a_failed_one_is_reported(tmp_path):
     with Children(tmp_path) as children:
         children.start(
             "server", ["server", "--listen", f"tcp/127.0.0.1:{free_port()}", "--data", str(tmp_path)]
@@ -94,9 +92,7 @@ time.sleep(60.0)
 """A child that ends only once all three have been asked to."""
 
 
-def test_children_are_asked_to_end_before_any_is_waited_for(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_children_are_asked_to_end_before_any_is_waited_for(tmp_path, monkeypatch):
     """One after the other took as long as all of them together."""
     popen, command, names = subprocess.Popen, [sys.executable, "-c", LAST, str(tmp_path)], ["a", "b", "c"]
     monkeypatch.setattr(subprocess, "Popen", lambda args, **more: popen([*command, *args[3:]], **more))
@@ -111,7 +107,7 @@ def test_children_are_asked_to_end_before_any_is_waited_for(
     assert all("all were asked" in log.read_text() for log in logs)
 
 
-def test_the_stdin_of_all_others_means_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_stdin_of_all_others_means_nothing(monkeypatch):
     monkeypatch.delenv(parent_watchdog.NAME, raising=False)
     stop = threading.Event()
     parent_watchdog.hold(stop)
@@ -119,9 +115,7 @@ def test_the_stdin_of_all_others_means_nothing(monkeypatch: pytest.MonkeyPatch) 
     assert "lifeline" not in {thread.name for thread in threading.enumerate()}
 
 
-def test_a_child_whose_output_finds_no_room_on_the_disk(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_child_whose_output_finds_no_room_on_the_disk(tmp_path, monkeypatch):
     """It was said to have printed nothing, though it had said why it ended."""
     with Children(tmp_path) as children:
         children.start("server", ["no such command"])

@@ -1,7 +1,5 @@
 """Coverage and loops, on a floor that can be counted by hand."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Journals against the store: missing changes are counted, and a hash distinguishes maps."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Expectations: what is accepted, and one line for each error."""
 
-from __future__ import annotations
-
 import tomllib
 from dataclasses import replace
 

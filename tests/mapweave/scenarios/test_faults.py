@@ -1,7 +1,5 @@
 """A fleet to which everything happens that a scenario knows: afterwards nothing is lost, nothing is false."""
 
-from __future__ import annotations
-
 import pytest
 
 from mapweave.agent.replication.journal import Journal

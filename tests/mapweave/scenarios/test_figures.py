@@ -1,7 +1,5 @@
 """Figures: flat, documented, and the same after a way through JSON."""
 
-from __future__ import annotations
-
 import inspect
 import json
 import math

@@ -1,7 +1,5 @@
 """Films: read back by a decoder, and not a word on the terminal."""
 
-from __future__ import annotations
-
 import os
 import threading
 

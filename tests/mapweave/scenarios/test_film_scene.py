@@ -1,7 +1,5 @@
 """Frames: what is in them, where, and that they are quick."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import time

@@ -1,7 +1,5 @@
 """The plot of a kidnapping on made-up maps: its rules, one by one."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 

@@ -1,7 +1,5 @@
 """The live view by real HTTP over loopback."""
 
-from __future__ import annotations
-
 import asyncio
 import http.client
 import json

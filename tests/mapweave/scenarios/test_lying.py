@@ -1,7 +1,5 @@
 """The event `lie`: its table, what each lie sends, and the figures of it. The run itself is a scenario."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -48,7 +46,7 @@ def setting() -> LieInputs:
     return LieInputs(LIAR, (nodes, [loop, *edges]), maps, rng)
 
 
-def test_a_map_is_sent_in_the_order_of_its_drive(setting: LieInputs) -> None:
+def test_a_map_is_sent_in_the_order_of_its_drive(setting: LieInputs):
     sent = bodies(setting.own)
     known = set()
     for body in sent:
@@ -62,7 +60,7 @@ def test_a_map_is_sent_in_the_order_of_its_drive(setting: LieInputs) -> None:
 
 
 @pytest.mark.parametrize("name", ["honest", *EVERY])
-def test_each_way_is_of_legal_messages_and_differs_from_the_truth(name: str, setting: LieInputs) -> None:
+def test_each_way_is_of_legal_messages_and_differs_from_the_truth(name: str, setting: LieInputs):
     way = {**EVERY, "honest": honest}[name]
     sent = way(setting)
     read = [
@@ -77,7 +75,7 @@ def test_each_way_is_of_legal_messages_and_differs_from_the_truth(name: str, set
     assert (sent.logs == {LIAR: truth}) is (name == "honest")
 
 
-def test_an_event_names_its_ways() -> None:
+def test_an_event_names_its_ways():
     action = parse_action("lie", {"robot": "r3", "ways": ["copied places"], "queries": 3}, "event 1")
     assert action == TryLies("r3", ("copied places",), 3)
     for table, reason in (
@@ -88,7 +86,7 @@ def test_an_event_names_its_ways() -> None:
             parse_action("lie", table, "event 1")
 
 
-def test_the_figures_count_the_ways_that_can_be_found_out() -> None:
+def test_the_figures_count_the_ways_that_can_be_found_out():
     good = ContainmentOutcome(True, "map r3.1 is implausible", True, 0.01, 0, 0, True, 1.0)
     bad = ContainmentOutcome(False, "map r3.1 is implausible", False, 0.2, 3, 1, True, 1.0)
     hidden = ContainmentOutcome(False, "", False, 9.0, 12, 0, True, 1.0)
@@ -104,7 +102,7 @@ def test_the_figures_count_the_ways_that_can_be_found_out() -> None:
     assert "not all merged in time" in row(second, replace(bad, alive=False))
 
 
-def test_an_accusation_counts_also_as_the_reason_of_a_split() -> None:
+def test_an_accusation_counts_also_as_the_reason_of_a_split():
     """A map that was joined until its geometry was found wrong is accused in no event of its own."""
     reason = "map r3.1 contradicts r0.1 and r1.1, which agree: its geometry is wrong"
     split = f"r0.1+r1.1 and r3.1 are no longer one map: 40 links refused ({reason})"

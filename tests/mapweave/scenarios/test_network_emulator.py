@@ -1,7 +1,5 @@
 """The cable between a robot and the router, on real sockets."""
 
-from __future__ import annotations
-
 import contextlib
 import math
 import socket

@@ -1,10 +1,7 @@
 """How long the processes of a trial may take to come up."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -36,9 +33,7 @@ class Slow:
 
 
 @pytest.mark.parametrize("looks", [2, 20])
-def test_first_agents_may_compile_for_longer_than_others_take(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture, looks: int
-) -> None:
+def test_first_agents_may_compile_for_longer_than_others_take(tmp_path, monkeypatch, caplog, looks: int):
     """On a busy computer the first run ended after a minute, without a word until then."""
     fleet = ProcessFleet(
         TrialStage(load_scenario(scenario_path("agent-killed")), 1, tmp_path, AgentSettings())

@@ -2,8 +2,6 @@
 machine, with the robots in one process or in many.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

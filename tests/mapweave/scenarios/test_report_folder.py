@@ -1,7 +1,5 @@
 """A trial's folder: whole, readable by others' programs, and nothing beside it."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

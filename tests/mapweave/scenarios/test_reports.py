@@ -1,7 +1,5 @@
 """What a scenario learns from the statuses of its robots."""
 
-from __future__ import annotations
-
 import random
 
 import pytest
@@ -24,7 +22,7 @@ def report(tick: int, traffic: int) -> AgentStatus:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_traffic_is_that_of_all_lives_of_an_agent_in_whatever_order_reports_come(seed: int) -> None:
+def test_traffic_is_that_of_all_lives_of_an_agent_in_whatever_order_reports_come(seed: int):
     """Each report that was overtaken counted as another life: a robot of 1 MB seemed to have sent 86 MB."""
     draw = random.Random(seed)
     hub = MemoryHub()

@@ -1,7 +1,5 @@
 """Scenario files: what is said is meant, and what is wrong is said in one line."""
 
-from __future__ import annotations
-
 import tomllib
 from pathlib import Path
 

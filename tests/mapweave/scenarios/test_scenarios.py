@@ -1,7 +1,5 @@
 """The scenarios that come with Mapweave, with a seed that nothing was developed with, in real processes."""
 
-from __future__ import annotations
-
 import pytest
 
 from mapweave.scenarios.run import TrialOptions, run_trial

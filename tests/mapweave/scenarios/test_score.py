@@ -1,7 +1,5 @@
 """The score of a trial against evo's own programs, plain numpy, and the rules of its docstrings."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import itertools

@@ -1,16 +1,12 @@
 """Progress of a trial where there is no terminal."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 from typing import Any, cast
-
-import pytest
 
 from mapweave.scenarios.terminal_progress import TerminalProgress
 
 
-def test_lines_say_how_far_the_robots_are(capfd: pytest.CaptureFixture[str]) -> None:
+def test_lines_say_how_far_the_robots_are(capfd):
     """The lines of a demo in a file were all alike but for the time."""
     runner: Any = SimpleNamespace(moments=[], now=13.0, doing="until joined, then go", done=1, agents={})
     with TerminalProgress("demo", ("r0", "r1"), 3, quiet=False) as show:

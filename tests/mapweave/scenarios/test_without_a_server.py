@@ -1,7 +1,5 @@
 """A robot whose map server is killed, in the simulator: it goes home, stands or goes on, as it is set."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -81,7 +79,7 @@ def exploring(folder: Path, without_server: WithoutServer, seconds: int = 60) ->
 @needs_simulator
 @pytest.mark.slow
 @pytest.mark.timeout(400)
-def test_it_goes_home_and_goes_on_when_the_server_is_back(tmp_path: Path) -> None:
+def test_it_goes_home_and_goes_on_when_the_server_is_back(tmp_path):
     with exploring(tmp_path, WithoutServer.HOME) as robot:
         assert robot.truth.distance(robot.home) > 0.5, "it has to drive"
         robot.fleet.kill_server()
@@ -102,7 +100,7 @@ def test_it_goes_home_and_goes_on_when_the_server_is_back(tmp_path: Path) -> Non
 @pytest.mark.slow
 @pytest.mark.timeout(400)
 @pytest.mark.parametrize("setting", [WithoutServer.STAND, WithoutServer.GO_ON])
-def test_it_stands_or_goes_on(tmp_path: Path, setting: WithoutServer) -> None:
+def test_it_stands_or_goes_on(tmp_path, setting: WithoutServer):
     with exploring(tmp_path, setting, seconds=30) as robot:
         robot.fleet.kill_server()
         robot.run(int(GONE + 2.0) * TICKS)

@@ -1,9 +1,6 @@
 """Keys and sticks: bytes as terminals and the kernel send them, to shares of the robot's speeds."""
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -22,7 +19,7 @@ from mapweave.teleoperation.keyboard import Keyboard
         (b"w++", (0.7, 0.0)), (b"w" + b"-" * 9, (0.1, 0.0)), (b"x\x1bw", (0.5, 0.0)),
     ],
 )  # fmt: skip
-def test_keys_drive(keys: bytes, wanted: tuple[float, float]) -> None:
+def test_keys_drive(keys: bytes, wanted: tuple[float, float]):
     keyboard = Keyboard(0.5)
     keyboard.feed(keys, 10.0)
     assert keyboard.wanted(10.1) == pytest.approx(wanted)
@@ -32,7 +29,7 @@ def test_keys_drive(keys: bytes, wanted: tuple[float, float]) -> None:
 
 
 @given(st.lists(st.sampled_from([b"w", b"a", b"\x1b[A", b"\x1b[C", b"\x1bOD", b" ", b"s"])), st.data())
-def test_sequences_may_come_in_pieces(keys: list[bytes], data: st.DataObject) -> None:
+def test_sequences_may_come_in_pieces(keys: list[bytes], data: st.DataObject):
     whole, pieces, stream = Keyboard(0.5), Keyboard(0.5), b"".join(keys)
     whole.feed(stream, 1.0)
     cut = data.draw(st.integers(0, len(stream)))
@@ -42,7 +39,7 @@ def test_sequences_may_come_in_pieces(keys: list[bytes], data: st.DataObject) ->
 
 
 @pytest.mark.parametrize("key", [b"q", b"Q", b"\x04"])
-def test_a_key_ends_it(key: bytes) -> None:
+def test_a_key_ends_it(key: bytes):
     keyboard = Keyboard(0.5)
     keyboard.feed(key, 1.0)
     assert keyboard.quit
@@ -53,7 +50,7 @@ def event(value: int, kind: int, number: int) -> bytes:
     return (123456).to_bytes(4, "little") + value.to_bytes(2, "little", signed=True) + bytes([kind, number])
 
 
-def test_the_left_stick_drives_and_a_button_stops(tmp_path: Path) -> None:
+def test_the_left_stick_drives_and_a_button_stops(tmp_path):
     device = tmp_path / "js0"
     os.mkfifo(device)
     pad = Gamepad(device, 0.8)
@@ -81,6 +78,6 @@ def test_the_left_stick_drives_and_a_button_stops(tmp_path: Path) -> None:
     pad.close()
 
 
-def test_a_gamepad_that_is_not_there_is_named(tmp_path: Path) -> None:
+def test_a_gamepad_that_is_not_there_is_named(tmp_path):
     with pytest.raises(DeviceError, match=r"gamepad .*js7: No such file"):
         Gamepad(tmp_path / "js7", 0.5)
