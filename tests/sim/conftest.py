@@ -1,7 +1,5 @@
 """A bare floor, a small office, and a ray caster that knows nothing of the renderer."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Worlds measured by their blocks and panels, not by their own plan."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

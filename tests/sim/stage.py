@@ -1,7 +1,5 @@
 """A bridge in a thread, agents that drive in threads, and a simulation without physics."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """People and boxes: they keep to free floor, give way to robots, and robots notice them."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 
@@ -23,7 +21,7 @@ from tests.quick import first_quick
 NO_OTHERS = np.zeros((0, 2))
 
 
-def test_a_person_walks_to_and_fro_at_its_speed() -> None:
+def test_a_person_walks_to_and_fro_at_its_speed():
     """Along both legs and back, never faster, looking where it goes."""
     actor = Actor("person", ((0.0, 0.0), (1.0, 0.0), (1.0, 0.5)), 0.5, 100, NO_OTHERS, 0.16)
     poses = [actor.pose]
@@ -40,7 +38,7 @@ def test_a_person_walks_to_and_fro_at_its_speed() -> None:
     assert math.cos(back) == pytest.approx(-1.0)
 
 
-def test_a_person_waits_for_a_robot_then_turns_back() -> None:
+def test_a_person_waits_for_a_robot_then_turns_back():
     """Never nearer than 0.5 m to what is ahead."""
     robot = np.array([[1.5, 0.1]])
     actor = Actor("person", ((0.0, 0.0), (3.0, 0.0)), 1.0, 1000, robot, 0.16)
@@ -58,7 +56,7 @@ def test_a_person_waits_for_a_robot_then_turns_back() -> None:
 
 @pytest.mark.parametrize("kind", sorted(KINDS))
 @pytest.mark.parametrize("seed", first_quick([1, 2], 1))
-def test_paths_near_robots_are_on_free_floor_and_in_view(kind: str, seed: int) -> None:
+def test_paths_near_robots_are_on_free_floor_and_in_view(kind: str, seed: int):
     """In every world: no wall, furniture or robot is touched; before the camera if there is room."""
     world = make_world(kind, seed)
     with Simulation(world, ["a", "b", "c", "d"], seed) as simulation:
@@ -83,7 +81,7 @@ def test_paths_near_robots_are_on_free_floor_and_in_view(kind: str, seed: int) -
         assert simulation.snapshot().actors == ()
 
 
-def test_rangers_cameras_and_bumpers_notice(bare: World) -> None:
+def test_rangers_cameras_and_bumpers_notice(bare: World):
     """At once, where it stands; and it is gone at the end."""
     with Simulation(bare, ["r0"], 1, [Pose2()]) as simulation:
         alone = simulation.observe("r0")
@@ -101,7 +99,7 @@ def test_rangers_cameras_and_bumpers_notice(bare: World) -> None:
         assert after.proximity.min() == simulation.describe("r0").ranger_reach
 
 
-def test_the_picture_of_a_person_is_where_the_person_is(bare: World, stand) -> None:
+def test_the_picture_of_a_person_is_where_the_person_is(bare: World, stand):
     """Pixels that change are those of its corners' hull, give or take a pixel."""
     with Simulation(bare, ["r0"], 1, [Pose2()]) as simulation:
         alone = simulation.observe("r0").image
@@ -122,7 +120,7 @@ def test_the_picture_of_a_person_is_where_the_person_is(bare: World, stand) -> N
     assert rows[0] == 0
 
 
-def test_legs_through_walls_are_refused(walled: World) -> None:
+def test_legs_through_walls_are_refused(walled: World):
     """Also those that only graze one, and legs without length."""
     plan: BuildingPlan = walled.plan
     assert plan.walls[0].x == pytest.approx(1.1)

@@ -1,7 +1,5 @@
 """Time that passes only on request, and rendezvous of robots between two ticks."""
 
-from __future__ import annotations
-
 import threading
 import time
 

@@ -1,7 +1,5 @@
 """The lock-step over the bus: agents in threads, a simulation without physics, and once with them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping
 
@@ -39,7 +37,7 @@ def race(paces: Mapping[str, Callable[[int], float]], ticks: int = 30) -> tuple[
     return [*simulation.calls, *(tuple(simulation.truth(name).vector) for name in simulation.robots)], apart
 
 
-def test_agents_go_in_step_and_their_speed_changes_nothing() -> None:
+def test_agents_go_in_step_and_their_speed_changes_nothing():
     rng = np.random.default_rng(3)
     uneven = rng.uniform(0, 0.006, (2, 30))
     even, apart = race({"r0": lambda _: 0.0, "r1": lambda _: 0.0})
@@ -50,7 +48,7 @@ def test_agents_go_in_step_and_their_speed_changes_nothing() -> None:
     assert even.count(("observe", "r0")) == even.count(("observe", "r1")) == 30
 
 
-def test_the_first_observation_comes_after_one_tick_in_which_nothing_moves(stage: Stage) -> None:
+def test_the_first_observation_comes_after_one_tick_in_which_nothing_moves(stage: Stage):
     simulation = FakeSimulation(robots=("r0",))
     stage.start(simulation)
     robot = stage.robot("r0")
@@ -67,14 +65,14 @@ def test_the_first_observation_comes_after_one_tick_in_which_nothing_moves(stage
     assert (second.image == 2).all()
 
 
-def test_a_command_beyond_the_limits_is_clipped_by_the_base_too(stage: Stage) -> None:
+def test_a_command_beyond_the_limits_is_clipped_by_the_base_too(stage: Stage):
     simulation = FakeSimulation(robots=("r0",))
     stage.start(simulation)
     stage.join().ask(KEYS.robot_step("r0"), encode_step(StepRequest(1, Command(50.0, -50.0))), 5.0)
     assert simulation.calls[0] == ("advance", {"r0": Command(0.3, -0.8)})
 
 
-def test_a_repeated_step_gets_the_same_bytes_and_does_not_advance(stage: Stage) -> None:
+def test_a_repeated_step_gets_the_same_bytes_and_does_not_advance(stage: Stage):
     simulation = FakeSimulation(robots=("r0",))
     stage.start(simulation)
     bus, key = stage.join(), KEYS.robot_step("r0")
@@ -87,7 +85,7 @@ def test_a_repeated_step_gets_the_same_bytes_and_does_not_advance(stage: Stage) 
     assert simulation.tick == 2
 
 
-def test_a_broken_step_is_refused(stage: Stage) -> None:
+def test_a_broken_step_is_refused(stage: Stage):
     simulation = FakeSimulation(robots=("r0",))
     stage.start(simulation)
     (reply,) = stage.join().ask(KEYS.robot_step("r0"), b"nonsense", 5.0)
@@ -95,9 +93,7 @@ def test_a_broken_step_is_refused(stage: Stage) -> None:
     assert simulation.tick == 0
 
 
-def test_a_silent_agent_blocks_the_others_only_for_the_patience(
-    stage: Stage, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_silent_agent_blocks_the_others_only_for_the_patience(stage: Stage, caplog):
     simulation = FakeSimulation()
     stage.start(simulation, patience=1.5)
     silent = Driver(stage.robot("r1"), 2, lambda _: 0.0)
@@ -124,7 +120,7 @@ def test_a_silent_agent_blocks_the_others_only_for_the_patience(
 
 
 @pytest.mark.parametrize("end", ["close", "cut"])
-def test_a_dead_agent_blocks_no_other(stage: Stage, end: str) -> None:
+def test_a_dead_agent_blocks_no_other(stage: Stage, end: str):
     simulation = FakeSimulation()
     stage.start(simulation, patience=60.0)
     bus = stage.join()
@@ -143,7 +139,7 @@ def test_a_dead_agent_blocks_no_other(stage: Stage, end: str) -> None:
     assert simulation.tick == 12
 
 
-def test_nothing_happens_until_all_robots_have_asked(stage: Stage) -> None:
+def test_nothing_happens_until_all_robots_have_asked(stage: Stage):
     simulation = FakeSimulation(robots=("r0", "r2"))
     control = stage.start(simulation)
     early = Driver(stage.robot("r2"), 1, lambda _: 0.0)
@@ -182,7 +178,7 @@ def drive_real(pace: float) -> list[object]:
         return [*seen, simulation.truth("r0"), simulation.truth("r1")]
 
 
-def test_the_simulation_repeats_over_the_bus_at_any_speed_of_the_agents() -> None:
+def test_the_simulation_repeats_over_the_bus_at_any_speed_of_the_agents():
     first, second = drive_real(0.0), drive_real(0.02)
     assert len(first) == 22
     assert first == second

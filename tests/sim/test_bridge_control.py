@@ -1,7 +1,5 @@
 """Who controls the simulation from outside: status, truth, kidnapping, the end."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,7 @@ from tests.sim.stage import KEYS, PLAN, TICK_NS, Driver, FakeSimulation, Stage
 from tests.waiting import eventually
 
 
-def test_control_is_answered_without_a_driver(stage: Stage) -> None:
+def test_control_is_answered_without_a_driver(stage: Stage):
     simulation = FakeSimulation()
     control = stage.start(simulation)
     status = control.status()
@@ -30,7 +28,7 @@ def test_control_is_answered_without_a_driver(stage: Stage) -> None:
     assert control.status().robots["r1"].world_from_robot == Pose2(3.0, 2.0, -1.0)
 
 
-def test_truth_of_the_past(stage: Stage) -> None:
+def test_truth_of_the_past(stage: Stage):
     simulation = FakeSimulation()
     control = stage.start(simulation)
     drivers = [Driver(stage.robot(name), 8, lambda _: 0.0) for name in simulation.robots]
@@ -53,7 +51,7 @@ def test_truth_of_the_past(stage: Stage) -> None:
     assert reply.error.startswith("control: ")
 
 
-def test_a_kidnapped_robot_is_elsewhere_in_the_next_tick_without_odometry(stage: Stage) -> None:
+def test_a_kidnapped_robot_is_elsewhere_in_the_next_tick_without_odometry(stage: Stage):
     simulation = FakeSimulation(robots=("r0",))
     control = stage.start(simulation)
     robot = stage.robot("r0")
@@ -65,7 +63,7 @@ def test_a_kidnapped_robot_is_elsewhere_in_the_next_tick_without_odometry(stage:
     assert simulation.truth("r0") == Pose2(2.0, 2.0, 0.0)
 
 
-def test_every_agent_is_notified_of_the_end(stage: Stage) -> None:
+def test_every_agent_is_notified_of_the_end(stage: Stage):
     simulation = FakeSimulation()
     stage.start(simulation, farewell=2.0)
     waiting = Driver(stage.robot("r0"), 10**6, lambda _: 0.0)
@@ -86,7 +84,7 @@ def test_every_agent_is_notified_of_the_end(stage: Stage) -> None:
         SimControl(stage.join(), "test", timeout=0.5).status()
 
 
-def test_questions_between_end_and_close_are_refused(stage: Stage) -> None:
+def test_questions_between_end_and_close_are_refused(stage: Stage):
     stage.start(FakeSimulation())
     stage.stop.set()
     assert stage.thread is not None
@@ -96,7 +94,7 @@ def test_questions_between_end_and_close_are_refused(stage: Stage) -> None:
     assert reply.error == ENDED
 
 
-def test_the_simulator_is_alive_while_it_serves(stage: Stage) -> None:
+def test_the_simulator_is_alive_while_it_serves(stage: Stage):
     news: list[tuple[str, bool]] = []
     stage.join().watch(KEYS.sim_alive(), lambda key, alive: news.append((key, alive)))
     stage.start(FakeSimulation())

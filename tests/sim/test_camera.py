@@ -1,7 +1,5 @@
 """Simulated cameras against OpenCV's lens model, the agent's lens, brute force and statistics."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -61,7 +59,7 @@ def still(setup: CameraSetup, scene: Scene, stand, **changes) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", ["wide", "phone", "cheap", "fisheye"])
-def test_corners_agree_with_the_lens_model(name: str, stand) -> None:
+def test_corners_agree_with_the_lens_model(name: str, stand):
     """Found as saddle points in the picture: against cv2.projectPoints, and the agent's lens undoes it."""
     exposure = replace(CAMERAS[name].exposure, gain_error=0.0, vignetting=0.0)
     setup = replace(CAMERAS[name], **SILENT, exposure=exposure)
@@ -92,7 +90,7 @@ def test_corners_agree_with_the_lens_model(name: str, stand) -> None:
     assert np.linalg.norm(ideal - camera.project(corners[inside]), axis=1).max() < (1.0 if fisheye else 0.5)
 
 
-def test_an_ideal_lens_leaves_the_picture_alone(stand) -> None:
+def test_an_ideal_lens_leaves_the_picture_alone(stand):
     """No distortion, no noise, light as painted: what the renderer draws."""
     setup = CameraSetup(**SILENT)
     scene, _ = board(1.0, 1.5)
@@ -107,7 +105,7 @@ def test_an_ideal_lens_leaves_the_picture_alone(stand) -> None:
     ),
     st.floats(130.0, 400.0),
 )
-def test_a_lens_is_refused_or_can_be_inverted(lens: tuple[float, ...], focal: float) -> None:
+def test_a_lens_is_refused_or_can_be_inverted(lens: tuple[float, ...], focal: float):
     """For any coefficients: the rays of an accepted lens fall back onto their pixels."""
     camera = Camera(width=320, height=240, fx=focal, fy=focal, cx=159.5, cy=119.5, mount_height=0.3)
     try:
@@ -126,7 +124,7 @@ def test_a_lens_is_refused_or_can_be_inverted(lens: tuple[float, ...], focal: fl
 
 
 @pytest.mark.parametrize(("read", "shot"), [(2.0, 0.0), (0.7, 0.0), (1.5, 4.0)])
-def test_noise_is_as_strong_as_ordered(read: float, shot: float, stand) -> None:
+def test_noise_is_as_strong_as_ordered(read: float, shot: float, stand):
     """Deviation, no bias, and nothing shared by one picture and the next."""
     for grey in (60, 180):
         wall = upright_panel((1.0, 3.0), (1.0, -3.0), -2.0, 3.0, Texture.plain(grey))
@@ -154,7 +152,7 @@ def follow(exposure: Exposure, lamps: list[float], stand, grey: int = 130) -> li
     return [float(imager.picture(scene, (position, rotation), lamp, 0.0, 0.1).mean()) for lamp in lamps]
 
 
-def test_exposure_follows_the_light_with_a_lag(stand) -> None:
+def test_exposure_follows_the_light_with_a_lag(stand):
     """Dark at once, then back to the edge of the band by the time constant; too bright saturates."""
     exposure = Exposure(band=0.1, lag=0.5, wanted=130.0)
     means = follow(exposure, [1.0] * 3 + [0.4] * 40, stand)
@@ -174,7 +172,7 @@ def test_exposure_follows_the_light_with_a_lag(stand) -> None:
     assert set(tolerant) == {91.0}
 
 
-def test_corners_get_less_light(stand) -> None:
+def test_corners_get_less_light(stand):
     """By as much as ordered, and cameras of one kind differ by the gain error."""
     wall = upright_panel((1.0, 3.0), (1.0, -3.0), -2.0, 3.0, Texture.plain(200))
     scene = Scene([PanelSet.of([wall])])
@@ -193,7 +191,7 @@ def test_corners_get_less_light(stand) -> None:
 
 @pytest.mark.parametrize("turn_rate", [0.8, -0.5])
 @pytest.mark.parametrize("name", ["webcam", "wide"])
-def test_blur_is_the_mean_image(name: str, turn_rate: float, stand) -> None:
+def test_blur_is_the_mean_image(name: str, turn_rate: float, stand):
     """Against the mean of 41 sharp pictures taken on the way."""
     sharp = replace(CAMERAS[name], **SILENT, exposure=Exposure(automatic=False))
     slow = replace(sharp, exposure=Exposure(automatic=False, seconds=0.03))
@@ -211,7 +209,7 @@ def test_blur_is_the_mean_image(name: str, turn_rate: float, stand) -> None:
     np.testing.assert_array_equal(still(slow, scene, stand, turn_rate=0.001), unblurred)
 
 
-def test_frames_are_dropped_by_chance() -> None:
+def test_frames_are_dropped_by_chance():
     """As often as ordered, the same for the same seed."""
     drops = [[imager.drops() for _ in range(2000)] for imager in (Imager(CAMERAS["cheap"], 0, (8, 9)),) * 1]
     again = Imager(CAMERAS["cheap"], 0, (8, 9))

@@ -1,7 +1,5 @@
 """Robots and cameras from the tables of a scenario file: what is meant, or one line that says why not."""
 
-from __future__ import annotations
-
 import contextlib
 
 import pytest
@@ -14,7 +12,7 @@ from mapweave.sim.camera import CAMERAS
 from mapweave.sim.robots import RobotSetup, robot_from_table, robot_setups
 
 
-def test_a_camera_is_a_name_or_a_variation_of_a_named_camera() -> None:
+def test_a_camera_is_a_name_or_a_variation_of_a_named_camera():
     """The rest stays as it is in the camera that is named."""
     assert robot_from_table({"name": "a", "camera": "wide"}).camera == CAMERAS["wide"]
     assert robot_from_table({"name": "a"}).camera == CAMERAS["webcam"]
@@ -33,7 +31,7 @@ def test_a_camera_is_a_name_or_a_variation_of_a_named_camera() -> None:
     assert (own.describe().camera.width, own.describe().camera.height) == (640, 240)
 
 
-def test_a_robot_describes_what_was_ordered() -> None:
+def test_a_robot_describes_what_was_ordered():
     """Limits, rangers, start, wheels."""
     table = {
         "name": "a", "start": [1, 2, 0.5], "rangers": 8, "ranger_reach": 2.0, "max_forward": 0.2,
@@ -66,7 +64,7 @@ def test_a_robot_describes_what_was_ordered() -> None:
         ({"name": "a", "start": [1, 2]}, "start: expected list of length 3"),
     ],
 )
-def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says: str) -> None:
+def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says: str):
     """One line."""
     with pytest.raises(MapweaveError, match=says) as caught:
         robot_from_table(table)
@@ -86,13 +84,13 @@ def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says:
         ),
     )
 )
-def test_no_table_crashes(table: dict[str, object]) -> None:
+def test_no_table_crashes(table: dict[str, object]):
     """Nonsense is a robot or one of our errors."""
     with contextlib.suppress(SettingsError, InvalidValue):
         assert isinstance(robot_from_table(table), RobotSetup)
 
 
-def test_one_to_sixteen_robots() -> None:
+def test_one_to_sixteen_robots():
     """No more, no fewer, and no two alike."""
     assert len(robot_setups([f"r{k}" for k in range(16)])) == 16
     for robots in ([], [f"r{k}" for k in range(17)]):

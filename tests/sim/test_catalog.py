@@ -1,7 +1,5 @@
 """Worlds by kind and parameters, and by a scenario's table; what cannot be built is refused in one line."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields
 
@@ -27,23 +25,21 @@ from mapweave.sim.worlds.catalog import KINDS, make_world, world_from_table
         ("arena", {"length": -3.0}, "length must be a number, 2 to 60; it is -3.0"),
     ],
 )
-def test_wrong_parameters_are_reported_in_one_line(
-    kind: str, parameters: dict[str, object], says: str
-) -> None:
+def test_wrong_parameters_are_reported_in_one_line(kind: str, parameters: dict[str, object], says: str):
     """Which parameter, and what it may be."""
     with pytest.raises(MapweaveError, match=says) as caught:
         make_world(kind, 1, **parameters)
     assert "\n" not in str(caught.value)
 
 
-def test_negative_seeds_are_refused() -> None:
+def test_negative_seeds_are_refused():
     """Numpy would say something else."""
     with pytest.raises(InvalidValue, match="seed is -1"):
         make_world("arena", -1)
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_unusual_sizes_can_be_built(kind: str) -> None:
+def test_unusual_sizes_can_be_built(kind: str):
     """Or are refused in one line; and a robot can start there."""
     for name in (field.name for field in fields(KINDS[kind].parameters)):
         for value in (1, 2.5, 40.0, True):
@@ -55,7 +51,7 @@ def test_unusual_sizes_can_be_built(kind: str) -> None:
             assert world.start_poses(1, 1)
 
 
-def test_scenario_tables_name_a_kind_or_a_file(tmp_path) -> None:
+def test_scenario_tables_name_a_kind_or_a_file(tmp_path):
     """Not both; an empty table is an office."""
     assert world_from_table({}, 3, tmp_path).plan == make_world("office", 3).plan
     table = {"kind": "arena", "length": 5.0}

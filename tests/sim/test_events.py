@@ -1,7 +1,5 @@
 """What happens to a world: parsed, done once, seen by everything that should see it, and repeatable."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from concurrent.futures import ThreadPoolExecutor
@@ -20,7 +18,7 @@ from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World
 
 
-def test_tables_become_events() -> None:
+def test_tables_become_events():
     """Each kind, with its defaults."""
     assert parse_event({"do": "kidnap", "robot": "r0", "x": 1, "y": 2.0}) == Kidnap("r0", 1.0, 2.0)
     assert parse_event({"do": "light", "factor": 0.3, "seconds": 2}) == Light(0.3, 2.0)
@@ -57,7 +55,7 @@ def test_tables_become_events() -> None:
         ({"do": "fail", "robot": "r0", "sensor": "rangers", "how": "spike", "amount": 3}, "amount is 3"),
     ],
 )
-def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says: str) -> None:
+def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says: str):
     """One line."""
     with pytest.raises(MapweaveError, match=says) as caught:
         parse_event(table)
@@ -78,7 +76,7 @@ def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says:
         ),
     )
 )
-def test_no_table_crashes(table: dict[str, object]) -> None:
+def test_no_table_crashes(table: dict[str, object]):
     """Nonsense is an event or one of our errors."""
     try:
         parse_event(table)
@@ -86,7 +84,7 @@ def test_no_table_crashes(table: dict[str, object]) -> None:
         assert "\n" not in str(error)
 
 
-def test_unknown_robots_rooms_and_places_are_refused(office: World) -> None:
+def test_unknown_robots_rooms_and_places_are_refused(office: World):
     """By name, before anything changes."""
     wall = office.plan.walls[0]
     wrong = [
@@ -109,7 +107,7 @@ def test_unknown_robots_rooms_and_places_are_refused(office: World) -> None:
         assert simulation.snapshot().actors == ()
 
 
-def test_kidnapped_robots_are_put_on_free_floor_away_from_others(office: World) -> None:
+def test_kidnapped_robots_are_put_on_free_floor_away_from_others(office: World):
     """Anywhere, also where another robot is already."""
     with Simulation(office, ["r0", "r1"], 2) as simulation:
         room = office.plan.room("room 2")
@@ -136,7 +134,7 @@ def test_kidnapped_robots_are_put_on_free_floor_away_from_others(office: World) 
         assert simulation.collisions("r0") == simulation.collisions("r1") == 0
 
 
-def test_light_goes_down_over_its_time(office: World) -> None:
+def test_light_goes_down_over_its_time(office: World):
     """Pictures darken step by step by the factor; the automatic then brings them back."""
     with Simulation(office, ["r0"], 3) as simulation:
         base = simulation.step({})["r0"].image.mean()
@@ -156,7 +154,7 @@ def test_light_goes_down_over_its_time(office: World) -> None:
         assert adapted > 2.0 * dark
 
 
-def test_moved_furniture_is_felt_and_seen_where_the_plan_has_it(office: World) -> None:
+def test_moved_furniture_is_felt_and_seen_where_the_plan_has_it(office: World):
     """Against a fresh simulation of the new world: the same ranges and the same pictures."""
     quiet = RobotSetup("r0", range_noise=0.0)
     with Simulation(office, [quiet], 4) as simulation:
@@ -203,14 +201,14 @@ def run(seed: int, office: World, threads: int) -> str:
     return digest.hexdigest()
 
 
-def test_events_are_repeatable_and_images_may_be_concurrent(office: World) -> None:
+def test_events_are_repeatable_and_images_may_be_concurrent(office: World):
     """The same bits from one thread and from three; others for another seed."""
     first = run(5, office, 1)
     assert run(5, office, 3) == first
     assert run(6, office, 3) != first
 
 
-def test_one_robots_faults_leave_the_others_alone(office: World) -> None:
+def test_one_robots_faults_leave_the_others_alone(office: World):
     """A robot that drops frames does not change another's noise."""
     pictures = []
     for fault in (None, Fail("r0", "camera", "drop", 1.0)):
@@ -221,7 +219,7 @@ def test_one_robots_faults_leave_the_others_alone(office: World) -> None:
     np.testing.assert_array_equal(*pictures)
 
 
-def test_snapshots_show_the_last_pictures(office: World) -> None:
+def test_snapshots_show_the_last_pictures(office: World):
     """No new ones; none before the first, and none where the camera gave none."""
     with Simulation(office, ["r0", "r1"], 8) as simulation:
         assert simulation.snapshot().images == {"r0": None, "r1": None}
@@ -237,7 +235,7 @@ def test_snapshots_show_the_last_pictures(office: World) -> None:
         assert simulation.snapshot().images["r0"] is None
 
 
-def test_places_that_setups_ask_for(office: World) -> None:
+def test_places_that_setups_ask_for(office: World):
     """Robots start there; others elsewhere; where one cannot stand is refused."""
     place = office.start_poses(1, 9)[0]
     here = RobotSetup("a", start=(place.x, place.y, 0.7))

@@ -1,7 +1,5 @@
 """Sensors that fail say what was ordered, for as long as was ordered, and nothing else changes."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -36,7 +34,7 @@ def healthy(office: World) -> list:
     return drive(office, None)
 
 
-def test_cameras_drop_freeze_and_are_covered(office: World, healthy: list) -> None:
+def test_cameras_drop_freeze_and_are_covered(office: World, healthy: list):
     """Ticks 3 to 7 of twelve; before and after all is as ever."""
     dropped = drive(office, Fail("r0", "camera", "drop", 0.5))
     assert [s.image is None for s in dropped] == [False] * 3 + [True] * 5 + [False] * 4
@@ -57,7 +55,7 @@ def wheels(odometry: Odometry) -> tuple[float, float]:
     return odometry.forward - odometry.turn * AXLE / 2, odometry.forward + odometry.turn * AXLE / 2
 
 
-def test_encoders_fail_wheel_by_wheel(office: World, healthy: list) -> None:
+def test_encoders_fail_wheel_by_wheel(office: World, healthy: list):
     """Zero, one wheel zero, a share too much, one jump."""
     ways = {
         "zero": lambda left, right: (0.0, 0.0),
@@ -80,7 +78,7 @@ def test_encoders_fail_wheel_by_wheel(office: World, healthy: list) -> None:
     st.floats(-1, 1), st.floats(-1, 1),
     st.sets(st.sampled_from(["zero", "zero_left", "zero_right", "scale"]), min_size=0),
 )  # fmt: skip
-def test_encoder_faults_in_any_combination(forward: float, turn: float, hows: set[str]) -> None:
+def test_encoder_faults_in_any_combination(forward: float, turn: float, hows: set[str]):
     """Against the wheels taken one by one."""
     faults = SensorFaults(AXLE, (1,))
     for how in sorted(hows):
@@ -93,7 +91,7 @@ def test_encoder_faults_in_any_combination(forward: float, turn: float, hows: se
     assert faults.odometry(Odometry(forward, turn), 6) == Odometry(forward, turn)
 
 
-def test_rangers_spike_and_drop_out(office: World, healthy: list) -> None:
+def test_rangers_spike_and_drop_out(office: World, healthy: list):
     """All at their maximum; or about the ordered share short, the others right."""
     for tick, one in enumerate(drive(office, Fail("r0", "rangers", "drop", 0.5))):
         assert (one.proximity == 3.0).all() == (3 <= tick < 8)
@@ -108,7 +106,7 @@ def test_rangers_spike_and_drop_out(office: World, healthy: list) -> None:
         assert (a.proximity >= 0.0).all()
 
 
-def test_bumpers_stick_and_die(walled: World) -> None:
+def test_bumpers_stick_and_die(walled: World):
     """Pressed without a wall, not pressed at one; collisions are counted as they are."""
     with Simulation(walled, ["r0"], 4, [Pose2(0.5, 0.0, 0.0)]) as simulation:
         simulation.apply(Fail("r0", "bumper", "stuck", 0.3))
@@ -119,7 +117,7 @@ def test_bumpers_stick_and_die(walled: World) -> None:
         assert any(simulation.step({"r0": Command(0.3)})["r0"].bumped for _ in range(10))
 
 
-def test_faults_are_described() -> None:
+def test_faults_are_described():
     """One line that names robot, sensor and way."""
     assert describe(Fail("r0", "camera", "drop", 3.0)) == "the camera of r0 fails (drop) for 3 s"
     assert describe(Fail("r0", "encoders", "spike")) == "the encoders of r0 jump by 0.3 m"

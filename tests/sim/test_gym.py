@@ -1,7 +1,5 @@
 """The library's examples, and the environment by Gymnasium's own rules."""
 
-from __future__ import annotations
-
 import builtins
 import importlib
 import math
@@ -23,20 +21,20 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 
 @pytest.mark.parametrize("name", first_quick(["ten_lines", "gym_random"], 1))
-def test_examples_run(name: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_examples_run(name: str, capsys):
     """As they stand."""
     runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
     assert len(capsys.readouterr().out.splitlines()) >= 3
 
 
-def test_ten_lines_are_ten() -> None:
+def test_ten_lines_are_ten():
     """Code lines, imports included."""
     lines = (EXAMPLES / "ten_lines.py").read_text().splitlines()[1:]
     assert sum(bool(line.strip()) for line in lines) <= 10
 
 
 @pytest.mark.slow
-def test_gymnasium_accepts_the_environment() -> None:
+def test_gymnasium_accepts_the_environment():
     """Spaces, seeds, types, rendering."""
     env = gymnasium.make("mapweave.sim.gym:mapweave/Park-v0", seconds=5.0, render_mode="rgb_array")
     check_env(env.unwrapped)
@@ -63,7 +61,7 @@ def drive(env: MapweaveEnv, info: dict) -> tuple[float, dict, bool]:
 
 
 @pytest.mark.slow
-def test_parking_succeeds_and_pays() -> None:
+def test_parking_succeeds_and_pays():
     """A driver who knows the truth parks, in other worlds for other seeds; who stands still is truncated."""
     env = MapweaveEnv()
     goals = []
@@ -87,7 +85,7 @@ def test_parking_succeeds_and_pays() -> None:
     env.close()
 
 
-def test_the_goal_is_given_in_the_frame_of_the_start() -> None:
+def test_the_goal_is_given_in_the_frame_of_the_start():
     """So that a robot that knows where it started knows where to go."""
     env = MapweaveEnv()
     seen, info = env.reset(seed=4)
@@ -101,7 +99,7 @@ def test_the_goal_is_given_in_the_frame_of_the_start() -> None:
         env.step(np.zeros(2, np.float32))
 
 
-def test_without_gymnasium_one_line_names_the_package(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_gymnasium_one_line_names_the_package(monkeypatch):
     """Importing fails with a hint."""
     real = builtins.__import__
 

@@ -1,11 +1,8 @@
 """Which robots time waits for, without threads or clocks."""
 
-from __future__ import annotations
-
 import logging
 from dataclasses import dataclass, field
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -51,7 +48,7 @@ class Table:
         return [seat.name for seat in seats]
 
 
-def test_time_begins_when_all_have_asked() -> None:
+def test_time_begins_when_all_have_asked():
     table = Table(["b", "a"])
     assert table.due() == []
     table.ask("b", 1)
@@ -60,7 +57,7 @@ def test_time_begins_when_all_have_asked() -> None:
     assert table.tick() == ["a", "b"]
 
 
-def test_absent_robots_are_given_up(caplog: pytest.LogCaptureFixture) -> None:
+def test_absent_robots_are_given_up(caplog):
     table = Table(["a", "b"])
     table.ask("a", 1, now=5.0)
     assert table.due(24.9) == []
@@ -75,7 +72,7 @@ def test_absent_robots_are_given_up(caplog: pytest.LogCaptureFixture) -> None:
     assert late.answers
 
 
-def test_robots_that_the_start_waits_for_are_logged(caplog: pytest.LogCaptureFixture) -> None:
+def test_robots_that_the_start_waits_for_are_logged(caplog):
     caplog.set_level(logging.INFO, "mapweave.sim")
     table = Table(["a", "b", "c"])
     table.ask("b", 1, now=5.0)
@@ -84,7 +81,7 @@ def test_robots_that_the_start_waits_for_are_logged(caplog: pytest.LogCaptureFix
     assert [r.message for r in caplog.records] == ["time waits for the agents of a, c, 20 s at the longest"]
 
 
-def test_the_silent_robot_stands_still_until_it_asks_again(caplog: pytest.LogCaptureFixture) -> None:
+def test_the_silent_robot_stands_still_until_it_asks_again(caplog):
     table = Table(["a", "b"])
     table.ask("a", 1)
     table.ask("b", 1)
@@ -105,7 +102,7 @@ def test_the_silent_robot_stands_still_until_it_asks_again(caplog: pytest.LogCap
     assert len(caplog.records) == 1
 
 
-def test_retries_do_not_prolong_the_wait_for_others() -> None:
+def test_retries_do_not_prolong_the_wait_for_others():
     table = Table(["a", "b"])
     table.ask("a", 1)
     table.ask("b", 1)
@@ -116,7 +113,7 @@ def test_retries_do_not_prolong_the_wait_for_others() -> None:
     assert table.due(21.0) == ["a"]
 
 
-def test_a_repeated_step_gets_the_same_answer_and_moves_nothing() -> None:
+def test_a_repeated_step_gets_the_same_answer_and_moves_nothing():
     table = Table(["a"])
     first = table.ask("a", 1)
     table.tick(1.0)
@@ -125,7 +122,7 @@ def test_a_repeated_step_gets_the_same_answer_and_moves_nothing() -> None:
     assert table.due(2.0) == []
 
 
-def test_of_a_step_asked_twice_the_newer_question_is_answered() -> None:
+def test_of_a_step_asked_twice_the_newer_question_is_answered():
     table = Table(["a", "b"])
     first, second = table.ask("a", 1), table.ask("a", 1)
     assert AGAIN in first.refusals[0]
@@ -134,7 +131,7 @@ def test_of_a_step_asked_twice_the_newer_question_is_answered() -> None:
     assert (first.answers, second.answers, second.refusals) == ([], [b"a@3.0"], [])
 
 
-def test_an_old_step_is_refused_and_the_first_resets() -> None:
+def test_an_old_step_is_refused_and_the_first_resets():
     table = Table(["a"])
     for sequence in (1, 2, 3):
         table.ask("a", sequence)
@@ -149,7 +146,7 @@ def test_an_old_step_is_refused_and_the_first_resets() -> None:
     assert table.due() == ["a"]
 
 
-def test_time_does_not_wait_for_the_dead() -> None:
+def test_time_does_not_wait_for_the_dead():
     table = Table(["a", "b"])
     table.steps.presence("b", 7, True)
     table.ask("a", 1)
@@ -167,7 +164,7 @@ def test_time_does_not_wait_for_the_dead() -> None:
     assert table.steps.active == {"a", "b"}
 
 
-def test_the_question_of_a_dead_agent_moves_nothing() -> None:
+def test_the_question_of_a_dead_agent_moves_nothing():
     table = Table(["a", "b"])
     table.steps.presence("b", 7, True)
     question = table.ask("b", 1)
@@ -179,7 +176,7 @@ def test_the_question_of_a_dead_agent_moves_nothing() -> None:
     table.steps.presence("stranger", 1, False)
 
 
-def test_the_end_refuses_everyone_once() -> None:
+def test_the_end_refuses_everyone_once():
     table = Table(["a", "b"])
     question = table.ask("b", 1)
     assert table.steps.refuse_all("over") == {"b"}
@@ -188,7 +185,7 @@ def test_the_end_refuses_everyone_once() -> None:
 
 
 @given(st.permutations(["a", "b", "c", "d"]), st.lists(st.permutations(["a", "b", "c", "d"]), max_size=5))
-def test_the_order_of_asking_does_not_matter(robots: list[str], orders: list[list[str]]) -> None:
+def test_the_order_of_asking_does_not_matter(robots: list[str], orders: list[list[str]]):
     table = Table(robots)
     for number, order in enumerate(orders, 1):
         for name in order:

@@ -1,7 +1,5 @@
 """Offices of many seeds, measured on a picture of their walls and furniture rather than by their own plan."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -47,7 +45,7 @@ def offices() -> list[World]:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_every_room_can_be_reached(offices: list[World], seed: int) -> None:
+def test_every_room_can_be_reached(offices: list[World], seed: int):
     """One region of floor for a robot with a margin: in all rooms, through all doors, without pockets."""
     world = offices[seed]
     drawing = Drawing(world)
@@ -71,7 +69,7 @@ def test_every_room_can_be_reached(offices: list[World], seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_robots_start_free_and_in_their_rooms(offices: list[World], seed: int) -> None:
+def test_robots_start_free_and_in_their_rooms(offices: list[World], seed: int):
     """Robot i in room i, the fourth where there is place, none near another."""
     world = offices[seed]
     drawing = Drawing(world)
@@ -84,7 +82,7 @@ def test_robots_start_free_and_in_their_rooms(offices: list[World], seed: int) -
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_furniture_is_in_its_room_and_does_not_overlap(offices: list[World], seed: int) -> None:
+def test_furniture_is_in_its_room_and_does_not_overlap(offices: list[World], seed: int):
     """Drawn one by one, no piece covers a wall or another piece."""
     plan = offices[seed].plan
     for number, piece in enumerate(plan.furniture):
@@ -95,7 +93,7 @@ def test_furniture_is_in_its_room_and_does_not_overlap(offices: list[World], see
             assert cv2.rotatedRectangleIntersection(*boxes)[0] == cv2.INTERSECT_NONE
 
 
-def test_offices_of_different_seeds_differ_and_of_the_same_do_not(offices: list[World]) -> None:
+def test_offices_of_different_seeds_differ_and_of_the_same_do_not(offices: list[World]):
     """In their plan and in what hangs on their walls."""
     plans = [world.plan for world in offices]
     assert len({plan.walls for plan in plans}) == len({plan.furniture for plan in plans}) == len(plans)
@@ -106,7 +104,7 @@ def test_offices_of_different_seeds_differ_and_of_the_same_do_not(offices: list[
     assert pictures[0].shape != pictures[2].shape or not np.array_equal(pictures[0], pictures[2])
 
 
-def test_clearances_are_those_of_the_drawing(offices: list[World]) -> None:
+def test_clearances_are_those_of_the_drawing(offices: list[World]):
     """The plan's formula against OpenCV's distance transform, at random places."""
     rng = np.random.default_rng(0)
     for world in offices[:3]:
@@ -118,7 +116,7 @@ def test_clearances_are_those_of_the_drawing(offices: list[World]) -> None:
 
 
 @pytest.mark.slow
-def test_there_is_enough_to_see(offices: list[World]) -> None:
+def test_there_is_enough_to_see(offices: list[World]):
     """From free places with random headings a robot finds 60 features, and almost always 15."""
     rng = np.random.default_rng(1)
     counts = []
@@ -134,7 +132,7 @@ def test_there_is_enough_to_see(offices: list[World]) -> None:
 
 
 @pytest.mark.parametrize("rooms", [0, 33])
-def test_offices_that_cannot_be_built_are_refused(rooms: int) -> None:
+def test_offices_that_cannot_be_built_are_refused(rooms: int):
     """One line says why."""
     with pytest.raises(SettingsError, match=f"rooms must be a whole number, 1 to 32; it is {rooms}"):
         make_world("office", 1, rooms=rooms)

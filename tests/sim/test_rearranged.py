@@ -1,7 +1,5 @@
 """Worlds whose furniture has been moved: everything else stays, and robots get through."""
 
-from __future__ import annotations
-
 import math
 
 import cv2
@@ -18,7 +16,7 @@ MOVING = [
 
 
 @pytest.mark.parametrize(("name", "seed"), first_quick(MOVING, 1))
-def test_rearranged_worlds_keep_everything_else(name: str, seed: int) -> None:
+def test_rearranged_worlds_keep_everything_else(name: str, seed: int):
     """What did not move is the same object; what did is the same box with the same pictures elsewhere."""
     world = world_of(name, seed)
     moved = world.rearranged(seed, 0.4)
@@ -51,7 +49,7 @@ def test_rearranged_worlds_keep_everything_else(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize(("name", "seed"), first_quick(MOVING, 1))
-def test_rearranged_worlds_can_be_driven_through(name: str, seed: int) -> None:
+def test_rearranged_worlds_can_be_driven_through(name: str, seed: int):
     """However often: no room is cut off, no corner catches a robot, nothing stands in anything."""
     world = world_of(name, seed)
     before = Drawing(world).regions(world)
@@ -73,7 +71,7 @@ def test_rearranged_worlds_can_be_driven_through(name: str, seed: int) -> None:
                 assert cv2.rotatedRectangleIntersection(*boxes)[0] == cv2.INTERSECT_NONE
 
 
-def test_furniture_is_not_put_down_near_robots() -> None:
+def test_furniture_is_not_put_down_near_robots():
     """Half a metre stays clear around each; without that wish, over many seeds, it does not."""
     world = world_of("arena", 1)
     robots = world.start_poses(12, 4)
@@ -92,13 +90,13 @@ def test_furniture_is_not_put_down_near_robots() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, -0.1, 1.01, math.nan, math.inf])
-def test_shares_that_are_none_are_refused(share: float) -> None:
+def test_shares_that_are_none_are_refused(share: float):
     """One line says what a share is."""
     with pytest.raises(InvalidValue, match="share of the furniture"):
         world_of("office", 1).rearranged(1, share)
 
 
-def test_a_world_without_furniture_cannot_be_rearranged() -> None:
+def test_a_world_without_furniture_cannot_be_rearranged():
     """One line says so."""
     with pytest.raises(InvalidValue, match="no furniture that can be moved"):
         world_of("corridor", 1).rearranged(1, 0.5)

@@ -1,7 +1,5 @@
 """The renderer against `Camera`, a ray caster and its textures: where things are, and what is in front."""
 
-from __future__ import annotations
-
 import math
 
 import cv2
@@ -61,7 +59,7 @@ def mark_shifts(image: np.ndarray, pixels: np.ndarray, places: np.ndarray) -> np
 @pytest.mark.parametrize("distance", [0.9, 1.4, 2.2])
 def test_marks_agree_with_the_camera_model(
     distance: float, slant_deg: float, size_px: tuple[int, int], stand
-) -> None:
+):
     """Corners of a board at known places, for any resolution of the board."""
     robot = Pose2(2.0, -1.0, 0.7)
     frame = robot @ Pose2(CAMERA.mount_forward + distance, 0.03, math.radians(slant_deg))
@@ -81,7 +79,7 @@ def test_marks_agree_with_the_camera_model(
 
 
 @pytest.mark.parametrize("size_px", [(1600, 1280), (1230, 987)])
-def test_levels_of_a_texture_lie_on_each_other(size_px: tuple[int, int]) -> None:
+def test_levels_of_a_texture_lie_on_each_other(size_px: tuple[int, int]):
     """Each mark is at the same share of the width and height at every level."""
     texture = board(*size_px)
     places = MARKS[:, None] + AROUND / [COLUMNS, ROWS]
@@ -94,7 +92,7 @@ def test_levels_of_a_texture_lie_on_each_other(size_px: tuple[int, int]) -> None
         assert np.abs(shifts).max() < 0.1
 
 
-def test_textures_stop_at_one_texel() -> None:
+def test_textures_stop_at_one_texel():
     """Halving never makes an empty image, and a grey stays that grey."""
     level = Texture.plain(99).level(7, 9)
     assert level.shape == (1, 1)
@@ -125,7 +123,7 @@ def placed(panels: PanelSet, rotation: np.ndarray, position: np.ndarray) -> Pane
 
 
 @pytest.mark.parametrize(("seed", "count"), [*((seed, 28) for seed in range(6)), (6, 150), (7, 150)])
-def test_the_nearest_surface_is_the_first_hit_of_a_ray(seed: int, count: int, caster) -> None:
+def test_the_nearest_surface_is_the_first_hit_of_a_ray(seed: int, count: int, caster):
     """Every pixel of a world in disorder, seen by a tilted camera; of many panels most are hidden."""
     rng = np.random.default_rng(seed)
     camera = Camera(80, 60, 60.0, 62.0, 41.0, 28.5, mount_height=0.3, mount_forward=0.1)
@@ -144,7 +142,7 @@ def test_the_nearest_surface_is_the_first_hit_of_a_ray(seed: int, count: int, ca
     np.testing.assert_array_equal(image[sure], greys[sure])
 
 
-def test_a_scene_of_moved_sets_is_the_scene_of_their_places(office: World, stand) -> None:
+def test_a_scene_of_moved_sets_is_the_scene_of_their_places(office: World, stand):
     """Sets that are placed later look as if they had been built there."""
     rng = np.random.default_rng(8)
     crates = [random_panels(rng, 6) for _ in range(3)]
@@ -163,7 +161,7 @@ def test_a_scene_of_moved_sets_is_the_scene_of_their_places(office: World, stand
     assert (images[0] != alone).mean() > 0.02
 
 
-def test_nothing_in_view_is_background(stand) -> None:
+def test_nothing_in_view_is_background(stand):
     """Behind, too near, too far, from the back, and no panel at all."""
     renderer = Renderer(CAMERA, 77)
     rotation, position = stand(Pose2())

@@ -3,8 +3,6 @@
 `pytest -s tests/sim/test_rival.py` prints the figures of docs/decisions/renderer.md.
 """
 
-from __future__ import annotations
-
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -69,7 +67,7 @@ class TinyRenderer:
 
 
 @pytest.mark.slow
-def test_same_picture_sooner_and_steadier(office: World, stand, tmp_path: Path) -> None:
+def test_same_picture_sooner_and_steadier(office: World, stand, tmp_path):
     """40 panels, 12 neighbouring places: pictures agree, and ours costs less and moves more smoothly."""
     start = office.start_poses(1, 4)[0]
     centres = np.array([panel.corner + panel.along / 2 for panel in office.panels])[:, :2]

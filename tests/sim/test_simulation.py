@@ -1,7 +1,5 @@
 """Simulated robots against their own specification: repeatable, level, slipping as much as they should."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import os
@@ -23,7 +21,7 @@ from mapweave.sim.worlds.catalog import make_world
 RANGE_NOISE = RobotSetup("r0").range_noise
 
 
-def test_pybullet_prints_nothing_amid_a_log() -> None:
+def test_pybullet_prints_nothing_amid_a_log():
     """It said on stderr when it was built: a line without the time, and none of JSON."""
     program = "import sys, mapweave.sim.physics; print('after it', file=sys.stderr)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
@@ -48,7 +46,7 @@ def fingerprint(seed: int) -> str:
 
 
 @pytest.mark.slow
-def test_same_seed_and_commands_give_the_same_bits() -> None:
+def test_same_seed_and_commands_give_the_same_bits():
     """Also in another process, whose hashes differ, and with robots that meet."""
     here = fingerprint(5)
     script = (
@@ -69,7 +67,7 @@ def test_same_seed_and_commands_give_the_same_bits() -> None:
     assert fingerprint(6) != here
 
 
-def test_odometry_errors_match_the_slip_model(bare: World) -> None:
+def test_odometry_errors_match_the_slip_model(bare: World):
     """Eight robots: 2 m straight, then two full turns, against variances derived from the settings."""
     names = [f"r{k}" for k in range(8)]
     poses = [Pose2(0.0, 3.0 * k, 0.0) for k in range(8)]
@@ -113,7 +111,7 @@ def test_odometry_errors_match_the_slip_model(bare: World) -> None:
         assert np.abs(errors).max() < 4.0
 
 
-def test_kidnap_is_not_noticed_by_the_encoders(office: World) -> None:
+def test_kidnap_is_not_noticed_by_the_encoders(office: World):
     """Neither standing nor driving; and the robot is where it was put."""
     with Simulation(office, ["r0"], 1) as simulation:
         for _ in range(5):
@@ -133,7 +131,7 @@ def test_kidnap_is_not_noticed_by_the_encoders(office: World) -> None:
             assert abs(seen.odometry.turn) < 1e-3
 
 
-def test_the_solver_loses_next_to_nothing(bare: World) -> None:
+def test_the_solver_loses_next_to_nothing(bare: World):
     """Ideal wheels over 9 m and three turns: where odometry says, to 1 % of what slip costs."""
     ideal = BodySettings(radius_error=0.0, axle_error=0.0, slip=0.0)
     legs = [
@@ -156,7 +154,7 @@ def test_the_solver_loses_next_to_nothing(bare: World) -> None:
 
 
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_commands_are_clipped(bare: World, sign: float) -> None:
+def test_commands_are_clipped(bare: World, sign: float):
     """Ten times the limit is the limit."""
     with Simulation(bare, ["r0"], 2, [Pose2()]) as simulation:
         description = simulation.describe("r0")
@@ -168,7 +166,7 @@ def test_commands_are_clipped(bare: World, sign: float) -> None:
             assert getattr(seen.odometry, field) / description.tick == pytest.approx(sign * limit, rel=0.02)
 
 
-def test_a_collision_counts_once_however_long_it_lasts(walled: World) -> None:
+def test_a_collision_counts_once_however_long_it_lasts(walled: World):
     """Pushing, and being carried away, end no differently than backing off."""
     with Simulation(walled, ["r0"], 4, [Pose2(0.5, 0.0, 0.2)]) as simulation:
 
@@ -190,7 +188,7 @@ def test_a_collision_counts_once_however_long_it_lasts(walled: World) -> None:
         assert simulation.collisions("r0") == 2
 
 
-def test_robot_stays_level(bare: World) -> None:
+def test_robot_stays_level(bare: World):
     """The camera must not nod: under 0.15 degree while starting, stopping and turning, at full speed."""
     with Simulation(bare, ["r0"], 5, [Pose2()]) as simulation:
         body = simulation._robots["r0"].body
@@ -223,7 +221,7 @@ def slab_distance(world: World, x: float, y: float, angle: float) -> float:
     return nearest
 
 
-def test_ranges_are_those_of_the_floor_plan(office: World) -> None:
+def test_ranges_are_those_of_the_floor_plan(office: World):
     """At random places, with the noise that they should have and no bias."""
     rng = np.random.default_rng(0)
     errors = []
@@ -245,7 +243,7 @@ def test_ranges_are_those_of_the_floor_plan(office: World) -> None:
     assert abs(np.mean(errors)) < 4 * RANGE_NOISE / math.sqrt(len(errors))
 
 
-def test_robots_see_and_sense_each_other(bare: World) -> None:
+def test_robots_see_and_sense_each_other(bare: World):
     """At once, also one that was just put there."""
     with Simulation(bare, ["r0", "r1"], 7, [Pose2(), Pose2(5.0, 0.0, 0.0)]) as simulation:
         alone = simulation.observe("r0")
@@ -256,7 +254,7 @@ def test_robots_see_and_sense_each_other(bare: World) -> None:
         assert np.abs(met.image.astype(float) - alone.image).max() > 60
 
 
-def test_truth_is_kept_by_tick(bare: World) -> None:
+def test_truth_is_kept_by_tick(bare: World):
     """One pose a tick; times and names that do not exist are refused."""
     with Simulation(bare, ["r0"], 8, [Pose2(1.0, 2.0, 0.5)]) as simulation:
         for _ in range(6):
@@ -274,13 +272,13 @@ def test_truth_is_kept_by_tick(bare: World) -> None:
     simulation.close()
 
 
-def test_robots_of_the_same_name_are_refused(bare: World) -> None:
+def test_robots_of_the_same_name_are_refused(bare: World):
     """One line that says so."""
     with pytest.raises(InvalidValue, match="same name"):
         Simulation(bare, ["r0", "r0"], 1)
 
 
-def test_robots_differ_in_rangers_and_cameras(bare: World) -> None:
+def test_robots_differ_in_rangers_and_cameras(bare: World):
     """Each senses with its own: also one without rangers, and pictures of another size."""
     small = camera_from_table({"intrinsics": {"width": 160, "height": 120, "cx": 79.5, "cy": 59.5}})
     robots = [RobotSetup("a", rangers=0), RobotSetup("b", rangers=5, camera=small), "c"]

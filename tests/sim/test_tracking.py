@@ -1,7 +1,5 @@
 """What the camera shows moves as the world's geometry says: flow is as good as on a real camera."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 
@@ -15,7 +13,7 @@ PATCH = np.array([(dx, dy) for dx in (-9, 0, 9) for dy in (-9, 0, 9)], float)
 """Around a point, px: all of it must be on one surface, or what is tracked is no point of a wall."""
 
 
-def test_tracks_follow_points_of_walls(office: World, caster, stand, monkeypatch) -> None:
+def test_tracks_follow_points_of_walls(office: World, caster, stand, monkeypatch):
     """Lucas-Kanade over half a second of driving and turning, against projections of the true points."""
     panels = PanelSet.of(office.panels)
     errors = []

@@ -1,7 +1,5 @@
 """Worlds from files: what is written is what is built, and what is wrong is said in one line."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from pathlib import Path
@@ -53,7 +51,7 @@ def same(first: World, second: World) -> bool:
     )
 
 
-def test_the_example_is_a_flat_to_drive_in() -> None:
+def test_the_example_is_a_flat_to_drive_in():
     """One region of floor, room for a fleet, and much to see."""
     world = load_world(EXAMPLE)
     assert len(world.plan.free_regions(0.28)) == 1
@@ -65,7 +63,7 @@ def test_the_example_is_a_flat_to_drive_in() -> None:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_saved_worlds_are_the_same_again(kind: str, tmp_path: Path) -> None:
+def test_saved_worlds_are_the_same_again(kind: str, tmp_path):
     """Of every kind, to the last bit."""
     design = make_design(kind, 4)
     path = tmp_path / "saved.toml"
@@ -74,13 +72,13 @@ def test_saved_worlds_are_the_same_again(kind: str, tmp_path: Path) -> None:
     assert same(load_world(path), build_world(design))
 
 
-def test_an_unwritable_file_is_reported_in_one_line(tmp_path: Path) -> None:
+def test_an_unwritable_file_is_reported_in_one_line(tmp_path):
     """A folder that is not there."""
     with pytest.raises(MapweaveError, match="No such file"):
         save_design(make_design("arena", 1), tmp_path / "nowhere" / "a.toml")
 
 
-def test_missing_values_keep_their_defaults(tmp_path: Path) -> None:
+def test_missing_values_keep_their_defaults(tmp_path):
     """One room is a world; it is called like its file."""
     world = load(tmp_path, ROOM)
     assert world.name == "my"
@@ -89,7 +87,7 @@ def test_missing_values_keep_their_defaults(tmp_path: Path) -> None:
     assert world.start_poses(1, 0)
 
 
-def test_posters_hang_on_the_nearest_wall_as_painted(tmp_path: Path) -> None:
+def test_posters_hang_on_the_nearest_wall_as_painted(tmp_path):
     """A picture with four different quarters, seen by a camera that looks at it: nothing is mirrored."""
     greys = np.array([[20, 90], [160, 240]], np.uint8)
     picture = np.kron(greys, np.ones((50, 80), np.uint8))
@@ -183,7 +181,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("text", "says"), WRONG)
-def test_errors_are_reported_in_one_line(text: str, says: str, tmp_path: Path) -> None:
+def test_errors_are_reported_in_one_line(text: str, says: str, tmp_path):
     """Which file, which item, and what to do."""
     (tmp_path / "my.toml.png").write_text("no picture")
     (tmp_path / "folder.png").mkdir()
@@ -193,7 +191,7 @@ def test_errors_are_reported_in_one_line(text: str, says: str, tmp_path: Path) -
     assert "\n" not in str(caught.value)
 
 
-def test_a_bomb_of_pixels_is_not_decoded(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bomb_of_pixels_is_not_decoded(tmp_path, monkeypatch):
     """A PNG of 1 MB may have 30000x30000 px."""
     png = bytearray(cv2.imencode(".png", np.zeros((4, 4), np.uint8))[1].tobytes())
     png[16:24] = (30_000).to_bytes(4, "big") * 2
@@ -203,13 +201,13 @@ def test_a_bomb_of_pixels_is_not_decoded(tmp_path: Path, monkeypatch: pytest.Mon
         load(tmp_path, ROOM + FURNITURE + "texture = 'mine.png'")
 
 
-def test_a_missing_file_is_reported_in_one_line(tmp_path: Path) -> None:
+def test_a_missing_file_is_reported_in_one_line(tmp_path):
     """Its name, and that it is not there."""
     with pytest.raises(MapweaveError, match=r"gone\.toml: no such file"):
         load_world(tmp_path / "gone.toml")
 
 
-def test_the_page_names_everything() -> None:
+def test_the_page_names_everything():
     """Every field, texture, kind and parameter stands in docs/worlds.md."""
     page = DOCS.read_text(encoding="utf-8")
     names = [field.name for cls in (Design, *ITEMS.values()) for field in dataclasses.fields(cls)]
@@ -222,7 +220,7 @@ def test_the_page_names_everything() -> None:
 @pytest.mark.parametrize(
     "name", [*WALLS, *PAINTERS, "sign", "sign EXIT 12", "grey 7", "rack", "rack changed", "carton"]
 )
-def test_painters_paint_any_size(name: str, size: tuple[int, int]) -> None:
+def test_painters_paint_any_size(name: str, size: tuple[int, int]):
     """The size that was asked for, the same for the same seed."""
     painter = Textures(Path(), 3).painter(name, 170.0, "here")
     one, again = (painter(np.random.default_rng([5]), *size) for _ in range(2))
@@ -281,7 +279,7 @@ DESIGNS = st.fixed_dictionaries(
 @given(
     DESIGNS, st.dictionaries(st.sampled_from([f.name for f in dataclasses.fields(Design)]), ODD, max_size=1)
 )
-def test_any_table_makes_a_world_or_one_line(lists: dict[str, Any], top: dict[str, Any]) -> None:
+def test_any_table_makes_a_world_or_one_line(lists: dict[str, Any], top: dict[str, Any]):
     """Any content of the file; and a built world has poses, and can be rearranged."""
     try:
         table = {**lists, **top}

@@ -1,7 +1,5 @@
 """What there is to see in worlds of every kind: what is alike, what differs, and how much there is."""
 
-from __future__ import annotations
-
 import math
 
 import cv2
@@ -27,7 +25,7 @@ def twin_poses(world: World) -> list[Pose2]:
 
 @pytest.mark.parametrize("name", first_quick(["joined twins", "twins", "large twins"], 1))
 @pytest.mark.parametrize("seed", SEEDS)
-def test_twins_look_exactly_the_same(name: str, seed: int) -> None:
+def test_twins_look_exactly_the_same(name: str, seed: int):
     """The same pose in the other room gives the same image to the last bit, unless one sees the corridor."""
     world = world_of(name, seed)
     rooms = [world.plan.room(f"room {k}") for k in (0, 1)]
@@ -45,7 +43,7 @@ def test_twins_look_exactly_the_same(name: str, seed: int) -> None:
     assert seen >= 2
 
 
-def test_joined_twins_differ_where_the_corridor_shows() -> None:
+def test_joined_twins_differ_where_the_corridor_shows():
     """Nothing in the corridor is there twice: neither on its walls nor on its floor."""
     world = world_of("joined twins", 1)
     corridor = world.plan.room("corridor")
@@ -60,7 +58,7 @@ def test_joined_twins_differ_where_the_corridor_shows() -> None:
 
 
 @pytest.mark.parametrize("seed", SEEDS)
-def test_no_two_prints_of_the_corridor_are_the_same(seed: int) -> None:
+def test_no_two_prints_of_the_corridor_are_the_same(seed: int):
     """As small pictures, each differs from each."""
     design = make_design("corridor", seed)
     world = world_of("corridor", seed)
@@ -73,7 +71,7 @@ def test_no_two_prints_of_the_corridor_are_the_same(seed: int) -> None:
             assert np.abs(first.astype(float) - second).mean() > 4.0
 
 
-def test_racks_are_equal_but_for_some_cartons() -> None:
+def test_racks_are_equal_but_for_some_cartons():
     """Most bays show one and the same picture, some another, and every aisle has signs of its own."""
     world = world_of("warehouse", 1)
     racks = [k for k, piece in enumerate(world.plan.furniture) if piece.name == "rack"]
@@ -100,7 +98,7 @@ def feature_counts(name: str, poses: int, along: bool) -> np.ndarray:
 
 
 @pytest.mark.parametrize("name", first_quick(["warehouse", "twins", "arena"], 1))
-def test_there_is_enough_to_see(name: str) -> None:
+def test_there_is_enough_to_see(name: str):
     """From almost everywhere; for offices see their own test."""
     counts = feature_counts(name, 4, along=False)
     assert np.median(counts) >= 120
@@ -108,7 +106,7 @@ def test_there_is_enough_to_see(name: str) -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_print_hangs_at_every_end_of_the_ring(seed: int) -> None:
+def test_a_print_hangs_at_every_end_of_the_ring(seed: int):
     """Where one looks to when driving along a side: on both ends of all four outer walls."""
     posters = np.array([poster.at for poster in make_design("corridor", seed).posters])
     x, y = 12.0, 8.0
@@ -119,7 +117,7 @@ def test_a_print_hangs_at_every_end_of_the_ring(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_the_corridor_is_sparse_but_not_empty() -> None:
+def test_the_corridor_is_sparse_but_not_empty():
     """Along the corridor there is always something in view, and much less than in an office."""
     counts = feature_counts("corridor", 6, along=True)
     assert counts.min() >= 15

@@ -1,7 +1,5 @@
 """Worlds of every kind and several seeds, measured by their blocks and panels, not by their own plan."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -23,13 +21,13 @@ from tests.sim.measured_world import (
 
 
 @pytest.mark.parametrize(("name", "seed"), WORLDS)
-def test_panels_lie_on_their_blocks(name: str, seed: int) -> None:
+def test_panels_lie_on_their_blocks(name: str, seed: int):
     """Walls are papered all over, furniture looks outward, posters hang before walls, floors are laid."""
     check_panels(world_of(name, seed))
 
 
 @pytest.mark.parametrize(("name", "seed"), WORLDS)
-def test_walls_are_closed(name: str, seed: int) -> None:
+def test_walls_are_closed(name: str, seed: int):
     """No ray from anywhere in a room leaves the building without meeting a wall, by the slab method."""
     world = world_of(name, seed)
     rng = np.random.default_rng(seed)
@@ -54,7 +52,7 @@ def test_walls_are_closed(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize(("name", "seed"), WORLDS)
-def test_all_floor_is_one_region(name: str, seed: int) -> None:
+def test_all_floor_is_one_region(name: str, seed: int):
     """For a robot with a margin; but the closed twins are two."""
     world = world_of(name, seed)
     regions = Drawing(world).regions(world)
@@ -66,7 +64,7 @@ def test_all_floor_is_one_region(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize(("name", "seed"), WORLDS)
-def test_sixteen_robots_can_start(name: str, seed: int) -> None:
+def test_sixteen_robots_can_start(name: str, seed: int):
     """Clear of everything and of one another, robot by robot in the rooms in turn, the same every time."""
     world = world_of(name, seed)
     small = name in ("small warehouse",)
@@ -89,7 +87,7 @@ def test_sixteen_robots_can_start(name: str, seed: int) -> None:
 
 
 @pytest.mark.parametrize("name", ["twins", "small warehouse"])
-def test_too_many_robots_are_refused_with_the_number_that_fits(name: str) -> None:
+def test_too_many_robots_are_refused_with_the_number_that_fits(name: str):
     """And so many do fit."""
     world = world_of(name, 1)
     with pytest.raises(InvalidValue, match="make the world larger") as caught:
@@ -102,7 +100,7 @@ def test_too_many_robots_are_refused_with_the_number_that_fits(name: str) -> Non
 
 
 @pytest.mark.parametrize("name", first_quick(["office", "joined twins", "corridor", "warehouse", "arena"], 2))
-def test_the_same_seed_gives_the_same_world(name: str) -> None:
+def test_the_same_seed_gives_the_same_world(name: str):
     """To the last bit of its places and pictures; another seed gives another."""
     kind, parameters = CASES[name]
     first, again, second = world_of(name, 1), make_world(kind, 1, **parameters), world_of(name, 2)

@@ -1,7 +1,5 @@
 """Light and faces of walls: against a loop over points, and over many random walls."""
 
-from __future__ import annotations
-
 import itertools
 import math
 
@@ -36,7 +34,7 @@ SURFACES = {
 
 
 @pytest.mark.parametrize("name", SURFACES)
-def test_light_is_that_of_points_under_lamps(name: str) -> None:
+def test_light_is_that_of_points_under_lamps(name: str):
     """Inverse squares and two cosines, one point after another."""
     surface = SURFACES[name]
     outward = {"wall to the south": (0, -1, 0), "wall to the east": (1, 0, 0), "floor": (0, 0, 1)}[name]
@@ -59,7 +57,7 @@ def test_light_is_that_of_points_under_lamps(name: str) -> None:
             assert bright[row, column] == pytest.approx(expected, rel=1e-9)
 
 
-def test_pictures_are_brightest_below_the_lamps_and_dark_in_corners() -> None:
+def test_pictures_are_brightest_below_the_lamps_and_dark_in_corners():
     """On the floor, in grey levels."""
     picture = SURFACES["floor"](np.random.default_rng(0), 250, 200).astype(float)
     below = picture[95:105, 45:55].mean()
@@ -67,7 +65,7 @@ def test_pictures_are_brightest_below_the_lamps_and_dark_in_corners() -> None:
     assert picture[95:105, 120:130].mean() > picture[:5, :5].mean() + 10
 
 
-def test_no_seam_shows_between_lengths_of_wall() -> None:
+def test_no_seam_shows_between_lengths_of_wall():
     """Light is the same where two pieces of a face meet."""
     world = make_world("corridor", 1)
     panels = [p for p in world.panels if p.down[2] < 0]
@@ -94,7 +92,7 @@ ROOMS = st.lists(st.tuples(NUMBER, NUMBER, st.floats(0.1, 5.0), st.floats(0.1, 5
 @given(POINT, POINT, ROOMS)
 def test_faces_are_cut_where_the_room_changes(
     start: tuple[float, float], end: tuple[float, float], rooms: list[tuple[float, float, float, float]]
-) -> None:
+):
     """Pieces follow one another, none too wide, none before two rooms but for a centimetre."""
     a, b = np.array(start), np.array(end)
     size = float(np.linalg.norm(b - a))
@@ -124,7 +122,7 @@ def test_faces_are_cut_where_the_room_changes(
 @given(POINT, POINT, POINT)
 def test_the_nearest_face_is_found(
     start: tuple[float, float], end: tuple[float, float], at: tuple[float, float]
-) -> None:
+):
     """The frame's origin is on the outline and looks at the point; the distance is that of a search."""
     if math.dist(start, end) < 0.1:
         return
@@ -141,7 +139,7 @@ def test_the_nearest_face_is_found(
         assert np.linalg.norm(corners - corner, axis=1).min() < 1e-9
 
 
-def test_plain_textures_are_plain() -> None:
+def test_plain_textures_are_plain():
     """Without a lamp, what is left is the ambient share."""
     dark = Lit(Plain(200), (0.0, 0.0, 1.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0), ())
     picture = Texture(40, 30, (1,), dark).level(0, 0)
