@@ -5,8 +5,6 @@
 Prints what was seen as JSON. STORE is sqlite or postgresql.
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

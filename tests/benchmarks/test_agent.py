@@ -1,7 +1,5 @@
 """The agent's benchmark measures a process that lacks what the base installation lacks."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -13,7 +11,7 @@ pytest.importorskip("pybullet")
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_its_last_line_is_one_object() -> None:
+def test_its_last_line_is_one_object():
     command = [sys.executable, "-m", "benchmarks.agent", "--seconds", "10", "--seed", "3", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
     values = json.loads(done.stdout.strip().splitlines()[-1])

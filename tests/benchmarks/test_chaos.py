@@ -84,13 +84,13 @@ def changed(store: SqliteStore, path: Path, sql: str) -> SqliteStore:
     return SqliteStore(path)
 
 
-def test_all_that_was_sent_is_stored(fleet: tuple[list[Change], Journal, SqliteStore]) -> None:
+def test_all_that_was_sent_is_stored(fleet: tuple[list[Change], Journal, SqliteStore]):
     sent, journal, store = fleet
     assert len(sent) > STEPS
     assert account(sent, journal, [store]) == Account(sent=len(sent), stored=len(sent))
 
 
-def test_what_a_store_lacks_is_lost(fleet: tuple[list[Change], Journal, SqliteStore], tmp_path: Path) -> None:
+def test_what_a_store_lacks_is_lost(fleet: tuple[list[Change], Journal, SqliteStore], tmp_path):
     sent, journal, store = fleet
     newest = {element_of(one.body): one.sequence for one in sent}
     final = max(newest.values())
@@ -102,8 +102,8 @@ def test_what_a_store_lacks_is_lost(fleet: tuple[list[Change], Journal, SqliteSt
 
 
 def test_what_a_robot_has_dropped_since_it_was_undone_is_not_lost(
-    fleet: tuple[list[Change], Journal, SqliteStore], tmp_path: Path
-) -> None:
+    fleet: tuple[list[Change], Journal, SqliteStore], tmp_path
+):
     sent, journal, store = fleet
     journal.acknowledge("s0", sent[0].map, len(sent))
     dropped = journal.prune(sent[0].map, ["s0"])
@@ -118,8 +118,8 @@ def test_what_a_robot_has_dropped_since_it_was_undone_is_not_lost(
 
 
 def test_what_a_store_deletes_of_a_large_map_is_not_lost(
-    fleet: tuple[list[Change], Journal, SqliteStore], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    fleet: tuple[list[Change], Journal, SqliteStore], monkeypatch
+):
     """The journal may have it still; of a small map a store deletes nothing."""
     sent, journal, store = fleet
     superseded = [sequence for sequence, _ in store.superseded(sent[0].map, len(sent))]
@@ -134,7 +134,7 @@ def test_what_a_store_deletes_of_a_large_map_is_not_lost(
     assert account(sent, journal, [store]).lost == 1
 
 
-def test_what_is_twice_or_elsewhere_is_counted(fleet: tuple[list[Change], Journal, SqliteStore]) -> None:
+def test_what_is_twice_or_elsewhere_is_counted(fleet: tuple[list[Change], Journal, SqliteStore]):
     sent, journal, store = fleet
     # As if the last change had been taken twice, the second time under the next number.
     twice = ReceivedChange.read(
@@ -146,8 +146,8 @@ def test_what_is_twice_or_elsewhere_is_counted(fleet: tuple[list[Change], Journa
 
 
 def test_a_journal_that_forgot_a_committed_change_has_lost_it(
-    fleet: tuple[list[Change], Journal, SqliteStore], tmp_path: Path
-) -> None:
+    fleet: tuple[list[Change], Journal, SqliteStore], tmp_path
+):
     sent, journal, store = fleet
     journal.close()
     disk = sqlite3.connect(tmp_path / "r0.sqlite")
@@ -159,8 +159,8 @@ def test_a_journal_that_forgot_a_committed_change_has_lost_it(
 
 
 def test_a_log_that_contradicts_itself_is_no_measure(
-    fleet: tuple[list[Change], Journal, SqliteStore], tmp_path: Path
-) -> None:
+    fleet: tuple[list[Change], Journal, SqliteStore], tmp_path
+):
     del fleet
     path = tmp_path / "r0.truth"
     path.write_text(path.read_text().replace(" 2 ", " 1 ", 1))
@@ -168,7 +168,7 @@ def test_a_log_that_contradicts_itself_is_no_measure(
         sent_changes(tmp_path, 0, 5)
 
 
-def test_recovery_ends_with_the_last_acknowledgement(tmp_path: Path) -> None:
+def test_recovery_ends_with_the_last_acknowledgement(tmp_path):
     (tmp_path / "r0.truth").write_text("C 1 1 10.0\nC 2 3 11.0\nC 3 4 20.0\n")
     (tmp_path / "r0.acks").write_text("s0 1 10.1\ns0 3 14.5\ns1 3 11.5\ns0 4 20.1\ns1 4 20.2\n")
     robots = [RobotTimes(tmp_path, "r0")]
@@ -183,7 +183,7 @@ def test_recovery_ends_with_the_last_acknowledgement(tmp_path: Path) -> None:
     assert took(21.0, Kind.LOSE_STORE, "s1") == NEVER
 
 
-def test_a_schedule_is_that_of_its_seed_and_kills_often_enough() -> None:
+def test_a_schedule_is_that_of_its_seed_and_kills_often_enough():
     def draw(seed: int) -> list[object]:
         return list(draw_schedule(10.0, GROUPS, seed, True))
 
@@ -207,9 +207,7 @@ ON_SQLITE = {
 }  # fmt: skip
 
 
-def test_messages_come_twice_and_late_and_none_is_lost(
-    hub: MemoryHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_messages_come_twice_and_late_and_none_is_lost(hub: MemoryHub, tmp_path, monkeypatch):
     monkeypatch.setattr("benchmarks.chaos.disorder.LONGEST", 0.5)
     robot, server, keys = MemoryBus(hub), MemoryBus(hub), Keys("fleet")
     link = DisorderedBus(robot, tmp_path, [3])
@@ -246,9 +244,7 @@ def test_messages_come_twice_and_late_and_none_is_lost(
         bus.close()
 
 
-def test_what_is_published_without_a_connection_does_not_come_late(
-    hub: MemoryHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_published_without_a_connection_does_not_come_late(hub: MemoryHub, tmp_path, monkeypatch):
     """A robot takes what a server has of it and has never left for changes that its disk has lost."""
     monkeypatch.setattr("benchmarks.chaos.disorder.LONGEST", 0.1)
     robot, server, heard = MemoryBus(hub), MemoryBus(hub), list[bytes]()
@@ -268,7 +264,7 @@ def test_what_is_published_without_a_connection_does_not_come_late(
         bus.close()
 
 
-def test_what_is_lost_on_one_store_is_lost_on_both() -> None:
+def test_what_is_lost_on_one_store_is_lost_on_both():
     one = ON_SQLITE
     other = dict(one, store="postgresql", stored=2, lost=1, maps_equal=False, relocalize_gap_s=0.7)
     assert together([one]) == one and good(one)
@@ -279,7 +275,7 @@ def test_what_is_lost_on_one_store_is_lost_on_both() -> None:
     assert (both["disorders"], both["doubled"], both["reordered"]) == (14, 10, 6)
 
 
-def test_what_stays_unacknowledged_is_in_the_report() -> None:
+def test_what_stays_unacknowledged_is_in_the_report():
     other = dict(ON_SQLITE, unacknowledged=2, recovery_s_p95=percentile([1.0, NEVER], 95))
     both = together([ON_SQLITE, other])
     assert not good(other) and not good(both)
@@ -287,14 +283,14 @@ def test_what_stays_unacknowledged_is_in_the_report() -> None:
     json.dumps(both, allow_nan=False)
 
 
-def test_percentiles_of_recoveries_by_hand() -> None:
+def test_percentiles_of_recoveries_by_hand():
     assert percentile([3.0, 1.0, 2.0], 50) == 2.0
     assert percentile([1.0, 2.0, 3.0, NEVER], 25) == 1.75
     assert percentile([1.0, NEVER], 50) is None
     assert percentile([NEVER, NEVER], 50) is None
 
 
-def test_robots_that_are_not_done_are_named(tmp_path: Path) -> None:
+def test_robots_that_are_not_done_are_named(tmp_path):
     with FleetProcesses(tmp_path, 2, 1, "sqlite") as fleet:
         for name, script in (("r0", "pass"), ("r1", "input()")):
             fleet._commands[name] = [sys.executable, "-c", script]
@@ -303,7 +299,7 @@ def test_robots_that_are_not_done_are_named(tmp_path: Path) -> None:
         assert comes_true(lambda: fleet.mapping() == ["r1"], 60.0)
 
 
-def test_a_server_that_has_ended_by_itself_is_neither_frozen_nor_thawed(tmp_path: Path) -> None:
+def test_a_server_that_has_ended_by_itself_is_neither_frozen_nor_thawed(tmp_path):
     """It found no database; it is started again later."""
     with FleetProcesses(tmp_path, 1, 1, "sqlite") as fleet:
         fleet._commands["s0"] = [sys.executable, "-c", "pass"]
@@ -339,9 +335,7 @@ class PatientRobot:
         return max(begin - end, 0.0)
 
 
-def test_a_server_that_found_no_database_is_started_again_before_robots_ask(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_that_found_no_database_is_started_again_before_robots_ask(tmp_path, monkeypatch):
     """Also when it ends behind the last disturbance; and who is missing is named."""
     monkeypatch.setattr("benchmarks.chaos.benchmark.LostRobot", PatientRobot)
     monkeypatch.setattr("benchmarks.chaos.benchmark.ATTACKS", ((Kind.STOP, "s1", 0.0),))
@@ -367,7 +361,7 @@ def test_a_server_that_found_no_database_is_started_again_before_robots_ask(
 @pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.timeout(600)
-def test_nothing_is_lost_in_a_short_chaos() -> None:
+def test_nothing_is_lost_in_a_short_chaos():
     ran = subprocess.run(
         [sys.executable, "-m", "benchmarks.chaos", "--agents", "2", "--seconds", "10", "--json",
          "--store", "sqlite"],

@@ -1,7 +1,5 @@
 """The mapping filter and FilterPy's come to the same where the algorithm is the same."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -15,7 +13,7 @@ AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_for
 
 
 @pytest.mark.parametrize("shape", first_quick(SHAPES, 1))
-def test_same_estimates_over_a_whole_run(shape: str) -> None:
+def test_same_estimates_over_a_whole_run(shape: str):
     """State and covariance to 1e-6 at each of 500 steps, landmarks coming into view and leaving it."""
     run = draw_run(np.random.default_rng([21, SHAPES.index(shape)]), shape, landmarks=12, camera=AHEAD)
     assert np.isnan(run.pixels).any()
@@ -27,7 +25,7 @@ def test_same_estimates_over_a_whole_run(shape: str) -> None:
             assert max(gap(own.belief, theirs.belief)) < 1e-6
 
 
-def test_a_wrong_model_does_not_agree(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_wrong_model_does_not_agree(monkeypatch):
     """What the agreement is worth: wheels of twice the noise are noticed."""
     run = draw_run(np.random.default_rng(22), "arc", steps=20, landmarks=12)
     own = Ours(run, plain=True)
@@ -40,7 +38,7 @@ def test_a_wrong_model_does_not_agree(monkeypatch: pytest.MonkeyPatch) -> None:
     assert min(gap(own.belief, theirs.belief)) > 1e-5
 
 
-def test_a_race_goes_on_when_our_filter_gives_a_landmark_up() -> None:
+def test_a_race_goes_on_when_our_filter_gives_a_landmark_up():
     """With its rules it does so in this run, at step 72."""
     run = draw_run(np.random.default_rng(8932), "arc", steps=200, landmarks=30)
     own = Ours(run)
@@ -50,7 +48,7 @@ def test_a_race_goes_on_when_our_filter_gives_a_landmark_up() -> None:
     assert race(8932, 30).difference < 1e-6
 
 
-def test_transition_is_the_motions_derivative() -> None:
+def test_transition_is_the_motions_derivative():
     """FilterPy's dense F against central differences of its own motion."""
     run = draw_run(np.random.default_rng(23), "arc", steps=20, landmarks=5, camera=AHEAD)
     step = run.odometry[-1]
@@ -71,7 +69,7 @@ def test_transition_is_the_motions_derivative() -> None:
     assert np.abs(np.column_stack(columns) - filter_.F).max() < 1e-8
 
 
-def test_the_race_measures_all_three() -> None:
+def test_the_race_measures_all_three():
     speed = race(24, 8, steps=15)
     assert min(speed.full_ms, speed.plain_ms, speed.filterpy_ms) > 0.0
     assert 0.0 < speed.difference < 1e-6

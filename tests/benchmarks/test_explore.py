@@ -1,7 +1,5 @@
 """The judge of exploration: which floor nodes show, against looking along every line step by step."""
 
-from __future__ import annotations
-
 import json
 import math
 
@@ -30,7 +28,7 @@ PLAN = BuildingPlan(
 
 
 @pytest.mark.parametrize("pose", [Pose2(1.0, 2.0, 0.0), Pose2(3.0, 0.8, 2.9), Pose2(6.0, 1.0, -3.0)])
-def test_a_node_shows_what_is_visible_in_its_field_of_view(pose: Pose2) -> None:
+def test_a_node_shows_what_is_visible_in_its_field_of_view(pose: Pose2):
     squares = floor_squares(PLAN)
     shown = shows(Look(0.0, pose, 0.5), squares, PLAN)
     steps = np.linspace(0.0, 1.0, 400)[:, None]
@@ -48,7 +46,7 @@ def test_a_node_shows_what_is_visible_in_its_field_of_view(pose: Pose2) -> None:
     assert 0.01 < shown.mean() < 0.5
 
 
-def test_floor_is_mapped_from_the_first_view_on() -> None:
+def test_floor_is_mapped_from_the_first_view_on():
     west, east = Pose2(1.0, 2.0, 0.0), Pose2(7.0, 2.0, math.pi)
     views = {"r0": [Look(5.0, west, 0.5), Look(9.0, west, 0.5)], "r1": [Look(7.0, east, 0.5)], "r2": []}
     floor = mapped_floor(PLAN, views)
@@ -67,7 +65,7 @@ def test_floor_is_mapped_from_the_first_view_on() -> None:
     assert both.overlap(8.0) == pytest.approx(first.sum() / (first | second).sum())
 
 
-def test_time_to_a_share() -> None:
+def test_time_to_a_share():
     floor = MappedFloor(np.array([[3.0, 9.0], [1.0, 0.5], [np.inf, np.inf], [7.0, 2.0]]))
     assert floor.time_to(0.25) == 0.5
     assert floor.time_to(0.5) == 2.0
@@ -76,7 +74,7 @@ def test_time_to_a_share() -> None:
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
-def test_a_fleet_starts_at_one_place(seed: int) -> None:
+def test_a_fleet_starts_at_one_place(seed: int):
     plan = make_world("office", seed, rooms=4).plan
     poses = gathered(plan, 3, seed)
     assert [p.vector.tolist() for p in poses] == [p.vector.tolist() for p in gathered(plan, 3, seed)]
@@ -93,7 +91,7 @@ def test_a_fleet_starts_at_one_place(seed: int) -> None:
     assert all(setup.pose is None for setup in office(4, 3, seed, spread=True).robots)
 
 
-def test_too_many_for_one_place_are_refused() -> None:
+def test_too_many_for_one_place_are_refused():
     closet = BuildingPlan(rooms=(Rectangle.spanning(0, 0, 2, 2, "closet"),), walls=())
     with pytest.raises(InvalidValue, match="12 robots do not fit into one place: use --spread"):
         gathered(closet, 12, 0)
@@ -106,7 +104,7 @@ def explored(seen: list[list[float]], nodes: int) -> Exploration:
     return Exploration(MappedFloor(np.array(seen)), nodes, 0, 0, 1, 0.01)
 
 
-def test_figures_by_hand() -> None:
+def test_figures_by_hand():
     inf = math.inf
     done = {
         "random": {2: explored([[30.0, inf], [inf, inf], [inf, inf], [inf, inf]], 3)},
@@ -129,7 +127,7 @@ def test_figures_by_hand() -> None:
 
 
 @pytest.mark.slow
-def test_a_short_race() -> None:
+def test_a_short_race():
     """One robot for some seconds: both strategies run in the same office, without a fleet."""
     done = measure([1], 3, 0.16, 1, spread=False, quiet=True)
     assert set(done["ours"]) == set(done["random"]) == {1}

@@ -1,7 +1,5 @@
 """The benchmark of fleets: what it says of agents that disturb, and its report by made-up figures."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -56,7 +54,7 @@ def asked(monkeypatch: pytest.MonkeyPatch, *answers: Sequence[Reply]) -> dict[st
     return StatusAsker(bus, names, [now, now + 0.02, now + 0.04], now + 0.1).result()
 
 
-def test_what_was_said_while_they_disturbed_is_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_was_said_while_they_disturbed_is_kept(monkeypatch):
     slow = RobotEntry("r8", True, 0.1, missing=2, lag=0.91)
     flooding = RobotEntry("r9", True, 0.1, over_quota="over its quota: 3 changes")
     more = replace(flooding, over_quota="over its quota: 7 changes")
@@ -69,13 +67,13 @@ def test_what_was_said_while_they_disturbed_is_kept(monkeypatch: pytest.MonkeyPa
     assert said == {"slow": "2 changes missing for 0.9 s", "flooding": "over its quota: 7 changes"}
 
 
-def test_a_server_that_never_answers_ends_the_benchmark(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_server_that_never_answers_ends_the_benchmark(monkeypatch):
     for none in ([], [Reply(error="too busy")]):
         with pytest.raises(SystemExit, match="does not answer"):
             asked(monkeypatch, none)
 
 
-def test_trouble_in_words() -> None:
+def test_trouble_in_words():
     entry = RobotEntry("r8", True, 4.9)
     assert trouble_of(entry) == ""
     assert trouble_of(replace(entry, age=5.14)) == "silent for 5.1 s"
@@ -84,16 +82,14 @@ def test_trouble_in_words() -> None:
     assert trouble_of(both) == "3 changes missing for 1.5 s, over its quota: 1 beacon"
 
 
-def test_agents_stay_until_the_end_of_mapping() -> None:
+def test_agents_stay_until_the_end_of_mapping():
     """One that floods would else end with its last node."""
     begin = time.monotonic()
     run_schedule([], Orders("", "", 0, 0, 1, 0.3, 0, 1), begin, Reporter())
     assert time.monotonic() >= begin + 0.3
 
 
-def test_agents_stay_connected_until_the_others_are_acknowledged(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_agents_stay_connected_until_the_others_are_acknowledged(monkeypatch, capsys):
     """Those that have no change in the burst would else leave at its beginning: half of a thousand."""
     printed: list[str] = []
 
@@ -115,14 +111,14 @@ def test_agents_stay_connected_until_the_others_are_acknowledged(
     assert [json.loads(out.splitlines()[-1])["burst"] for out in printed] == [[]]
 
 
-def test_a_slow_agent_is_asked_about_behind_each_of_its_nodes() -> None:
+def test_a_slow_agent_is_asked_about_behind_each_of_its_nodes():
     slow = Orders("", "", 9, 1, 9, 30.0, 0, 1)
     (first,) = first_stops(slow, 100.0)
     assert 100.0 <= first < 110.0
     assert when_behind(slow, 100.0) == pytest.approx([first + k * INTERVAL + BEHIND_AFTER for k in range(3)])
 
 
-def test_a_percentile_of_nothing_is_none() -> None:
+def test_a_percentile_of_nothing_is_none():
     assert milliseconds(np.array([]), 99) is None
     assert milliseconds(np.array([0.001, 0.002, np.inf]), 50) == 2.0
 
@@ -140,12 +136,8 @@ def test_a_percentile_of_nothing_is_none() -> None:
     ],
 )
 def test_it_ends_with_1_unless_it_is_good_and_prints_json(
-    change: Figures,
-    said: dict[str, str],
-    status: int,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+    change: Figures, said: dict[str, str], status: int, monkeypatch, capsys
+):
     monkeypatch.setattr(benchmark, "measure_floor", lambda folder: {"floor_p50_ms": 1.0})
     monkeypatch.setattr(benchmark, "measure_fleet", lambda *_: ({**FIGURES, **change}, said))
     monkeypatch.setattr("sys.argv", ["fleet", "--agents", "9", "--burst", "0", "--json"])
@@ -164,7 +156,7 @@ def test_it_ends_with_1_unless_it_is_good_and_prints_json(
 @pytest.mark.slow
 @pytest.mark.waits
 @pytest.mark.timeout(400)
-def test_a_small_fleet_is_measured_as_a_whole() -> None:
+def test_a_small_fleet_is_measured_as_a_whole():
     """Not how fast it is: that is a matter of the machine and of what else it does."""
     arguments = "--agents 4 --seconds 12 --burst 40 --disturb --seed 5 --json"
     ran = subprocess.run(

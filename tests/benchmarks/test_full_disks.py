@@ -1,7 +1,5 @@
 """Full disks below a server, a PostgreSQL and a robot, as processes: disks that only this test sees."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -46,14 +44,14 @@ def said(request: pytest.FixtureRequest) -> Iterator[dict[str, Any]]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-def test_nothing_is_lost_whichever_disk_is_full(said: dict[str, Any]) -> None:
+def test_nothing_is_lost_whichever_disk_is_full(said: dict[str, Any]):
     account = said["account"]
     assert account["sent"] == account["stored"] + account["undone"] > 100
     assert (account["lost"], account["duplicated"], account["out_of_order"]) == (0, 0, 0)
     assert account["maps_equal"] is True
 
 
-def test_a_server_on_a_full_disk_acknowledges_nothing_and_says_why(said: dict[str, Any]) -> None:
+def test_a_server_on_a_full_disk_acknowledges_nothing_and_says_why(said: dict[str, Any]):
     server = said["server"]
     assert server["runs"] is True and server["acknowledged while full"] == 0
     why = {"sqlite": "map store: the disk is full", "postgresql": "No space left on device"}[said["store"]]
@@ -61,7 +59,7 @@ def test_a_server_on_a_full_disk_acknowledges_nothing_and_says_why(said: dict[st
 
 
 @pytest.mark.parametrize("process", ["server", "robot"])
-def test_a_full_disk_is_one_line_and_so_is_that_it_has_room(said: dict[str, Any], process: str) -> None:
+def test_a_full_disk_is_one_line_and_so_is_that_it_has_room(said: dict[str, Any], process: str):
     """Which disk, and what to do; whatever else is not written, as the history and what a restart spares."""
     (line,), (again,) = said[process]["lines"], said[process]["room again"]
     assert said[process]["lines after"] == [line], "also behind the recovery"
@@ -73,19 +71,19 @@ def test_a_full_disk_is_one_line_and_so_is_that_it_has_room(said: dict[str, Any]
     assert again.endswith("what waited is written")
 
 
-def test_a_server_that_is_killed_on_a_full_disk_has_what_it_acknowledged(said: dict[str, Any]) -> None:
+def test_a_server_that_is_killed_on_a_full_disk_has_what_it_acknowledged(said: dict[str, Any]):
     assert said["server"]["missing after kill"] == 0
     assert said["server"]["started full"] is True
 
 
-def test_a_full_disk_of_the_write_ahead_log_ends_postgresql_and_no_server(said: dict[str, Any]) -> None:
+def test_a_full_disk_of_the_write_ahead_log_ends_postgresql_and_no_server(said: dict[str, Any]):
     if said["store"] == "sqlite":
         pytest.skip("a file has no such disk")
     assert said["log"]["runs"] is True and said["log"]["acknowledged while full"] == 0
     assert "the map store cannot be used" in said["log"]["event"]
 
 
-def test_a_server_does_not_start_on_a_read_only_disk(said: dict[str, Any]) -> None:
+def test_a_server_does_not_start_on_a_read_only_disk(said: dict[str, Any]):
     if said["store"] == "postgresql":
         pytest.skip("PostgreSQL itself does not start there")
     (line,) = said["read-only"]["lines"]

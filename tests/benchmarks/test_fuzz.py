@@ -1,7 +1,5 @@
 """The fuzzer finds what is there to be found, and its command prints what it found."""
 
-from __future__ import annotations
-
 import importlib
 import json
 import math
@@ -42,7 +40,7 @@ class TwoLines(InvalidMessage):
         return "one\ntwo"
 
 
-def test_what_is_wrong_is_found_and_sorted(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_wrong_is_found_and_sorted(tmp_path, monkeypatch):
     monkeypatch.setattr(process, "SLOW", 0.05)
 
     def decode(data: bytes, _: Path) -> None:
@@ -67,7 +65,7 @@ def test_what_is_wrong_is_found_and_sorted(tmp_path: Path, monkeypatch: pytest.M
     assert {path.read_bytes() for path in tmp_path.glob("crashes-????????????")} == {b"crash", b"two lines"}
 
 
-def test_a_finding_is_counted_at_once(tmp_path: Path) -> None:
+def test_a_finding_is_counted_at_once(tmp_path):
     """LibFuzzer ends the process without coming back: before, findings of its last 0.2 s were not counted."""
 
     def decode(data: bytes, _: Path) -> None:
@@ -86,7 +84,7 @@ NEW += ["messages", "sealed", "shown", "learned", "views"]
 
 @pytest.mark.parametrize("name", NEW)
 @pytest.mark.usefixtures("application")
-def test_good_samples_are_taken(name: str, samples: Samples, tmp_path: Path) -> None:
+def test_good_samples_are_taken(name: str, samples: Samples, tmp_path):
     """What is refused at its beginning hides all that lies behind it from the fuzzer."""
     good = TARGETS[name].samples(samples)
     assert len(good) >= 1 and max(map(len, good)) <= TARGETS[name].most
@@ -94,7 +92,7 @@ def test_good_samples_are_taken(name: str, samples: Samples, tmp_path: Path) -> 
         TARGETS[name].run(sample, tmp_path)
 
 
-def test_every_kind_of_message_and_of_sealed_file_has_a_good_sample(samples: Samples) -> None:
+def test_every_kind_of_message_and_of_sealed_file_has_a_good_sample(samples: Samples):
     """The last kinds had none: what they were mutated of was refused at its first byte."""
     kinds = {sample[0] for sample in TARGETS["messages"].samples(samples)}
     assert kinds == {*range(len(targets.DECODERS))}
@@ -104,7 +102,7 @@ def test_every_kind_of_message_and_of_sealed_file_has_a_good_sample(samples: Sam
     assert magics == {b"mapweave superseded", b"mapweave verdicts", b"mapweave merge"}
 
 
-def test_uploads_of_good_samples_are_kept(samples: Samples, application: HttpApplication) -> None:
+def test_uploads_of_good_samples_are_kept(samples: Samples, application: HttpApplication):
     """A target of HTTP takes refusals as well."""
     kept = [
         application.answer(b"POST /plans multipart/form-data; boundary=b\n" + form)
@@ -113,9 +111,7 @@ def test_uploads_of_good_samples_are_kept(samples: Samples, application: HttpApp
     assert kept == [200] * len(kept)
 
 
-def test_a_viewer_is_let_in(
-    samples: Samples, application: HttpApplication, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_viewer_is_let_in(samples: Samples, application: HttpApplication, monkeypatch):
     """By the heads of all samples; so the frames behind them are read."""
     sent: list[bytes] = []
     monkeypatch.setattr(http_application.Transport, "write", lambda self, data: sent.append(bytes(data)))
@@ -127,7 +123,7 @@ def test_a_viewer_is_let_in(
         assert compressed == (number == 1) and (compressed or b'"hello"' in b"".join(sent))
 
 
-def test_an_invalid_value_is_noticed() -> None:
+def test_an_invalid_value_is_noticed():
     check_finite((Pose2(1.0, 2.0, 3.0), {"a": [1.0]}))
     with pytest.raises(AcceptedInvalid):
         check_finite({"a": [Pose2(1.0, math.inf, 3.0)]})
@@ -136,7 +132,7 @@ def test_an_invalid_value_is_noticed() -> None:
 
 
 @pytest.mark.slow
-def test_the_command_prints_its_counts(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_prints_its_counts(capsys):
     status = benchmark.main(["--seconds", "1", "--targets", "lines", "poses", "--json"])
     result = json.loads(capsys.readouterr().out.splitlines()[-1])
     assert result["inputs"] > 20
@@ -146,7 +142,7 @@ def test_the_command_prints_its_counts(capsys: pytest.CaptureFixture[str]) -> No
     assert result["peak_rss_mb"] > 10
 
 
-def test_no_kernel_counts_its_branches() -> None:
+def test_no_kernel_counts_its_branches():
     """Numba cannot compile it then; a kernel of whole numbers is compiled after some hundred calls."""
     for module in ("wire.landmark_codec", "agent.runner", "mapserver.server"):
         importlib.import_module(f"mapweave.{module}")

@@ -1,11 +1,8 @@
 """The benchmark of wrong geometry on a short rendered drive: its figures."""
 
-from __future__ import annotations
-
 import json
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,9 +15,7 @@ from tests.agent.calibration.room_drive import CAMERA, drive, write
 
 
 @pytest.mark.slow
-def test_the_benchmark_says_what_a_wrong_geometry_costs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_the_benchmark_says_what_a_wrong_geometry_costs(tmp_path, monkeypatch, capfd):
     camera = replace(CAMERA, width=160, height=120, fx=138.5, fy=138.5, cx=79.5, cy=59.5)
     true = DriveGeometry(forward=0.1, height=0.25)
     write(drive(np.random.default_rng(0), true, 12.0, camera=camera), tmp_path)

@@ -1,7 +1,5 @@
 """The landmark benchmark judges matches by truth, counts what it says, and refuses what it cannot use."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path
@@ -32,9 +30,7 @@ def photographs(tmp_path: Path) -> Path:
     return tmp_path
 
 
-def test_a_folder_of_photographs(
-    photographs: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_folder_of_photographs(photographs: Path, monkeypatch, capsys):
     (photographs / "notes.txt").write_text("no photograph")
     (photographs / "broken.jpg").write_text("no photograph either")
     run(monkeypatch, "--images", str(photographs), "--places", "0", "--json")
@@ -50,7 +46,7 @@ def test_a_folder_of_photographs(
     assert {"bytes_per_landmark", "pairs_matched_ratio", "encode_ms", "decode_ms"} <= set(result)
 
 
-def test_neighbours_come_first_when_there_are_too_many(photographs: Path) -> None:
+def test_neighbours_come_first_when_there_are_too_many(photographs: Path):
     """By number: 10 comes after 9."""
     first, second, _ = (
         cv2.imread(str(photographs / f"{name}.png"), cv2.IMREAD_GRAYSCALE) for name in (9, 10, 11)
@@ -63,9 +59,7 @@ def test_neighbours_come_first_when_there_are_too_many(photographs: Path) -> Non
 
 
 @pytest.mark.parametrize("content", ["missing", "empty", "one", "different"])
-def test_a_missing_folder_is_reported_in_one_line(
-    content: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_missing_folder_is_reported_in_one_line(content: str, tmp_path, monkeypatch, capsys):
     folder = tmp_path / "views"
     if content != "missing":
         folder.mkdir()
@@ -81,7 +75,7 @@ def test_a_missing_folder_is_reported_in_one_line(
     assert str(folder) in output[-1]
 
 
-def test_matches_of_a_warp_agree_with_the_homography() -> None:
+def test_matches_of_a_warp_agree_with_the_homography():
     """To 3 px of where the homography takes a feature, written down here once more."""
     rng = np.random.default_rng(1)
     pair = _warped_pair(load("coins"), rng)
@@ -97,7 +91,7 @@ def test_matches_of_a_warp_agree_with_the_homography() -> None:
     assert pair.right(pixels[:0], at[:0]) == 0
 
 
-def test_matches_of_rooms_are_right_where_both_rays_meet_the_same_point() -> None:
+def test_matches_of_rooms_are_right_where_both_rays_meet_the_same_point():
     """Features matched by chance are wrong."""
     pair = _room_pair(np.random.default_rng(5))
     pixels, _ = features(pair.first, pair.camera)
@@ -110,7 +104,7 @@ def test_matches_of_rooms_are_right_where_both_rays_meet_the_same_point() -> Non
     assert np.nanmin(pair.depths(pixels)) > 0.05
 
 
-def test_epipolar_geometry_of_points_that_were_really_seen_twice() -> None:
+def test_epipolar_geometry_of_points_that_were_really_seen_twice():
     rng = np.random.default_rng(2)
     points = rng.uniform([-2, -1, 3], [2, 1, 8], (60, 3))
     first = 300 * points[:, :2] / points[:, 2:] + 160
@@ -123,7 +117,7 @@ def test_epipolar_geometry_of_points_that_were_really_seen_twice() -> None:
     assert epipolar(first[:7], second[:7]) == 0
 
 
-def test_ratios_are_of_the_pairs_that_floats_match() -> None:
+def test_ratios_are_of_the_pairs_that_floats_match():
     floats = KeptMatches([100, 50, 3], [110, 60, 40], [10, 10, 10], ["a"] * 3)
     own = KeptMatches([90, 10, 30], [100, 40, 40], [1, 2, 3], ["a"] * 3)
     one = figures({"float sift": floats, "ours": own})["ours"]
@@ -133,7 +127,7 @@ def test_ratios_are_of_the_pairs_that_floats_match() -> None:
     assert one["bytes"] == 2
 
 
-def test_a_node_has_150_landmarks() -> None:
+def test_a_node_has_150_landmarks():
     full, half = Packed(2800, 150, 2500, 2.0, 1.0), Packed(1550, 75, 1250, 1.0, 1.0)
     assert node_figures([full, half])["bytes_per_node"] == 2800
     reckoned = node_figures([half])
@@ -141,6 +135,6 @@ def test_a_node_has_150_landmarks() -> None:
     assert reckoned["bytes_per_landmark"] == pytest.approx(16.667, abs=1e-3)
 
 
-def test_the_folder_is_checked_first(tmp_path: Path) -> None:
+def test_the_folder_is_checked_first(tmp_path):
     with pytest.raises(InvalidFile, match="no such folder"):
         folder_pairs(tmp_path / "nothing", 0, 10)

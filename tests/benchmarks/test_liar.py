@@ -1,9 +1,5 @@
 """One robot of four lies, over the real server: the others keep what they have, and the page names it."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -16,7 +12,7 @@ from synthetic.wrong_geometry import ODD
 
 
 @pytest.mark.parametrize("name", list(MARGINS))
-def test_what_one_rule_contains_is_of_legal_messages(name: str) -> None:
+def test_what_one_rule_contains_is_of_legal_messages(name: str):
     """No change of it is refused, so that no other rule names it for that."""
     rule, lie, scene = MARGINS[name]
     maps = draw(3, scene)[1]
@@ -29,7 +25,7 @@ def test_what_one_rule_contains_is_of_legal_messages(name: str) -> None:
 
 
 @pytest.mark.slow
-def test_lies_are_contained_and_named(tmp_path: Path) -> None:
+def test_lies_are_contained_and_named(tmp_path):
     trial = drawn_trial(3, 6, tmp_path)
     beside = trial.beside
     assert not beside.named and not beside.links_changed and beside.answers_changed <= 1
@@ -39,7 +35,7 @@ def test_lies_are_contained_and_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_who_retires_a_lie_that_no_server_can_tell_has_the_map_of_before(tmp_path: Path) -> None:
+def test_who_retires_a_lie_that_no_server_can_tell_has_the_map_of_before(tmp_path):
     # Two robots collide here. With other seeds none does, and the map is joined: its views are true.
     trial = drawn_trial(9103, 6, tmp_path)
     for name, lie in UNDECIDABLE.items():

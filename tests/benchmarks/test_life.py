@@ -1,7 +1,5 @@
 """The benchmark of a map's life: a short one as a whole, and its ratios by hand."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -17,7 +15,7 @@ from benchmarks.life.benchmark import FIFTIETH, SOME, MapAfterDrive, change_of, 
 DRIVE = MapAfterDrive(20, 5, 3, 1, 5.0, 0.1, 200_000_000, 1_000_000, 100_000)
 
 
-def test_the_last_drives_are_compared_with_those_about_the_fiftieth() -> None:
+def test_the_last_drives_are_compared_with_those_about_the_fiftieth():
     drives = FIFTIETH + 2 * SOME
     about = range(FIFTIETH - 1 - SOME // 2, FIFTIETH + SOME // 2)
     last = range(drives - SOME, drives)
@@ -32,7 +30,7 @@ def test_the_last_drives_are_compared_with_those_about_the_fiftieth() -> None:
     assert in_the_long_run(curve[:-1]) == {}, "too few drives to say anything"
 
 
-def test_a_change_of_recall_has_the_interval_of_paired_views() -> None:
+def test_a_change_of_recall_has_the_interval_of_paired_views():
     before, after = np.zeros(200, np.bool_), np.zeros(200, np.bool_)
     before[:180] = after[6:183] = True
     # Six views are answered no longer, three that were not are now.
@@ -49,7 +47,7 @@ def test_a_change_of_recall_has_the_interval_of_paired_views() -> None:
 
 
 @pytest.mark.slow
-def test_the_map_after_some_drives_is_asked_as_it_was_then(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_map_after_some_drives_is_asked_as_it_was_then(monkeypatch):
     """Pruned, too: nodes that have left need no node to supersede them."""
     monkeypatch.setattr(benchmark, "EARLY", (1, 5))
     figures, drives = run(6, 65, 1, 0.0, 4, 4.0, Console(quiet=True))
@@ -59,7 +57,7 @@ def test_the_map_after_some_drives_is_asked_as_it_was_then(monkeypatch: pytest.M
 
 
 @pytest.mark.slow
-def test_a_short_life() -> None:
+def test_a_short_life():
     arguments = "--drives 3 --stops 1 --queries 20 --seed 4 --json"
     ran = subprocess.run(
         [sys.executable, "-m", "benchmarks.life", *arguments.split()],

@@ -1,12 +1,9 @@
 """The mapping run from the simulator's camera: figures, pictures, and the truth that it is judged by."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -34,9 +31,7 @@ def run() -> MappingDrive:
 
 
 @pytest.mark.slow
-def test_the_command_draws_and_prints(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_draws_and_prints(tmp_path, monkeypatch, capsys):
     """One short run: its pictures, and its last line for scripts."""
     out = tmp_path / "a" / "b"
     arguments = ["--steps", "40", "--runs", "line", "--seed", "2", "--out", str(out), "--json"]
@@ -54,7 +49,7 @@ def test_the_command_draws_and_prints(
         assert image.std() > 5.0
 
 
-def test_mismatched_comparisons_are_reported() -> None:
+def test_mismatched_comparisons_are_reported():
     seen: dict[str, float | None] = {"person_in_view_s": 3.0, "landmarks_left": 9.0}
     unseen: dict[str, float | None] = {"person_in_view_s": 0.0, "landmarks_left": 0.0}
     assert notes({"line": unseen | {"landmarks_left": 1.0}, "person": seen}, {"line": "", "person": ""}) == []
@@ -66,7 +61,7 @@ def test_mismatched_comparisons_are_reported() -> None:
 
 
 @pytest.mark.slow
-def test_a_run_is_near_the_truth(run: MappingDrive) -> None:
+def test_a_run_is_near_the_truth(run: MappingDrive):
     """Bounds with room for chance: `python -m benchmarks.mapping_run` measures the figures."""
     result = figures(run)
     assert not run.given_up
@@ -82,7 +77,7 @@ def test_a_run_is_near_the_truth(run: MappingDrive) -> None:
 
 
 @pytest.mark.slow
-def test_a_person_in_the_view_changes_nothing_else() -> None:
+def test_a_person_in_the_view_changes_nothing_else():
     alone, passed = drive(2, "arena", "line", 60), drive(2, "arena", "line", 60, person=True)
     bearings = np.array([m.person for m in passed.moments])
     assert np.isfinite(bearings).sum() > 5
@@ -94,14 +89,14 @@ def test_a_person_in_the_view_changes_nothing_else() -> None:
     assert figures(passed)["person_in_view_s"] == pytest.approx(0.1 * np.isfinite(bearings).sum())
 
 
-def test_the_same_seed_gives_the_same_run_and_another_seed_another(run: MappingDrive) -> None:
+def test_the_same_seed_gives_the_same_run_and_another_seed_another(run: MappingDrive):
     again, other = drive(3, "arena", "line", 20), drive(4, "arena", "line", 20)
     assert again.moments[20].pose.mean == run.moments[20].pose.mean
     np.testing.assert_array_equal(again.images[0], run.images[0])
     assert other.world_from_anchor != run.world_from_anchor
 
 
-def test_true_points_are_on_the_surfaces_of_the_picture(run: MappingDrive) -> None:
+def test_true_points_are_on_the_surfaces_of_the_picture(run: MappingDrive):
     """A true point, seen from the end of the way, shows what the anchor showed around it: the truth moves
     with the picture as the robot does, independent of trackers and filters.
     """
@@ -123,7 +118,7 @@ def test_true_points_are_on_the_surfaces_of_the_picture(run: MappingDrive) -> No
     assert np.median(likeness) > 0.9
 
 
-def test_rays_agree_with_another_solution() -> None:
+def test_rays_agree_with_another_solution():
     """Against a solution of one system a panel and ray."""
     world = make_world("office", 5)
     surfaces, camera = Surfaces(world), WEBCAM
@@ -152,7 +147,7 @@ def _meets(panel: Panel, eye: np.ndarray, ray: np.ndarray) -> float | None:
     return float(depth) if 0 <= p <= 1 and 0 <= q <= 1 and depth > 0.03 else None
 
 
-def test_a_patch_across_an_edge_is_no_point() -> None:
+def test_a_patch_across_an_edge_is_no_point():
     """A box before a wall: its middle is one surface, its edge is two."""
     world = make_world("arena", 0, boxes=1)
     box = world.plan.furniture[0]
@@ -163,7 +158,7 @@ def test_a_patch_across_an_edge_is_no_point() -> None:
     assert Surfaces(world).flat(face, WEBCAM, pixels).tolist() == [True, False, False]
 
 
-def test_the_score_of_a_known_error_is_that_error() -> None:
+def test_the_score_of_a_known_error_is_that_error():
     """A robot that is 3 cm and 2 deg off, with landmarks whose errors are drawn from the covariance."""
     rng = np.random.default_rng(1)
     robot = RobotSetup("r0").describe()

@@ -1,7 +1,6 @@
 """The merge benchmark: its fleets keep their word, and its scores and split graphs against what is known."""
 
 import math
-from pathlib import Path
 
 import gtsam
 import numpy as np
@@ -20,7 +19,7 @@ SMALL = FleetSettings(robots=3, nodes=25, side=7.0, true_links=15)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5, 0.8])
-def test_links_are_true_and_false_as_requested(share: float) -> None:
+def test_links_are_true_and_false_as_requested(share: float):
     fleet = draw_fleet(share, np.random.default_rng(3), SMALL)
     assert 1.0 - len(fleet.true) / len(fleet.links) == pytest.approx(share, abs=0.02)
     assert len({link.pair for link in fleet.links}) == len(fleet.links)
@@ -29,14 +28,14 @@ def test_links_are_true_and_false_as_requested(share: float) -> None:
         assert (link.a_from_b.mean.distance(true) < 0.2) == (link.pair in fleet.true)
 
 
-def test_a_robot_that_is_left_apart_counts() -> None:
+def test_a_robot_that_is_left_apart_counts():
     fleet = draw_fleet(0.0, np.random.default_rng(4), SMALL)
     apart = merge_maps(fleet.maps, [])
     assert len(apart.components) == 3
     assert error(apart, fleet.truth) > 5.0 * error(oracle(fleet), fleet.truth)
 
 
-def test_a_split_graph_has_the_cost_of_the_whole() -> None:
+def test_a_split_graph_has_the_cost_of_the_whole():
     rng = np.random.default_rng(5)
     true = [Pose2(3.0 * math.cos(0.4 * k), 3.0 * math.sin(0.4 * k), 0.4 * k) for k in range(40)]
     sigmas = np.array([0.05, 0.05, 0.02])
@@ -55,7 +54,7 @@ def test_a_split_graph_has_the_cost_of_the_whole() -> None:
     assert chi2_of(factors_of(graph), merge_maps(maps, []), nodes) is None
 
 
-def test_in_space_the_links_that_close_loops_are_kept(tmp_path: Path) -> None:
+def test_in_space_the_links_that_close_loops_are_kept(tmp_path):
     """Two robots on random ways in space; links that were planted false are left out."""
     rng = np.random.default_rng(6)
     poses = {}

@@ -12,7 +12,7 @@ from mapweave.merge.pose_graph.verification import verify
 from synthetic.building import Building
 
 
-def test_links_that_are_drawn_are_those_that_would_be_found() -> None:
+def test_links_that_are_drawn_are_those_that_would_be_found():
     """Verification confirms most pairs that are specified to show the same, with their relative poses."""
     building = Building.draw(3, 24, 5)
     result = np.ones(building.rooms.shape, np.bool_)
@@ -28,7 +28,7 @@ def test_links_that_are_drawn_are_those_that_would_be_found() -> None:
 
 
 @pytest.mark.slow
-def test_a_small_fleet_becomes_one_map() -> None:
+def test_a_small_fleet_becomes_one_map():
     figures = at_size(200, 0, Progress(disable=True), measured=6)
     assert figures["false_links"] == 0.0 and figures["links"] > 50.0
     assert figures["components"] == 1.0 and figures["error_m_median"] < 0.5

@@ -18,7 +18,7 @@ from mapweave.hybridmap.pose import Pose2
 RUN = MergeRun("office", 3, 60, 3, 1, 0.02, 9, 0, 0, 0.7, 150.0, 90.0)
 
 
-def test_maps_that_are_joined_wrongly_are_counted() -> None:
+def test_maps_that_are_joined_wrongly_are_counted():
     rng = np.random.default_rng(2)
     truth = {
         NodeId(agent, 1, k): Pose2.from_vector(rng.uniform([0, 0, -3], [9, 9, 3]))
@@ -38,7 +38,7 @@ def test_maps_that_are_joined_wrongly_are_counted() -> None:
     assert false_merges(close, truth) == 0
 
 
-def test_a_failed_or_killed_run_is_reported() -> None:
+def test_a_failed_or_killed_run_is_reported():
     text = json.dumps(asdict(RUN))
     assert outcome("office", 3, 0, f"noise\n{text}\n", "") == RUN
     for status, out, words, reason in (
@@ -60,7 +60,7 @@ def test_a_failed_or_killed_run_is_reported() -> None:
 
 
 @pytest.mark.slow
-def test_runs_are_processes_and_all_are_accounted_for(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_runs_are_processes_and_all_are_accounted_for(monkeypatch):
     """A scenario that cannot be built beside one that there is not: each is one line, nothing hangs."""
     wrong = {
         "none": ("no-such-scenario",),
@@ -73,7 +73,7 @@ def test_runs_are_processes_and_all_are_accounted_for(monkeypatch: pytest.Monkey
     assert isinstance(results[1], Failure) and "twins: length must be a number, 2.5 to" in results[1].reason
 
 
-def test_median_and_sums_over_runs() -> None:
+def test_median_and_sums_over_runs():
     other = MergeRun("office", 4, 60, 3, 2, 0.04, 5, 1, 1, None, 150.0, 80.0)
     values = figures([RUN, other])
     assert values["merged_ate_m_median"] == pytest.approx(0.03)

@@ -1,7 +1,5 @@
 """The navigation benchmark: shortest ways against geometry, starts and goals keep their word, figures."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -49,7 +47,7 @@ def mapped() -> Mapped:
     return Mapped(contents, {node.id: pose for node, pose in zip(nodes, truth, strict=True)})
 
 
-def test_the_shortest_way_leads_around_the_corner(floor: FreeFloor) -> None:
+def test_the_shortest_way_leads_around_the_corner(floor: FreeFloor):
     """Against the taut string around the wall's two corners, at the robot's radius."""
     start, goal = Pose2(1.5, 1.0), Pose2(4.5, 1.0)
     corners = np.array([[2.9, 3.0], [3.1, 3.0]])
@@ -68,7 +66,7 @@ def test_the_shortest_way_leads_around_the_corner(floor: FreeFloor) -> None:
     assert expected - 0.06 <= route <= 1.03 * expected + 0.06
 
 
-def test_free_ways_are_about_straight_and_symmetric(floor: FreeFloor) -> None:
+def test_free_ways_are_about_straight_and_symmetric(floor: FreeFloor):
     rng = np.random.default_rng(0)
     for _ in range(20):
         a, b = (Pose2(*rng.uniform((0.3, 0.3), (2.6, 3.7))) for _ in range(2))
@@ -77,14 +75,14 @@ def test_free_ways_are_about_straight_and_symmetric(floor: FreeFloor) -> None:
         assert a.distance(b) - 1e-9 <= there <= 1.03 * a.distance(b) + 0.08
 
 
-def test_no_way_leads_into_a_wall_or_outside(floor: FreeFloor) -> None:
+def test_no_way_leads_into_a_wall_or_outside(floor: FreeFloor):
     assert math.isinf(floor.ways_from(Pose2(1.0, 1.0)).to(Pose2(8.0, 1.0)))
     assert math.isinf(floor.ways_from(Pose2(-3.0, 1.0)).to(Pose2(1.0, 1.0)))
     closed = BuildingPlan(PLAN.rooms, (Rectangle.spanning(2.9, 0.0, 3.1, 4.0),))
     assert math.isinf(FreeFloor.of(closed, RADIUS).ways_from(Pose2(1.0, 1.0)).to(Pose2(5.0, 1.0)))
 
 
-def test_plots_are_valid_pictures(mapped: Mapped, floor: FreeFloor) -> None:
+def test_plots_are_valid_pictures(mapped: Mapped, floor: FreeFloor):
     starts = set()
     for seed in range(20):
         plot = draw_plot(mapped, PLAN, floor, np.random.default_rng(seed))
@@ -102,7 +100,7 @@ def test_plots_are_valid_pictures(mapped: Mapped, floor: FreeFloor) -> None:
     assert len(starts) == 20, "another seed is another start"
 
 
-def test_a_map_that_is_too_small_is_refused(mapped: Mapped, floor: FreeFloor) -> None:
+def test_a_map_that_is_too_small_is_refused(mapped: Mapped, floor: FreeFloor):
     few = sorted(mapped.truth)[:LEAST_EDGES]
     small = Mapped(mapped.nodes, {node: mapped.truth[node] for node in few})
     for too_small in (small, Mapped(HybridMap(), {})):
@@ -121,7 +119,7 @@ def outcome(mapped: Mapped, **other: object) -> NavigationOutcome:
     return replace(one, **other)  # type: ignore[arg-type]
 
 
-def test_figures_count_failures_as_such(mapped: Mapped) -> None:
+def test_figures_count_failures_as_such(mapped: Mapped):
     away = Status("driving along the route", "", 10, 0, Pose2(), False, tally=DriveStatistics(1, 0, 1, 3))
     outcomes = [
         outcome(mapped),
@@ -138,7 +136,7 @@ def test_figures_count_failures_as_such(mapped: Mapped) -> None:
     assert failed["success"] == 0.0 and failed["goal_error_m_median"] is None
 
 
-def test_a_drive_fails_for_each_reason(mapped: Mapped) -> None:
+def test_a_drive_fails_for_each_reason(mapped: Mapped):
     there, away = outcome(mapped).status, Status("looking around", "dark", 1, 0, Pose2(), False)
     assert _reason(there, 0.01, 1.0, 0) == ""
     assert "touched" in _reason(there, 0.01, 1.0, 1)
@@ -189,7 +187,7 @@ class FakeOffice:
 
 
 @pytest.mark.parametrize("arrives", [True, False])
-def test_a_drive_is_timed_measured_and_ended(arrives: bool) -> None:
+def test_a_drive_is_timed_measured_and_ended(arrives: bool):
     office = FakeOffice(arrives)
     plot = Plot(Pose2(1.0, 0.0), NodeId("r0", 1, 9), Pose2(3.01, 0.0, 0.02), 5, 1.6)
     one = drive(office, plot, lambda now, doing: None)  # type: ignore[arg-type]

@@ -1,7 +1,5 @@
 """Processor time of a process whose threads end, by its own clock; memory that is taken and given back."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -32,7 +30,7 @@ sys.stdin.readline()
 
 
 @pytest.mark.slow
-def test_threads_that_have_ended_still_count_where_they_belong() -> None:
+def test_threads_that_have_ended_still_count_where_they_belong():
     with subprocess.Popen(
         [sys.executable, "-c", BURN], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True
     ) as process:
@@ -51,7 +49,7 @@ def test_threads_that_have_ended_still_count_where_they_belong() -> None:
         print(file=process.stdin, flush=True)
 
 
-def test_memory_is_counted_in_millions_of_bytes() -> None:
+def test_memory_is_counted_in_millions_of_bytes():
     before, resident = held_bytes(), resident_mb(os.getpid())
     block = np.ones(100_000_000, np.uint8)
     assert held_bytes() - before == pytest.approx(1e8, rel=0.05)

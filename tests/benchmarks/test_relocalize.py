@@ -3,7 +3,6 @@
 import math
 import time
 from collections import Counter
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -44,7 +43,7 @@ def nodes_of(seed: int, count: int) -> list[Node]:
     return take_map(room(0, 0, 5, 4, 400, rng), MapId("a", 1), tour, rng)[0]
 
 
-def test_the_quick_count_of_the_ceiling_never_leaves_out_a_match(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_quick_count_of_the_ceiling_never_leaves_out_a_match(monkeypatch):
     rng = np.random.default_rng(1)
     own = rng.integers(0, 255, (60, 128))
     places = []
@@ -62,7 +61,7 @@ def test_the_quick_count_of_the_ceiling_never_leaves_out_a_match(monkeypatch: py
     assert (counts >= matches).all()
 
 
-def test_the_bag_of_words_is_tf_idf_and_cosine() -> None:
+def test_the_bag_of_words_is_tf_idf_and_cosine():
     nodes = nodes_of(2, 8)
     vocabulary = Vocabulary(np.concatenate([decode(node.landmarks.codes) for node in nodes]), 3)
     bags = [Counter(vocabulary.words(decode(node.landmarks.codes)).tolist()) for node in nodes]
@@ -83,7 +82,7 @@ def test_the_bag_of_words_is_tf_idf_and_cosine() -> None:
     assert [score for _, score in nearest] == pytest.approx([score for _, score in best])
 
 
-def test_distractors_are_halves_of_real_nodes_and_always_the_same() -> None:
+def test_distractors_are_halves_of_real_nodes_and_always_the_same():
     rng = np.random.default_rng(5)
     donors = [
         TruePlace(node, Pose2(), 0, rng.integers(0, 256, (len(node.landmarks), 128)).astype(np.uint8))
@@ -105,7 +104,7 @@ def test_distractors_are_halves_of_real_nodes_and_always_the_same() -> None:
     assert 1 <= len(set(owners)) <= 2
 
 
-def test_the_loss_of_the_index_is_measured_on_the_same_views() -> None:
+def test_the_loss_of_the_index_is_measured_on_the_same_views():
     picture = picture_of(np.zeros((0, 128), np.uint8))
     query = Query("near", picture, 0)
 
@@ -124,7 +123,7 @@ def test_the_loss_of_the_index_is_measured_on_the_same_views() -> None:
     assert len(asked_of([query] * 200, 1000)) == 200 and 20 < len(asked) < 100
 
 
-def test_pictures_are_taken_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pictures_are_taken_once(tmp_path, monkeypatch):
     monkeypatch.setattr(relocalize_pictures, "FOLDER", tmp_path)
     world = make_world("arena", 3)
     wishes = [Wish(Pose2(2.0, 2.0, heading)) for heading in (0.0, 1.0)]
@@ -144,7 +143,7 @@ def test_pictures_are_taken_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     assert np.array_equal(first[1].sift, third[1].sift)
 
 
-def test_a_person_hides_about_a_third() -> None:
+def test_a_person_hides_about_a_third():
     world = make_world("arena", 3)
     shares = []
     artist = Photographer(world, (1,))
@@ -155,7 +154,7 @@ def test_a_person_hides_about_a_third() -> None:
     assert 0.2 < np.mean(shares) < 0.4
 
 
-def test_twins_are_visited_in_the_same_way() -> None:
+def test_twins_are_visited_in_the_same_way():
     world = make_world("twins", 5)
     east = world.plan.room("room 1").x - world.plan.room("room 0").x
     poses = twin_lookouts(world, 12, np.random.default_rng(6))
@@ -164,14 +163,14 @@ def test_twins_are_visited_in_the_same_way() -> None:
         assert abs(a.heading - b.heading) < 0.25
 
 
-def test_places_far_from_each_other() -> None:
+def test_places_far_from_each_other():
     grid = np.stack(np.meshgrid(np.arange(10.0), np.arange(10.0)), axis=-1).reshape(-1, 2)
     chosen = spread_out(grid, 5, np.random.default_rng(8))
     apart = np.linalg.norm(chosen[:, None] - chosen[None], axis=2) + 99 * np.eye(5)
     assert apart.min() > 4.0
 
 
-def test_far_is_exactly_half_a_metre_and_twenty_degrees() -> None:
+def test_far_is_exactly_half_a_metre_and_twenty_degrees():
     world, rng = make_world("arena", 3), np.random.default_rng(9)
     place = Pose2(2.0, 2.0, 0.5)
     spots = [spot for _ in range(30) if (spot := beside(place, world, True, rng)) is not None]
@@ -181,7 +180,7 @@ def test_far_is_exactly_half_a_metre_and_twenty_degrees() -> None:
         assert abs(math.degrees((place.inverse() @ spot).heading)) == pytest.approx(20.0)
 
 
-def test_answers_are_judged_by_the_truth() -> None:
+def test_answers_are_judged_by_the_truth():
     node = nodes_of(10, 1)[0]
     place = TruePlace(node, Pose2(1.0, 2.0, 0.3), 0, np.zeros((0, 128), np.uint8))
     truth = {node.id: place}
@@ -206,7 +205,7 @@ def test_answers_are_judged_by_the_truth() -> None:
 
 
 @pytest.mark.slow
-def test_the_fit_finds_the_weights_that_made_the_data() -> None:
+def test_the_fit_finds_the_weights_that_made_the_data():
     rng = np.random.default_rng(11)
     weights = np.array([-2.0, 1.2, 1.0, 1.5, 0.4, -2.5])
     supports = [
@@ -225,7 +224,7 @@ def test_the_fit_finds_the_weights_that_made_the_data() -> None:
             assert row["right"] == pytest.approx(row["predicted"], abs=0.05)
 
 
-def test_the_benchmarks_own_work_is_not_timed() -> None:
+def test_the_benchmarks_own_work_is_not_timed():
     sift = np.zeros((0, 128), np.uint8)
     picture = RenderedPicture(Pose2(), CAMERA, np.zeros((0, 2), np.float32), sift, np.zeros(0, np.float32))
     making = np.zeros(2)

@@ -1,7 +1,5 @@
 """The store of a large fleet, by what a server reads out of it."""
 
-from pathlib import Path
-
 import networkx as nx
 import numpy as np
 import pytest
@@ -18,7 +16,7 @@ from synthetic.world import room, take_map
 
 
 @pytest.mark.slow
-def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path: Path) -> None:
+def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path):
     rng = np.random.default_rng(5)
     tour = [Pose2(2.5, 2.0, 0.7 * k) for k in range(6)]
     nodes = take_map(room(0, 0, 5, 4, 400, rng), MapId("m0", 1), tour, rng)[0]

@@ -1,7 +1,5 @@
 """With each rule of the table switched off everything still runs: what takes its place fits."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import cache
 
@@ -50,7 +48,7 @@ def logs() -> list[tuple[MapId, ChangeBody]]:
 
 
 @pytest.mark.parametrize("rule", first_quick([*TRIAL_RULES, *PLACE_RULES], 3))
-def test_fleets_are_merged_and_answered_without_a_rule(rule: str, caplog: pytest.LogCaptureFixture) -> None:
+def test_fleets_are_merged_and_answered_without_a_rule(rule: str, caplog):
     """None of these rules is on how nodes are compared, so each pair of them is compared once."""
     switches: tuple[Switch, ...] = {**TRIAL_RULES, **PLACE_RULES}[rule]
     merger = Merger()
@@ -66,12 +64,12 @@ def test_fleets_are_merged_and_answered_without_a_rule(rule: str, caplog: pytest
     assert "the merge fails" not in caplog.text
 
 
-def test_one_link_joins_two_maps_only_if_it_is_strong() -> None:
+def test_one_link_joins_two_maps_only_if_it_is_strong():
     found = by_rule(SINGLE_RULES, lambda: single_links(seed=4, count=30))
     assert found["one strong link"]["joined_alone"] < found[ALL]["joined_alone"] < found[ALL]["fleets"] == 30
 
 
-def test_own_loop_closures_are_drawn_as_they_are_called() -> None:
+def test_own_loop_closures_are_drawn_as_they_are_called():
     fleet, own, true = draw(seed=3, run=0, share=50, resumed=3)
     ways = [edge for edge in own.edges.values() if edge.kind is EdgeKind.MAPPED]
     assert len(own.nodes) - len(ways) == 4
@@ -81,7 +79,7 @@ def test_own_loop_closures_are_drawn_as_they_are_called() -> None:
         assert right == (np.hypot(off.x, off.y) < 0.2)
 
 
-def test_a_robot_sends_no_loop_closure_to_where_it_was_not() -> None:
+def test_a_robot_sends_no_loop_closure_to_where_it_was_not():
     """Nor one that is measured 10 m further on than its own poses say."""
     _, own, true = draw(seed=3, run=0, share=50, resumed=3)
     loops = [edge for edge in own.edges.values() if edge.kind is EdgeKind.LOOP]
@@ -92,7 +90,7 @@ def test_a_robot_sends_no_loop_closure_to_where_it_was_not() -> None:
         assert not would_send(own, replace(edge, a_from_b=further))
 
 
-def test_without_a_rule_on_own_loop_closures_more_is_wrong() -> None:
+def test_without_a_rule_on_own_loop_closures_more_is_wrong():
     found = by_rule(LOOP_RULES, lambda: own_loops(seed=4, count=1))
     assert found["own loops that agree"]["whole"]["50"]["false_loops"] > 0
     assert found[ALL]["whole"]["50"]["false_loops"] == 0
@@ -100,7 +98,7 @@ def test_without_a_rule_on_own_loop_closures_more_is_wrong() -> None:
     assert kept["drives against loops"] < kept[ALL] <= found[ALL]["whole"]["20"]["of_true"]
 
 
-def test_without_a_rule_of_recognition_what_it_is_against_is_linked() -> None:
+def test_without_a_rule_of_recognition_what_it_is_against_is_linked():
     found = by_rule(RECOGNITION_RULES, lambda: look_alikes(seed=4, count=12))
     assert found[ALL]["larger copy"]["wrong"] == 0 < found["depths"]["larger copy"]["wrong"]
     assert found[ALL]["picture"]["wrong"] < found["image cells"]["picture"]["wrong"]
@@ -117,14 +115,14 @@ def drive() -> tuple[RobotDescription, Drive]:
     return recorded(5, seconds=12.0)
 
 
-def test_a_drive_without_faults_is_mapped_well(drive: tuple[RobotDescription, Drive]) -> None:
+def test_a_drive_without_faults_is_mapped_well(drive: tuple[RobotDescription, Drive]):
     found = mapped(*drive)
     assert found["edges"] > 0 and found["wrong_edges"] == 0 and found["used"] > 0.9 * found["ticks"]
     assert found["error_m"] < 0.05
 
 
 @pytest.mark.parametrize("rule", first_quick(FRAME_RULES, 1))
-def test_a_drive_is_mapped_without_a_rule_on_frames(rule: str, drive: tuple[RobotDescription, Drive]) -> None:
+def test_a_drive_is_mapped_without_a_rule_on_frames(rule: str, drive: tuple[RobotDescription, Drive]):
     """Without faults it is as good as with it."""
     with switched_off(FRAME_RULES[rule]):
         found = mapped(drive[0], drive[1][:60])
@@ -132,9 +130,7 @@ def test_a_drive_is_mapped_without_a_rule_on_frames(rule: str, drive: tuple[Robo
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_spoils_images_or_wheels_and_nothing_else(
-    fault: str, drive: tuple[RobotDescription, Drive]
-) -> None:
+def test_a_fault_spoils_images_or_wheels_and_nothing_else(fault: str, drive: tuple[RobotDescription, Drive]):
     spoiled = FAULTS[fault](drive[1], np.random.default_rng(0))
     stamps = [one.observation.stamp_ns for one in spoiled]
     assert len(set(stamps)) == len(stamps) and stamps == sorted(stamps)

@@ -1,9 +1,6 @@
 """The plan for many robots: its constants measured again, and its sums by another way."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -29,7 +26,7 @@ def results() -> dict[str, StoredResult]:
     return {name: load(name) for name in MEASUREMENTS}
 
 
-def test_bytes_are_those_of_today(tmp_path: Path) -> None:
+def test_bytes_are_those_of_today(tmp_path):
     node = NodeId("r0", 3, 17)
     doing = Status(
         "driving to the goal", "3 nodes to go", 17, 40, Pose2(1.25, -2.0, 0.5), False, "goto", node,
@@ -59,7 +56,7 @@ def test_bytes_are_those_of_today(tmp_path: Path) -> None:
     assert len(encode_view(tour.view)) == pytest.approx(scale.QUESTION_BYTES, rel=0.1)
 
 
-def test_the_sums_are_those_of_simulated_minutes(results: dict[str, StoredResult]) -> None:
+def test_the_sums_are_those_of_simulated_minutes(results: dict[str, StoredResult]):
     """One robot after the other, minute by minute, instead of by rates."""
     costs = costs_of(results)
     plan = site(costs)
@@ -79,7 +76,7 @@ def test_the_sums_are_those_of_simulated_minutes(results: dict[str, StoredResult
     assert plan["memory"] > plan["nodes"] * costs["kept_bytes"] > 0
 
 
-def test_a_server_carries_the_largest_fleet_that_is_in_time(results: dict[str, StoredResult]) -> None:
+def test_a_server_carries_the_largest_fleet_that_is_in_time(results: dict[str, StoredResult]):
     row = {"server_cpu": 0.5, "router_cpu": 0.1, "ack_p99_ms": 90.0}
     figures = {
         "agents": {"50": row, "1000": {**row, "ack_p99_ms": 400.0}, "2000": {**row, "ack_p99_ms": 9e3}}

@@ -1,7 +1,5 @@
 """The benchmark of shards: its figures by hand, and a small run with a real cluster and a killed shard."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -33,7 +31,7 @@ from mapweave.mapserver.log.opening import open_store
 WITHOUT = "needs the extra `postgres` and Debian's package postgresql"
 
 
-def test_recovery_by_hand() -> None:
+def test_recovery_by_hand():
     times = [1.0, 2.0, 2.1, 4.5, *(4.6 + 0.1 * k for k in range(IN_A_ROW))]
     tally = AnswerLog([(at, at not in (2.0, 2.1)) for at in times])
     assert tally.recovery(1.5) == pytest.approx(3.0)
@@ -41,13 +39,13 @@ def test_recovery_by_hand() -> None:
 
 
 @pytest.mark.parametrize("kind", ["primary", "front"])
-def test_a_file_has_no_second_server_and_no_primary(kind: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_has_no_second_server_and_no_primary(kind: str, capsys):
     with pytest.raises(SystemExit):
         main(["--store", "sqlite", "--kills", "shard", kind])
     assert "with --store postgresql alone" in capsys.readouterr().err
 
 
-def test_what_is_not_killed_is_said_with_the_reason() -> None:
+def test_what_is_not_killed_is_said_with_the_reason():
     assert not_killed([*KILLS, *SHARED_KILLS], "postgresql") == {}
     assert not_killed(["worker", "primary"], "postgresql") == dict.fromkeys(
         ("shard", "gateway", "server", "head", "front"), "not in --kills"
@@ -57,7 +55,7 @@ def test_what_is_not_killed_is_said_with_the_reason() -> None:
     assert all("a store in a file has one server and no primary" in why for why in for_want.values())
 
 
-def test_maps_of_two_servers_are_as_good_as_the_worse(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_maps_of_two_servers_are_as_good_as_the_worse(monkeypatch):
     rows = iter([
         {"links": 30, "same_links": True, "max_pose_difference_m": 0.0},
         {"links": 29, "same_links": False, "max_pose_difference_m": 0.25},
@@ -78,9 +76,7 @@ def test_maps_of_two_servers_are_as_good_as_the_worse(monkeypatch: pytest.Monkey
         ({"max_pose_difference_m": float("inf")}, False),
     ],
 )
-def test_it_is_good_if_nothing_is_lost_wrong_or_linked_otherwise(
-    change: dict[str, object], is_good: bool
-) -> None:
+def test_it_is_good_if_nothing_is_lost_wrong_or_linked_otherwise(change: dict[str, object], is_good: bool):
     row = {"lost": 0, "wrong": 0, "same_links": True, "max_pose_difference_m": 0.0}
     rows = {"without": {"lost": 0, "wrong": 0}, "2 shards": row, "killed": {**row, **change}}
     report = summary(rows)
@@ -91,7 +87,7 @@ def test_it_is_good_if_nothing_is_lost_wrong_or_linked_otherwise(
     )
 
 
-def test_robots_that_stay_unacknowledged_are_named() -> None:
+def test_robots_that_stay_unacknowledged_are_named():
     robots: Any = [
         SimpleNamespace(agent=name, acknowledged=lambda s, n=name: n == "r0") for name in ("r0", "r1")
     ]
@@ -99,7 +95,7 @@ def test_robots_that_stay_unacknowledged_are_named() -> None:
 
 
 @pytest.mark.slow
-def test_a_lost_primary_has_a_standby_with_all_that_was_stored(tmp_path: Path) -> None:
+def test_a_lost_primary_has_a_standby_with_all_that_was_stored(tmp_path):
     """The address names both machines: the standby is found by it."""
     if not can_be_shared():
         pytest.skip(WITHOUT)
@@ -119,7 +115,7 @@ def test_a_lost_primary_has_a_standby_with_all_that_was_stored(tmp_path: Path) -
 @pytest.mark.slow
 @pytest.mark.skipif(find_spec("ray") is None, reason="needs the extra cluster: Ray")
 @pytest.mark.parametrize(("store", "kind"), [("sqlite", "shard"), ("postgresql", "primary")])
-def test_a_small_run(store: str, kind: str) -> None:
+def test_a_small_run(store: str, kind: str):
     if store == "postgresql" and not can_be_shared():
         pytest.skip(WITHOUT)
     sizes = "--shards 2 --robots 4 --nodes 12 --seconds 1 --ray-nodes 2"

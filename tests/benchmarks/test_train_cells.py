@@ -1,7 +1,5 @@
 """The learning of cells, on descriptors that are drawn."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -18,7 +16,7 @@ def codes_of(count: int, seed: int) -> benchmark.Codes:
     return quantise(centres[rng.integers(0, 16, count)] + rng.normal(0, 0.03, (count, 32)))
 
 
-def test_the_same_examples_make_the_same_cells_and_these_fit_other_examples() -> None:
+def test_the_same_examples_make_the_same_cells_and_these_fit_other_examples():
     cells, again = (benchmark.learned(codes_of(4000, 2), 4) for _ in range(2))
     assert np.array_equal(cells.heads, again.heads) and np.array_equal(cells.centres, again.centres)
     assert benchmark.imbalance(cells, codes_of(2000, 3)) < 2.5
@@ -26,7 +24,7 @@ def test_the_same_examples_make_the_same_cells_and_these_fit_other_examples() ->
     assert benchmark.imbalance(cells, np.repeat(codes_of(1, 4), 50, axis=0)) == pytest.approx(16)
 
 
-def test_what_is_stored_is_what_is_read(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_what_is_stored_is_what_is_read(monkeypatch, tmp_path):
     shipped = {len(cells.heads): cells for cells in coarse_quantizers()}
     monkeypatch.setattr(benchmark.retrieval, "__path__", [str(tmp_path)])
     path = benchmark.store(shipped)

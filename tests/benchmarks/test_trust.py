@@ -82,7 +82,7 @@ def off(a: Pose2, b: Pose2) -> tuple[float, float]:
     return math.dist((a.x, a.y), (b.x, b.y)), abs(math.remainder(a.heading - b.heading, math.tau))
 
 
-def test_without_a_lie_the_answers_are_the_truth(asked: Asked) -> None:
+def test_without_a_lie_the_answers_are_the_truth(asked: Asked):
     where, way = asked.where(), asked.way()
     assert where.certainty is Certainty.FOUND
     assert max(off(asked.stated(where), ROBOT)) < AGREE
@@ -97,14 +97,12 @@ def test_without_a_lie_the_answers_are_the_truth(asked: Asked) -> None:
         ("right place, 90 degrees off", 0.0, math.pi / 2),
     ],
 )
-def test_whereabouts_are_as_wrong_as_the_lie_says(
-    asked: Asked, lie: str, distance: float, angle: float
-) -> None:
+def test_whereabouts_are_as_wrong_as_the_lie_says(asked: Asked, lie: str, distance: float, angle: float):
     asked.server.lie = LIES[lie]()
     assert off(asked.stated(asked.where()), ROBOT) == pytest.approx((distance, angle), abs=AGREE)
 
 
-def test_places_that_are_wrong_are_elsewhere_and_nodes_that_no_map_has_are_in_none(asked: Asked) -> None:
+def test_places_that_are_wrong_are_elsewhere_and_nodes_that_no_map_has_are_in_none(asked: Asked):
     asked.server.lie = LIES["wrong place"]()
     assert any(off(asked.stated(asked.where()), ROBOT)[0] > 0.3 for _ in range(10))
     for lie in ("another floor", "the view itself as a node"):
@@ -113,7 +111,7 @@ def test_places_that_are_wrong_are_elsewhere_and_nodes_that_no_map_has_are_in_no
     assert asked.way().legs[0].node.id not in asked.true
 
 
-def test_routes_lead_where_the_lie_says(asked: Asked) -> None:
+def test_routes_lead_where_the_lie_says(asked: Asked):
     honest = asked.way()
     asked.server.lie = LIES["route through walls"]()
     straight = asked.way()
@@ -134,7 +132,7 @@ def test_routes_lead_where_the_lie_says(asked: Asked) -> None:
     assert ends[-1] == asked.nodes[-1] and not set(ends[1:-1]) & set(asked.nodes)
 
 
-def test_what_is_no_answer_is_none(asked: Asked) -> None:
+def test_what_is_no_answer_is_none(asked: Asked):
     asked.server.lie = LIES["silence"]()
     view = encode_view(asked.view)
     assert asked.raw(KEYS.relocalize("s0"), view) is None
@@ -150,7 +148,7 @@ def test_what_is_no_answer_is_none(asked: Asked) -> None:
 
 @pytest.mark.slow
 @pytest.mark.timeout(300)
-def test_a_drive_is_judged_by_where_the_robot_was(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_is_judged_by_where_the_robot_was(monkeypatch):
     """Way and arrival against the poses that the simulator gave, tick by tick."""
     from benchmarks.trust import benchmark
     from benchmarks.trust.building import mapped_office

@@ -1,7 +1,5 @@
 """Every benchmark says in one line what is wrong with its arguments, before it computes anything."""
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path
@@ -42,14 +40,7 @@ WRONG = [
 
 
 @pytest.mark.parametrize(("name", "wrong", "words"), WRONG, ids=lambda case: case if "-" in case else None)
-def test_errors_are_reported_in_one_line(
-    name: str,
-    wrong: str,
-    words: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-    tmp_path: Path,
-) -> None:
+def test_errors_are_reported_in_one_line(name: str, wrong: str, words: str, monkeypatch, capsys, tmp_path):
     file = tmp_path / "file"
     file.write_text("not a folder")
     module = importlib.import_module(f"benchmarks.{name}.benchmark")
@@ -66,11 +57,11 @@ def test_errors_are_reported_in_one_line(
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_python_starts_it_by_the_name_of_its_folder(name: str) -> None:
+def test_python_starts_it_by_the_name_of_its_folder(name: str):
     """`python -m benchmarks.NAME` runs the package's `__main__`."""
     started = importlib.import_module(f"benchmarks.{name}.__main__")
     assert started.main is importlib.import_module(f"benchmarks.{name}.benchmark").main
 
 
-def test_the_benchmarks_are_found() -> None:
+def test_the_benchmarks_are_found():
     assert {"parking", "navigate", "servo", "ekf", "relocalize", "merge"} <= set(SEEDED)
