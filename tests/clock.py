@@ -1,7 +1,5 @@
 """Time that passes when a test says so."""
 
-from __future__ import annotations
-
 
 class Clock:
     """A clock that is set, s."""

@@ -1,7 +1,5 @@
 """How long something took, without the time in which other programs of a busy computer had its cores."""
 
-from __future__ import annotations
-
 import subprocess
 import time
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Small disks that only one process and its children see, to be filled: file systems in memory."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """Pairs of nodes that many servers and commands of tests compare are compared once in a process."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager

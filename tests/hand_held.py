@@ -1,7 +1,5 @@
 """Nodes of a hand-held camera: tilted, off their height, of unknown scale."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

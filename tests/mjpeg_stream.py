@@ -1,7 +1,5 @@
 """An MJPEG stream over HTTP, as network cameras and phones give it."""
 
-from __future__ import annotations
-
 import http.server
 import threading
 from collections.abc import Callable

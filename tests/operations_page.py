@@ -1,7 +1,5 @@
 """The commands of docs/operations.md, run as they stand there against a PostgreSQL of a test."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

@@ -4,8 +4,6 @@ Firefox is driven by WebDriver BiDi, which needs no driver beside it, WebKitGTK 
 display of its own. Debian's packages: firefox-esr; webkit2gtk-driver and xvfb.
 """
 
-from __future__ import annotations
-
 import itertools
 import json
 import os

@@ -1,7 +1,5 @@
 """A real Patroni cluster on loopback: etcd and PostgreSQL as docs/operations.md configures them."""
 
-from __future__ import annotations
-
 import json
 import os
 import pwd

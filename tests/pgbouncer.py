@@ -1,7 +1,5 @@
 """A real pgbouncer in front of a PostgreSQL server of tests."""
 
-from __future__ import annotations
-
 import os
 import pwd
 import shutil

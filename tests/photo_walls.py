@@ -1,7 +1,5 @@
 """Photographs on walls, as a camera sees them by exact homographies."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cache
 

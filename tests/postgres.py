@@ -1,7 +1,5 @@
 """A real PostgreSQL server for tests: started in a temporary folder."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil

@@ -1,7 +1,5 @@
 """Which cases of a parametrized test run in `make test`, in `make slow` or in `make scenarios`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any
 

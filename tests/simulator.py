@@ -1,7 +1,5 @@
 """Whether the simulator is installed; tests that need it are skipped where it is not."""
 
-from __future__ import annotations
-
 from importlib.machinery import ModuleSpec
 from importlib.util import find_spec
 

@@ -1,7 +1,5 @@
 """constraints.txt pins what every Python that the project promises can install."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from importlib.metadata import PackageNotFoundError, metadata
@@ -12,7 +10,7 @@ from packaging.specifiers import SpecifierSet
 ROOT = Path(__file__).parents[1]
 
 
-def test_what_is_pinned_installs_on_the_oldest_python() -> None:
+def test_what_is_pinned_installs_on_the_oldest_python():
     """Debian 12 and Raspberry Pi OS have Python 3.11.2: a release for 3.11.5 alone made `make demo` fail."""
     promised = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["requires-python"]
     oldest = f"{promised.removeprefix('>=')}.0"
@@ -29,7 +27,7 @@ def test_what_is_pinned_installs_on_the_oldest_python() -> None:
     assert checked > 10
 
 
-def test_all_files_promise_the_same_python() -> None:
+def test_all_files_promise_the_same_python():
     """README, the package's metadata and `make`; mypy checks for the oldest one."""
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())
     oldest = project["project"]["requires-python"].removeprefix(">=")

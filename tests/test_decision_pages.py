@@ -1,7 +1,5 @@
 """Pages of decisions have one form: context, decision, evidence, consequences."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -15,7 +13,7 @@ LONGEST = 120
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.stem)
-def test_a_decision_has_context_evidence_and_consequences_and_is_listed(page: Path) -> None:
+def test_a_decision_has_context_evidence_and_consequences_and_is_listed(page: Path):
     text = page.read_text(encoding="utf-8")
     assert re.findall(r"^## (.*)$", text, re.MULTILINE) == [
         "Context", "Decision", "Evidence", "Consequences",

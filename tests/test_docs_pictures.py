@@ -1,7 +1,5 @@
 """Pictures of the pages are drawn by the programs that the pages' build runs, and say what the pages say."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 
@@ -17,7 +15,7 @@ from mapweave.vision.calibration.views import BoardDetector
 DOCS = Path(__file__).parents[1] / "docs"
 
 
-def test_every_picture_has_a_program_that_draws_it() -> None:
+def test_every_picture_has_a_program_that_draws_it():
     """The build runs it, or the page says that a person does."""
     drawn = [name for names in (hooks.PICTURES | hooks.BY_HAND).values() for name in names]
     pictures = [path for path in DOCS.rglob("*") if path.suffix in {".png", ".gif", ".svg"}]
@@ -29,14 +27,14 @@ def test_every_picture_has_a_program_that_draws_it() -> None:
         assert f"python -m {program.removesuffix('.py').replace('/', '.')}" in pages
 
 
-def test_the_build_runs_each_of_these_programs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_build_runs_each_of_these_programs(monkeypatch):
     ran = []
     monkeypatch.setattr(hooks.subprocess, "run", lambda command, **_: ran.append(command[-1]))
     hooks.on_pre_build(None)
     assert ran == list(hooks.PICTURES)
 
 
-def test_independent_support_counts_as_its_page_says(tmp_path: Path) -> None:
+def test_independent_support_counts_as_its_page_says(tmp_path):
     # Not by all that collect tests: it imports matplotlib.
     from docs import independent_support
 
@@ -47,14 +45,14 @@ def test_independent_support_counts_as_its_page_says(tmp_path: Path) -> None:
     assert (tmp_path / "drawn.svg").stat().st_size > 10_000
 
 
-def test_the_guidance_that_is_drawn_is_of_a_target_that_is_seen(tmp_path: Path) -> None:
+def test_the_guidance_that_is_drawn_is_of_a_target_that_is_seen(tmp_path):
     assert calibration_picture.main(tmp_path / "drawn.png").startswith("hold the board nearer")
     drawn = cv2.imread(str(tmp_path / "drawn.png"), cv2.IMREAD_GRAYSCALE)
     paper = drawn[:, : drawn.shape[1] - 800]
     assert BoardDetector(CalibrationTarget()).find(paper) is not None, "what is printed can be read"
 
 
-def test_a_picture_that_looks_the_same_stays(tmp_path: Path) -> None:
+def test_a_picture_that_looks_the_same_stays(tmp_path):
     grey = np.full((4, 5, 3), 100, np.uint8)
     kept, drawn = tmp_path / "kept.png", tmp_path / "drawn.png"
     cv2.imwrite(str(drawn), grey + 2)
@@ -78,7 +76,7 @@ class DrawnPage:
         cv2.imwrite(str(path), np.full((4, 5, 3), self.grey, np.uint8))
 
 
-def test_a_picture_of_the_page_is_drawn_when_the_page_shows_something_else(tmp_path: Path) -> None:
+def test_a_picture_of_the_page_is_drawn_when_the_page_shows_something_else(tmp_path):
     """Another browser with other fonts draws the same a little differently: that is no new picture."""
     path = tmp_path / "page.png"
     cv2.imwrite(str(path), np.full((4, 5, 3), 100, np.uint8))
@@ -96,9 +94,7 @@ def test_a_picture_of_the_page_is_drawn_when_the_page_shows_something_else(tmp_p
     assert page_picture.content_of(path)
 
 
-def test_without_a_browser_the_pictures_of_the_page_stay(
-    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_without_a_browser_the_pictures_of_the_page_stay(monkeypatch, capsys):
     monkeypatch.setattr(page_picture, "there_is_none", lambda: True)
     page_picture.main()
     reason = "page.png and edit.png stay as they are: drawing needs chromium and chromedriver\n"
@@ -106,7 +102,7 @@ def test_without_a_browser_the_pictures_of_the_page_stay(
 
 
 @pytest.mark.parametrize("reached", [True, False])
-def test_the_demo_gives_its_picture_if_the_lost_robot_arrived(reached: bool, tmp_path: Path) -> None:
+def test_the_demo_gives_its_picture_if_the_lost_robot_arrived(reached: bool, tmp_path):
     (tmp_path / "report.json").write_text(json.dumps({"goal": {"reached": reached}}))
     (tmp_path / "map.png").write_bytes(b"new")
     (tmp_path / "kept.png").write_bytes(b"old")

@@ -1,7 +1,5 @@
 """Every block of Python of the pages runs, those of a page one after the other, with a fleet behind."""
 
-from __future__ import annotations
-
 import math
 import re
 import threading
@@ -56,7 +54,7 @@ def with_endpoint(endpoint: str) -> dict[str, str]:
     return {ENDPOINT: endpoint, "mapweave.Fleet(": f'mapweave.Fleet("{endpoint}", '}
 
 
-def test_no_page_has_python_that_is_not_run() -> None:
+def test_no_page_has_python_that_is_not_run():
     root = DOCS.parent
     files = [*DOCS.rglob("*.md"), *root.glob("*.md")]
     pages = {str(page.relative_to(root)) for page in files if BLOCK.search(page.read_text())}
@@ -145,9 +143,7 @@ def write_files(
 
 
 @needs_simulator
-def test_the_blocks_of_the_readme_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_blocks_of_the_readme_run(tmp_path, monkeypatch, capsys):
     changes = together()
     write_files(changes, tmp_path, monkeypatch)
     with fleet_with(changes, tmp_path) as endpoint:
@@ -156,11 +152,7 @@ def test_the_blocks_of_the_readme_run(
     assert simulated.startswith("(240, 320) Odometry(") and len(library) > 3
 
 
-def test_every_block_of_the_page_of_python_runs(
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_every_block_of_the_page_of_python_runs(tmp_path, monkeypatch, capsys):
     changes = together()
     write_files(changes, tmp_path, monkeypatch)
     with fleet_with(changes, tmp_path) as endpoint:
@@ -173,9 +165,7 @@ def test_every_block_of_the_page_of_python_runs(
         assert Path(made).stat().st_size > 0, made
 
 
-def test_the_blocks_of_the_page_of_commands_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_blocks_of_the_page_of_commands_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with fleet_with(together(), tmp_path) as endpoint:
         run_blocks("command.md", {}, with_endpoint(endpoint))
@@ -183,9 +173,7 @@ def test_the_blocks_of_the_page_of_commands_run(
     assert len(mapweave.open("office.mapweave").nodes) == 2 * STOPS
 
 
-def test_the_blocks_of_the_page_of_corrections_run(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_blocks_of_the_page_of_corrections_run(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with fleet_with(apart(), tmp_path) as endpoint:
         run_blocks("corrections.md", {}, with_endpoint(endpoint))
@@ -197,9 +185,7 @@ def test_the_blocks_of_the_page_of_corrections_run(
     assert "only checked, nothing is changed: " in printed and printed.endswith("r0.1.17\n")
 
 
-def test_the_block_of_the_page_of_http_runs(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_block_of_the_page_of_http_runs(tmp_path, monkeypatch, capsys):
     """With the certificate and the token of a fleet with keys."""
     monkeypatch.chdir(tmp_path)
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, ["127.0.0.1"], "s0")
@@ -216,7 +202,7 @@ def test_the_block_of_the_page_of_http_runs(
 
 
 @needs_simulator
-def test_the_block_of_the_page_of_worlds_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_block_of_the_page_of_worlds_runs(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     Path("my.toml").write_bytes((DOCS.parent / "sim/worlds/examples/flat.toml").read_bytes())
     values: dict[str, object] = {}

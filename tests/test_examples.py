@@ -1,7 +1,5 @@
 """The examples run from a checkout as they are, and what they print is so."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess
@@ -42,12 +40,12 @@ def run(folder: Path, name: str, *words: str) -> str:
 
 
 @pytest.mark.parametrize("name", SHORT)
-def test_they_are_short(name: str) -> None:
+def test_they_are_short(name: str):
     assert len((EXAMPLES / f"{name}.py").read_text().splitlines()) <= 30
 
 
 @pytest.mark.parametrize("name", [*LACKING])
-def test_an_example_without_its_extra_ends_in_one_line(name: str, tmp_path: Path) -> None:
+def test_an_example_without_its_extra_ends_in_one_line(name: str, tmp_path):
     """As a command does: it was a traceback of fifteen lines."""
     missing = sorted({module for extra in LACKING[name] for module in MODULES[extra]})
     program = (
@@ -70,7 +68,7 @@ def test_an_example_without_its_extra_ends_in_one_line(name: str, tmp_path: Path
 
 @pytest.mark.slow
 @needs_simulator
-def test_they_run(tmp_path: Path) -> None:
+def test_they_run(tmp_path):
     """Each by itself; what one has driven the next finds, as in a person's folder."""
     out = tmp_path / "out" / "examples"
     printed = run(tmp_path, "plot_map")

@@ -1,7 +1,5 @@
 """The product unpickles nothing, runs no text as code and starts no shell, with one named exception."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator
@@ -66,7 +64,7 @@ def modules() -> list[Path]:
     return sorted({path.resolve() for path in found})
 
 
-def test_the_product_has_none_of_them() -> None:
+def test_the_product_has_none_of_them():
     found = {
         (str(path.relative_to(ROOT)), what)
         for path in modules()
@@ -76,7 +74,7 @@ def test_the_product_has_none_of_them() -> None:
     assert len(modules()) > 500
 
 
-def test_the_folders_are_those_of_the_package() -> None:
+def test_the_folders_are_those_of_the_package():
     linked = {path.resolve().name for path in (ROOT / "mapweave").iterdir() if path.is_symlink()}
     assert {*PRODUCT} == linked | {"mapweave"}
 
@@ -100,10 +98,10 @@ def test_the_folders_are_those_of_the_package() -> None:
         ("connection.recv()", "recv() of a multiprocessing connection"),
     ],
 )
-def test_each_of_them_is_found(source: str, what: str) -> None:
+def test_each_of_them_is_found(source: str, what: str):
     assert [*forbidden(source)] == [what]
 
 
-def test_what_is_alike_is_not_taken_for_one_of_them() -> None:
+def test_what_is_alike_is_not_taken_for_one_of_them():
     calls = ("frame.eval('a')", "socket.recv(10)", "run(['ls'], shell=False)", "code(shell=name)")
     assert not [*forbidden("\n".join((*calls, "import os", "os.walk('.')")))]

@@ -1,7 +1,5 @@
 """docs/method.md: its charts, numbers, equations and the files that it names are those of the code."""
 
-from __future__ import annotations
-
 import math
 import re
 from pathlib import Path
@@ -48,11 +46,11 @@ NUMBERS = (
 
 
 @pytest.mark.parametrize(("words", "value"), NUMBERS)
-def test_numbers_of_the_page_are_those_of_the_code(words: str, value: float) -> None:
+def test_numbers_of_the_page_are_those_of_the_code(words: str, value: float):
     assert words.format(value) in FLAT
 
 
-def test_counts_that_are_written_out() -> None:
+def test_counts_that_are_written_out():
     assert (margins.MIN_VISIBLE, behaviours.LEFT) == (4, 4)
     assert "At least four landmarks must stay in view" in FLAT
     assert "until four features are left" in FLAT
@@ -70,14 +68,14 @@ def shift(cell: str, angle: str) -> float:
     return {"−": -1.0, "+": 1.0, None: 0.0}[sign] * (2.0 if factor else 1.0) * math.pi
 
 
-def test_the_five_charts_of_the_page_are_those_of_the_laws() -> None:
+def test_the_five_charts_of_the_page_are_those_of_the_laws():
     rows = re.findall(r"^\| (\d) \| (β[^|]*?) \| (φ[^|]*?) \|", PAGE, re.MULTILINE)
     assert [row[0] for row in rows] == ["1", "2", "3", "4", "5"]
     assert [shift(row[1], "β") for row in rows] == pytest.approx(BETA_SHIFT)
     assert [shift(row[2], "φ") for row in rows] == pytest.approx(PHI_SHIFT)
 
 
-def test_the_derivatives_that_the_page_states_follow_from_its_control() -> None:
+def test_the_derivatives_that_the_page_states_follow_from_its_control():
     """beta~' and V' as written, against (2) driven by (5) as the code has it."""
     random = np.random.default_rng(1)
     rho, phi = random.uniform(0.1, 3.0, 50)[:, None], random.uniform(0.0, 2 * math.pi, 50)
@@ -92,7 +90,7 @@ def test_the_derivatives_that_the_page_states_follow_from_its_control() -> None:
     np.testing.assert_allclose(falls, -((rho * np.cos(beta_tilde)) ** 2) - gain * beta_tilde**2, atol=1e-12)
 
 
-def test_files_and_functions_that_the_page_names_are_there() -> None:
+def test_files_and_functions_that_the_page_names_are_there():
     """A name without its folder is in the folder that the text before it, or its heading, names."""
     folders = [ROOT / folder for folder in ("", "agent/servo", "agent/ekf")]
     for name, function in re.findall(r"`([\w/]+\.py)(?:: (\w+))?`", PAGE):

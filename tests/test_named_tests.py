@@ -1,7 +1,5 @@
 """Tests that the pages name are there."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 
@@ -23,9 +21,9 @@ def missing(name: str) -> bool:
 
 
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
-def test_every_test_that_a_page_names_is_there(page: Path) -> None:
+def test_every_test_that_a_page_names_is_there(page: Path):
     assert [name for name in NAMED.findall(page.read_text()) if missing(name)] == []
 
 
-def test_security_names_tests() -> None:
+def test_security_names_tests():
     assert len(NAMED.findall((ROOT / "SECURITY.md").read_text())) > 40

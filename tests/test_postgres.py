@@ -1,7 +1,5 @@
 """The databases that tests are given: each is as a new one, also where another test has used it."""
 
-from __future__ import annotations
-
 import psycopg
 
 from mapweave.mapserver.log.postgres_store import PostgresStore
@@ -27,7 +25,7 @@ def content(address: str) -> list[tuple[str, ...]]:
         return sorted(connection.execute(CONTENT).fetchall())
 
 
-def test_a_database_that_is_given_again_is_as_a_new_one(postgres: PostgresServer) -> None:
+def test_a_database_that_is_given_again_is_as_a_new_one(postgres: PostgresServer):
     new = postgres.database()
     before, others = content(new), {new}
     store = PostgresStore(new)
@@ -53,7 +51,7 @@ def test_a_database_that_is_given_again_is_as_a_new_one(postgres: PostgresServer
     store.close()
 
 
-def test_a_database_that_is_in_use_or_holds_what_is_not_removed_is_not_given_again() -> None:
+def test_a_database_that_is_in_use_or_holds_what_is_not_removed_is_not_given_again():
     servers = started()
     server = next(servers)
     try:

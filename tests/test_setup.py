@@ -1,7 +1,5 @@
 """`make setup` and `make audit` where something is missing, with scripts in the place of Python and tools."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess
@@ -62,7 +60,7 @@ def setup(checkout: Path) -> tuple[int, str]:
     return ran.returncode, ran.stdout + ran.stderr
 
 
-def test_an_environment_that_was_left_without_pip_is_completed(checkout: Path) -> None:
+def test_an_environment_that_was_left_without_pip_is_completed(checkout: Path):
     """Debian's Python said which package to install. When that was there, make said: No module named pip."""
     (checkout / "lacking").touch()
     assert setup(checkout)[0] != 0
@@ -71,7 +69,7 @@ def test_an_environment_that_was_left_without_pip_is_completed(checkout: Path) -
     assert status == 0, said
 
 
-def test_a_missing_network_is_not_taken_for_a_missing_wheel(checkout: Path) -> None:
+def test_a_missing_network_is_not_taken_for_a_missing_wheel(checkout: Path):
     (checkout / "wheel").unlink()
     status, said = setup(checkout)
     assert status == 0 and "there is no wheel of pybullet" in said, said
@@ -82,13 +80,13 @@ def test_a_missing_network_is_not_taken_for_a_missing_wheel(checkout: Path) -> N
     assert status != 0 and "wheel" not in said, said
 
 
-def test_settings_of_pip_that_cannot_be_read_are_not_taken_for_a_missing_wheel(checkout: Path) -> None:
+def test_settings_of_pip_that_cannot_be_read_are_not_taken_for_a_missing_wheel(checkout: Path):
     (checkout / "misconfigured").touch()
     status, said = setup(checkout)
     assert status != 0 and "could not be loaded" in said and "wheel" not in said, said
 
 
-def test_what_was_skipped_is_said_in_one_line_for_each_reason() -> None:
+def test_what_was_skipped_is_said_in_one_line_for_each_reason():
     """Without a browser all tests are green; how many were left out, and why, must be seen.
 
     A process of its own runs them, as in `make test`, and another one says it.
@@ -123,8 +121,8 @@ def test_what_was_skipped_is_said_in_one_line_for_each_reason() -> None:
     ids=["nothing", "found", "no-network"],
 )
 def test_an_audit_says_in_one_line_what_it_has_found_or_why_it_cannot(
-    tmp_path: Path, status: int, found: str, said: str, words: str
-) -> None:
+    tmp_path, status: int, found: str, said: str, words: str
+):
     """Without its service it printed fifty lines."""
     for name in ("pyproject.toml", "constraints.txt", "stamp", "audit/bin/pip-audit", "audit/.installed"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)

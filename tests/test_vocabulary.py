@@ -81,7 +81,7 @@ def hits(text: str) -> set[str]:
     return (PLAIN.keys() & words) | {m.group() for m in PHRASE.finditer(text.lower())}
 
 
-def test_code_and_pages_use_the_words_of_the_field() -> None:
+def test_code_and_pages_use_the_words_of_the_field():
     collected = []
     for path in pages():
         name = path.relative_to(ROOT).as_posix()

@@ -1,7 +1,5 @@
 """Waiting for what other threads and processes do; and a port to do it at."""
 
-from __future__ import annotations
-
 import socket
 import time
 from collections.abc import Callable

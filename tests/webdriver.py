@@ -1,7 +1,5 @@
 """Requests of the W3C WebDriver protocol, which drivers of all browsers speak."""
 
-from __future__ import annotations
-
 import http.client
 import json
 from typing import Any
