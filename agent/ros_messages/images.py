@@ -21,11 +21,24 @@ CHANNELS = {
     "bgra8": 4,
     "mono16": 2,
     "16uc1": 2,
+    "yuv422": 2,
+    "uyvy": 2,
+    "yuv422_yuy2": 2,
+    "yuyv": 2,
+    "bayer_rggb8": 1,
+    "bayer_bggr8": 1,
+    "bayer_gbrg8": 1,
+    "bayer_grbg8": 1,
 }
 """Bytes of a pixel."""
+LUMA = {"yuv422": 1, "uyvy": 1, "yuv422_yuy2": 0, "yuyv": 0}
+"""Which byte of a pixel is how bright it is, of images as many webcams give them."""
 TO_GREY = {
     "rgb8": cv2.COLOR_RGB2GRAY, "bgr8": cv2.COLOR_BGR2GRAY, "8uc3": cv2.COLOR_BGR2GRAY,
     "rgba8": cv2.COLOR_RGBA2GRAY, "bgra8": cv2.COLOR_BGRA2GRAY,
+    # OpenCV names a pattern by the second row and column, ROS by the first.
+    "bayer_rggb8": cv2.COLOR_BayerBG2GRAY, "bayer_bggr8": cv2.COLOR_BayerRG2GRAY,
+    "bayer_gbrg8": cv2.COLOR_BayerGR2GRAY, "bayer_grbg8": cv2.COLOR_BayerGB2GRAY,
 }  # fmt: skip
 
 
@@ -35,16 +48,18 @@ def grey_of(message: Any) -> NDArray[np.uint8]:
     Raises:
         DeviceError: its encoding is not supported, or it is damaged, empty or too large.
     """
+    compressed = not hasattr(message, "encoding")
     try:
-        if not hasattr(message, "encoding"):
+        if compressed:
             return decode_grey(bytes(message.data))
         check_size(int(message.width), int(message.height))
     except InvalidValue as error:
-        raise DeviceError(str(error)) from None
+        named = f"of format {str(message.format)[:40]!r}: " if compressed else ""
+        raise DeviceError(f"{named}{error}") from None
     encoding = str(message.encoding).lower()
     if encoding not in CHANNELS:
         raise DeviceError(
-            f"images of encoding {message.encoding!r} are not supported; mono8, rgb8 and bgr8 are"
+            f"images of encoding {message.encoding!r} are not supported; {', '.join(CHANNELS)} are"
         )
     size, row = CHANNELS[encoding], int(message.step)
     height, width = int(message.height), int(message.width)
@@ -52,9 +67,10 @@ def grey_of(message: Any) -> NDArray[np.uint8]:
     if not (width and height) or row < width * size or len(data) < height * row:
         raise DeviceError(f"an image of {width}x{height} px has {len(data)} bytes")
     pixels = data[: height * row].reshape(height, row)[:, : width * size]
-    if encoding in ("mono16", "16uc1"):
-        # The more significant byte of each pixel.
-        return np.ascontiguousarray(pixels.reshape(height, width, 2)[:, :, 0 if message.is_bigendian else 1])
-    if size == 1:
+    if size == 2:
+        # Of 16 bits, the more significant byte of each pixel.
+        byte = LUMA.get(encoding, 0 if message.is_bigendian else 1)
+        return np.ascontiguousarray(pixels.reshape(height, width, 2)[:, :, byte])
+    if encoding not in TO_GREY:
         return np.ascontiguousarray(pixels)
     return np.asarray(cv2.cvtColor(pixels.reshape(height, width, size), TO_GREY[encoding]), np.uint8)

@@ -27,13 +27,34 @@ def test_an_empty_image_is_refused(encoding: str, size: dict[str, int]):
 @pytest.mark.parametrize(
     ("wrong", "words"),
     [
-        (SimpleNamespace(data=b"no image"), "no JPEG, PNG, PGM or BMP file"),
-        (SimpleNamespace(data=b""), "no JPEG, PNG, PGM or BMP file"),
+        (SimpleNamespace(format="h264", data=b"no image"), "of format 'h264': no JPEG, PNG, PGM or BMP file"),
+        (SimpleNamespace(format="", data=b""), "no JPEG, PNG, PGM or BMP file"),
         (image(width=2**16, height=2**16), "65536x65536 px is too large"),
         (image(step=2**32 - 1), "has 48 bytes"),
-        (image(encoding="32FC1"), "are not supported"),
+        (image(encoding="32FC1"), "are not supported; mono8, .*bayer_rggb8, .* are"),
     ],
 )
 def test_what_is_no_image_is_refused_in_words(wrong: SimpleNamespace, words: str):
     with pytest.raises(DeviceError, match=words):
         grey_of(wrong)
+
+
+@pytest.mark.parametrize("encoding", ["bayer_rggb8", "bayer_bggr8", "bayer_gbrg8", "bayer_grbg8"])
+@pytest.mark.parametrize("colour", ["r", "g", "b"])
+def test_a_bayer_image_is_as_bright_as_one_in_colour(encoding: str, colour: str):
+    """By its name, a red image in the wrong pattern is a blue one."""
+    mosaic = np.zeros((6, 6), np.uint8)
+    for k, cell in enumerate(encoding.split("_")[1][:4]):
+        mosaic[k // 2 :: 2, k % 2 :: 2] = 200 * (cell == colour)
+    grey = grey_of(image(encoding=encoding, width=6, height=6, step=6, data=mosaic.ravel()))
+    flat = np.tile(np.array([200 * (each == colour) for each in "rgb"], np.uint8), 36)
+    same = grey_of(image(encoding="rgb8", width=6, height=6, step=18, data=flat))
+    np.testing.assert_allclose(grey, same, atol=1)
+
+
+@pytest.mark.parametrize(("encoding", "first"), [("yuv422_yuy2", 0), ("yuyv", 0), ("yuv422", 1), ("uyvy", 1)])
+def test_of_an_image_in_yuv_the_brightness_is_read(encoding: str, first: int):
+    data = np.full(24, 128, np.uint8)
+    data[first::2] = np.arange(12)
+    grey = grey_of(image(encoding=encoding, step=8, data=data))
+    np.testing.assert_array_equal(grey, np.arange(12).reshape(3, 4))
