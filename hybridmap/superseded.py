@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.limits import Angle, Distance, Number
+from mapweave.hybridmap.limits import Angle, Distance, LandmarkCount
 
 
 @dataclass(frozen=True, slots=True)
@@ -21,7 +21,7 @@ class Superseded:
     """
 
     by: NodeId
-    found: Number
+    found: LandmarkCount
     distance: Distance
     turn: Angle
 

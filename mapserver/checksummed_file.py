@@ -16,13 +16,15 @@ from typing import Any, Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.errors import InvalidFile, InvalidValue
+from mapweave.hybridmap.errors import InvalidFile, InvalidMessage, InvalidValue
 from mapweave.storage.atomic_file import write_whole
 
 Value = TypeVar("Value")
 
 DIGEST = 32
 """Bytes of SHA-256."""
+_UNFIT = ValueError, KeyError, TypeError, IndexError, EOFError, StopIteration
+"""What reading raises where arrays are not those of a value."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +137,7 @@ def read_sealed(
         if read_json(next(parts)) != header:
             raise InvalidFile(f"{words}of another version of this program, or with other settings")
         return read(parts)
-    except (ValueError, KeyError, TypeError, IndexError, EOFError, StopIteration, InvalidValue) as error:
+    except (InvalidValue, InvalidMessage, *_UNFIT) as error:
         raise InvalidFile(f"{words}{lack} ({error})") from None
 
 

@@ -4,14 +4,14 @@
 value. `msgspec.convert` checks every type and range; a value checks what else it requires when it is created.
 
 Some types have their own form, see docs/wire.md: poses are 36 bytes, a node is the body of its change, an
-array is `[kind, shape, bytes]`, a map with node ids as keys is a list of pairs. Where a value may be one of
-several dataclasses (`A | B`), each has a `TAG`, which travels as the field `kind`.
+array is `[kind, shape, bytes]`, a map with ids or pairs of them as keys is a list of pairs. Where a value
+may be one of several dataclasses (`A | B`), each has a `TAG`, which travels as the field `kind`.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Set
 from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache, reduce
@@ -158,7 +158,7 @@ def _packer(kind: Any) -> Callable[[Any, Packers], Any]:
         return _packed_map
     if issubclass(kind, tuple | list):
         return lambda value, packers: [packed(element, packers) for element in value]
-    if issubclass(kind, frozenset):
+    if issubclass(kind, Set):
         return lambda value, packers: [packed(element, packers) for element in sorted(value)]
     return lambda value, packers: value
 
@@ -245,7 +245,7 @@ def _schema(kind: Any) -> Any:
     if (alias := getattr(origin, "__value__", None)) is not None:
         # From NumPy 2.5 on `NDArray` is one.
         return _schema(alias[inner])
-    by_id = origin is Mapping and inner[0] in (NodeId, MapId)
+    by_id = origin is Mapping and (inner[0] in (NodeId, MapId) or get_origin(inner[0]) is tuple)
     if kind in FORMS or is_dataclass(kind) or origin is np.ndarray or by_id:
         return _opaque(kind)
     if origin is None or origin is Literal:

@@ -9,12 +9,16 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Set
 from dataclasses import dataclass, field
+from typing import Annotated
+
+from msgspec import Meta
 
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Node
 from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.verdicts import Verdict
 
+Overlap = Annotated[float, Meta(gt=0.0)]
 PRINT_BYTES = 16
 """Of a digest: two of a million nodes have the same with a chance below 1e-26."""
 
@@ -72,7 +76,7 @@ class RecentComparisons:
 
     prints: Mapping[NodeId, bytes] = field(default_factory=dict)
     compared: Set[NodeId] = frozenset()
-    overlaps: Mapping[Pair, float] = field(default_factory=dict)
+    overlaps: Mapping[Pair, Overlap] = field(default_factory=dict)
 
 
 class CachedVerifications:

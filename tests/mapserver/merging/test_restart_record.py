@@ -23,7 +23,6 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.superseded import Superseded
-from mapweave.mapserver.checksummed_file import sealed, unseal
 from mapweave.mapserver.merging import restart_record_file, verification_cache_keeper
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.restart_record import RestartRecord
@@ -266,7 +265,7 @@ BAD: dict[str, Any] = {
     "negative distance": lambda record: _superseded(distance=-0.1),
     "no distance": lambda record: _superseded(distance=np.nan),
     "far": lambda record: _superseded(distance=1e9),
-    "more than a turn": lambda record: _superseded(turn=7.0),
+    "more than a turn": lambda record: _superseded(turn=7.5),
     "by a superseded node": lambda record: _superseded(by=max(record.superseded)),
     "by itself": lambda record: _superseded(by=min(record.superseded)),
     "not judged": lambda record: {"judged": frozenset()},
@@ -287,7 +286,7 @@ BAD: dict[str, Any] = {
         "log": SupersedingLog(record.log.steps, ({MapId("r0", 1): -2},))
     },
     "overlap": lambda record: {
-        "recent": replace(record.recent, overlaps=dict.fromkeys(record.recent.overlaps, np.inf))
+        "recent": replace(record.recent, overlaps=dict.fromkeys(record.recent.overlaps, 0.0))
     },
 }
 
@@ -299,30 +298,6 @@ def test_what_cannot_be_is_refused(bad: str, tmp_path: Path) -> None:
     save(tmp_path / "x", replace(record, **BAD[bad](record)), "me")
     with pytest.raises(InvalidFile, match="no record of this version"):
         load(tmp_path / "x", "me")
-
-
-@pytest.mark.parametrize("part", range(19))
-@pytest.mark.parametrize("how", ["short", "kind", "shape", "numbers"])
-def test_parts_that_do_not_fit_are_refused(part: int, how: str) -> None:
-    record = random_record(np.random.default_rng(1))
-    parts = list(unseal(bytes(restart_record_file.packed(record, "me")), restart_record_file.MAGIC))
-    assert len(parts) == 19
-    array = parts[part]
-    if how == "numbers":
-        # Fingerprints and what is known of nodes may be any.
-        array = np.full_like(array, -1 if array.dtype.kind in "if" else 255)
-        harmless = part in (3, 4)
-    else:
-        array = {
-            "short": array[:-1], "kind": array.astype(np.complex128), "shape": array[..., None]
-        }[how]  # fmt: skip
-        harmless = (how == "short" and part in (7, 10, 14, 15, 16, 17, 18)) or (how == "shape" and part < 2)
-    data = sealed(restart_record_file.MAGIC, [*parts[:part], array, *parts[part + 1 :]])
-    if harmless:
-        load(data, "me")
-    else:
-        with pytest.raises(InvalidFile):
-            load(data, "me")
 
 
 @pytest.mark.parametrize("damage", first_quick(["flipped", "version", "merging", "cut", "empty", "other"], 3))
