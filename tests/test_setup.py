@@ -111,12 +111,7 @@ def test_what_was_skipped_is_said_in_one_line_for_each_reason():
     [
         (0, "", "No known vulnerabilities found", "no known vulnerabilities"),
         (1, "anyio 4.16.0 PYSEC-1", "Found 1 known vulnerability", "anyio 4.16.0 PYSEC-1"),
-        (
-            1,
-            "",
-            "Traceback:\n  a step\nProxyError: refused",
-            "cannot be looked up: ProxyError: refused",
-        ),
+        (1, "", "Traceback:\n  a step\nProxyError: refused", "cannot be looked up: ProxyError: refused"),
     ],
     ids=["nothing", "found", "no-network"],
 )

@@ -58,7 +58,7 @@ APART = re.compile(r"told apart")
 """To distinguish: plain English."""
 EXCEPTIONS: dict[str, tuple[str, ...]] = {
     # A living room.
-    "living": ("docs/worlds.md", "sim/worlds/examples/", "tests/sim/test_world_file.py"),
+    "living": ("docs/worlds.md", "sim/worlds/examples/", "tests/sim/test_world_file.py")
 }
 """Words by the files that may use them, with the reason."""
 

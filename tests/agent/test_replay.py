@@ -358,10 +358,7 @@ def test_errors_are_reported_in_one_line(folder, case):
     ("options", "words"),
     [
         (RecordingOptions(image_topic="/camera"), "has no topics: leave out --image-topic"),
-        (
-            RecordingOptions(camera_height=0.3),
-            "is height_m of {folder}/camera.toml: leave out",
-        ),
+        (RecordingOptions(camera_height=0.3), "is height_m of {folder}/camera.toml: leave out"),
     ],
 )
 def test_options_without_effect_are_refused(folder, options, words):

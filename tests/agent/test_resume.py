@@ -247,8 +247,7 @@ def test_a_kidnapped_explorer_maps_on_and_adds_no_false_edge(begun: Begun, tmp_p
 
 
 @pytest.mark.parametrize(
-    "seed",
-    [pytest.param(s, marks=pytest.mark.slow if s < 6 else pytest.mark.scenario) for s in range(4, 9)],
+    "seed", [pytest.param(s, marks=pytest.mark.slow if s < 6 else pytest.mark.scenario) for s in range(4, 9)]
 )
 def test_kidnapped_again_and_again(tmp_path, seed: int):
     world, rng = make_world("office", seed, rooms=3), np.random.default_rng(seed)

@@ -62,10 +62,7 @@ def test_a_failed_or_killed_run_is_reported():
 @pytest.mark.slow
 def test_runs_are_processes_and_all_are_accounted_for(monkeypatch):
     """A scenario that cannot be built beside one that there is not: each is one line, nothing hangs."""
-    wrong = {
-        "none": ("no-such-scenario",),
-        "small": ("twin-rooms", "--set", "world.length=0.1"),
-    }
+    wrong = {"none": ("no-such-scenario",), "small": ("twin-rooms", "--set", "world.length=0.1")}
     monkeypatch.setattr(merge_sim, "SCENARIOS", wrong)
     results = measure(["none", "small"], 1, 0, 2, Console(file=sys.stderr, quiet=True))
     assert [type(result) for result in results] == [Failure, Failure]

@@ -112,10 +112,7 @@ def test_a_running_servers_store_is_backed_up_and_a_server_on_it_is_completed(tm
     names = {MapId(one.agent, 1): one for one in journals}
 
     def server(children: Children, data: Path) -> None:
-        children.start(
-            "server",
-            ["server", "--fleet", "fleet", "--data", str(data), "--listen", endpoint],
-        )
+        children.start("server", ["server", "--fleet", "fleet", "--data", str(data), "--listen", endpoint])
 
     with Children(tmp_path / "logs") as children:
         server(children, tmp_path / "first")

@@ -75,10 +75,7 @@ def test_names_that_cannot_be_in_a_key(name, capfd, recording, closed, tmp_path)
         assert not data.exists(), "nothing is left behind"
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    ["--robots=1", "--rooms=99", "--seed=-1"],
-)
+@pytest.mark.parametrize("arguments", ["--robots=1", "--rooms=99", "--seed=-1"])
 def test_demos_out_of_range(arguments, capfd, tmp_path):
     output = complaint(capfd, "demo", arguments, "--out", tmp_path, status=USAGE)
     assert arguments.replace("=", " ") in output

@@ -100,10 +100,7 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
         ("agent = []", "agent: expected table, got list"),
         ("[network]\nfleet = 3", "network.fleet: expected str, got int; it is 3"),
         ("[network]\nendpoints = 'tcp/1.2.3.4:5'", "network.endpoints: expected list, got str"),
-        (
-            "[network]\nendpoints = ['tcp/1.2.3.4:5', 7447]",
-            "network.endpoints[1]: expected str, got int",
-        ),
+        ("[network]\nendpoints = ['tcp/1.2.3.4:5', 7447]", "network.endpoints[1]: expected str, got int"),
         ("[agent]\nseed = 1.5", "agent.seed: expected int, got float; it is 1.5"),
         ("[agent]\nseed = true", "agent.seed: expected int, got bool; it is True"),
         ("[agent.navigation]\nspeed = 'far'", "agent.navigation.speed: expected float, got str; it is 'far'"),
@@ -131,10 +128,7 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
         ("[merge.exclusion]\ndoubt = 'much'", "merge.exclusion.doubt: expected float, got str"),
         ("[merge.consistency]\nleast_links = 1.5", "merge.consistency.least_links: expected int, got float"),
         ("[network", "robot.toml: last line: is not TOML: Expected ']'"),
-        (
-            "a = 1\na = 2",
-            "robot.toml: last line: is not TOML: Cannot overwrite a value; correct it there",
-        ),
+        ("a = 1\na = 2", "robot.toml: last line: is not TOML: Cannot overwrite a value; correct it there"),
         (
             "\n[robot]\ndriver = koala",
             "robot.toml: line 3, column 10: is not TOML: Invalid value; correct it there",

@@ -114,12 +114,7 @@ class Stage:
         self.buses.append(MemoryBus(self.hub))
         return self.buses[-1]
 
-    def start(
-        self,
-        simulation: Any,
-        patience: float = 20.0,
-        farewell: float = 0.02,
-    ) -> SimControl:
+    def start(self, simulation: Any, patience: float = 20.0, farewell: float = 0.02) -> SimControl:
         self.bridge = SimBridge(simulation, self.join(), "test", patience, farewell)
         self.thread = threading.Thread(target=self.bridge.run, args=(self.stop,))
         self.thread.start()

@@ -78,8 +78,7 @@ def test_a_known_delay_is_subtracted(clip: str):
 
 
 @pytest.mark.parametrize(
-    ("source", "words"),
-    [("/nowhere/film.avi", "no such file"), ("63", "camera 63: cannot be opened")],
+    ("source", "words"), [("/nowhere/film.avi", "no such file"), ("63", "camera 63: cannot be opened")]
 )
 def test_a_source_that_is_not_there(source: str, words: str):
     with pytest.raises(DeviceError, match=words):

@@ -15,9 +15,7 @@ from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 
 DESCRIPTION = RobotDescription(
-    Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3),
-    ranger_bearings=(-0.5, 0.0, 0.5, 1.0, 1.5),
-    ranger_reach=2.0,
+    Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3), ranger_bearings=(-0.5, 0.0, 0.5, 1.0, 1.5), ranger_reach=2.0
 )
 NOW_S = 1_795_000_000.0
 NOW_NS = round(NOW_S * 1e9)

@@ -112,8 +112,7 @@ def test_a_fisheye_lens_is_taken_from_camera_info(start: Start):
 
 
 @pytest.mark.parametrize(
-    ("odometry", "more"),
-    [("joint_states", {"wheel_radius": 0.033}), ("wheel_ticks", {})],
+    ("odometry", "more"), [("joint_states", {"wheel_radius": 0.033}), ("wheel_ticks", {})]
 )
 @pytest.mark.parametrize("bridge", first_quick([None, "/bot1"], 1))
 def test_other_odometry_compressed_images_and_stamped_commands(

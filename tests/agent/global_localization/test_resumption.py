@@ -194,10 +194,7 @@ def test_it_turns_to_where_there_is_most_room(elsewhere, own_map):
 
 @pytest.mark.parametrize(
     ("proximity", "description"),
-    [
-        (np.full(len(BEARINGS), 0.2), BODY),
-        (np.zeros(0), replace(BODY, ranger_bearings=(), ranger_reach=0.0)),
-    ],
+    [(np.full(len(BEARINGS), 0.2), BODY), (np.zeros(0), replace(BODY, ranger_bearings=(), ranger_reach=0.0))],
     ids=["no room", "no rangers"],
 )
 def test_without_room_that_it_can_see_it_stays(elsewhere, own_map, proximity, description):

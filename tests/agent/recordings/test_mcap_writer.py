@@ -42,10 +42,7 @@ class Driven:
 
     def describe(self) -> RobotDescription:
         return RobotDescription(
-            camera=self._drive.camera,
-            distortion=self._lens,
-            ranger_bearings=(0.0, 0.5),
-            ranger_reach=2.0,
+            camera=self._drive.camera, distortion=self._lens, ranger_bearings=(0.0, 0.5), ranger_reach=2.0
         )
 
     def sense(self) -> Observation | None:

@@ -7,14 +7,7 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
-from mapweave.agent.servo.laws import (
-    LAWS,
-    charts,
-    control,
-    law_paths,
-    lyapunov,
-    saturate,
-)
+from mapweave.agent.servo.laws import LAWS, charts, control, law_paths, lyapunov, saturate
 from mapweave.agent.servo.polar import Polar, continued, polar_of
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 

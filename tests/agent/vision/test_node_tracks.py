@@ -30,11 +30,7 @@ def pairs(node, description, features) -> np.ndarray:
 def tracks(walls, description, features, pairs) -> NodeTracks:
     """Of the landmarks that were recognised there."""
     return NodeTracks(
-        Lens(description.camera, description.distortion),
-        walls.render(HERE),
-        features,
-        pairs,
-        most_refusals=2,
+        Lens(description.camera, description.distortion), walls.render(HERE), features, pairs, most_refusals=2
     )
 
 

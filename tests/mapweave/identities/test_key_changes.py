@@ -203,13 +203,7 @@ def test_tokens_that_a_broken_off_revocation_left_do_not_come_back(folder: KeyFo
 def test_the_only_server_is_revoked_by_force_alone(folder: KeyFolder, capfd):
     """A running router keeps its key, and no other could be started."""
     assert "s0 is the only server: add another one first" in complaint(
-        capfd,
-        "keys",
-        "revoke",
-        "s0",
-        "--keys",
-        folder.path,
-        status=NO,
+        capfd, "keys", "revoke", "s0", "--keys", folder.path, status=NO
     )
     with pytest.raises(InvalidValue, match="only server"):
         folder.revoke("s0")

@@ -321,8 +321,7 @@ def test_a_disk_that_is_really_full_is_one_line(tmp_path):
 
 
 @pytest.mark.parametrize(
-    "host",
-    ["127.0.0.1:7447", "10.0.0.5/24", "fe80::1%eth0", "-x", "a b", "192.168.1.300", "192.168.1"],
+    "host", ["127.0.0.1:7447", "10.0.0.5/24", "fe80::1%eth0", "-x", "a b", "192.168.1.300", "192.168.1"]
 )
 def test_a_host_is_a_name_or_an_address_without_a_port(host: str, capfd, tmp_path):
     where = tmp_path / "keys"

@@ -146,10 +146,7 @@ def test_nodes_without_truth_play_no_part():
 def test_a_goal_that_the_others_cut_off_is_none():
     """r0 is in the only gap between the two halves of a hall: no robot is sent through it."""
     hall = BuildingPlan(
-        (
-            Rectangle.spanning(0, 0, 4, 4, "room 0"),
-            Rectangle.spanning(4, 0, 8, 4, "room 1"),
-        ),
+        (Rectangle.spanning(0, 0, 4, 4, "room 0"), Rectangle.spanning(4, 0, 8, 4, "room 1")),
         (Rectangle.spanning(3.95, 0, 4.05, 1.6), Rectangle.spanning(3.95, 2.4, 4.05, 4)),
     )
     merged, components, truth = a_map({"r0": [(1, 1), (2, 2)], "r1": [(6, 1), (6, 3)]})
