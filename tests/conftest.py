@@ -7,6 +7,7 @@ import gc
 import os
 import sys
 from collections import Counter
+from collections.abc import Iterator
 
 # numpy reads it when it is imported, and cv2 imports numpy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -70,6 +71,9 @@ if not INSTALLED:
 
 
 @pytest.fixture
-def hub() -> MemoryHub:
-    """A network in memory, of buses that a test opens."""
-    return MemoryHub()
+def hub() -> Iterator[MemoryHub]:
+    """A network in memory; buses that a test opens and leaves open are closed at its end."""
+    hub = MemoryHub()
+    yield hub
+    for bus in [*hub._buses]:
+        bus.close()

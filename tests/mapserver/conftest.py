@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -52,16 +53,29 @@ def house(mapped_room: Callable[[], MappedRoom]) -> Iterator[House]:
 
 
 @pytest.fixture
-def server(hub: MemoryHub, tmp_path: Path) -> Iterator[Server]:
-    """An ingest, s0."""
-    server = Server(hub, tmp_path / "s0.sqlite")
-    yield server
-    server.end()
+def started(hub: MemoryHub, tmp_path: Path) -> Iterator[Callable[..., Server]]:
+    """Starts an ingest, s0, with the given quotas or settings; it ends with the test."""
+    servers: list[Server] = []
+
+    def start(**options: Any) -> Server:
+        servers.append(Server(hub, tmp_path / "s0.sqlite", **options))
+        return servers[-1]
+
+    yield start
+    # First the agents: those that never answer are asked for as long as they are there.
+    for bus in [bus for bus in hub._buses if bus not in [server.bus for server in servers]]:
+        bus.close()
+    for server in servers:
+        server.end()
 
 
 @pytest.fixture
-def agent(hub: MemoryHub) -> Iterator[HandAgent]:
+def server(started: Callable[..., Server]) -> Server:
+    """An ingest, s0."""
+    return started()
+
+
+@pytest.fixture
+def agent(hub: MemoryHub) -> HandAgent:
     """The client of it."""
-    agent = HandAgent(hub)
-    yield agent
-    agent.bus.close()
+    return HandAgent(hub)

@@ -26,6 +26,8 @@ from tests.waiting import eventually
 
 KEYS = Keys("fleet")
 ROBOT = MapId("r0", 1)
+STANDING = Status("standing", "", 7, 0, Pose2(0.0, 0.1, 0.0), False, "explore", located=True)
+"""Of a robot that knows where it is."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,6 +57,7 @@ class House:
         self.mapped, self.hub = mapped, MemoryHub()
         self.stack = ExitStack()
         self.buses: list[MemoryBus] = []
+        self.links: list[FleetClient] = []
         self.start_server()
         self.person = Fleet(fleet="fleet", by="anna", bus=self.bus())
 
@@ -69,18 +72,30 @@ class House:
     def stop_server(self) -> None:
         self.stack.close()
 
+    def restart_server(self) -> None:
+        self.stop_server()
+        self.start_server()
+
     def robot(self, name: str = "r0") -> tuple[FleetClient, MissionControl]:
         control = MissionControl(name)
         link = FleetClient(self.bus(), KEYS, replace_agent(name), control)
-        link.report(Status("standing", "", 7, 0, Pose2(0.0, 0.1, 0.0), False, "explore", located=True), 1)
+        link.report(STANDING, 1)
+        self.links.append(link)
         eventually(lambda: self.entry(name).status is not None)
         return link, control
+
+    def robot_that_left(self) -> None:
+        """Robot r0 has been here, and is away."""
+        self.robot()[0].close()
+        eventually(lambda: not self.entry("r0").alive)
 
     def entry(self, name: str):
         entries = {entry.robot: entry for entry in self.person.status().robots}
         return entries.get(name, type("Nothing", (), {"status": None, "alive": False}))
 
     def close(self) -> None:
+        for link in self.links:
+            link.close()
         self.stop_server()
         for bus in self.buses:
             bus.close()

@@ -46,6 +46,10 @@ class HandAgent:
         data = message(sequence, self.map) if data is None else data
         self.bus.publish(KEYS.change(self.map), data, mark)
 
+    def publish_each(self, *sequences: int) -> None:
+        for sequence in sequences:
+            self.publish(sequence)
+
     def beacon(self, newest: int, **acknowledged: int) -> None:
         self.bus.publish(KEYS.head(self.map), Head(self.log_id, newest, acknowledged).encode())
 
@@ -100,6 +104,10 @@ class Server:
         self.ingest.close()
         self.bus.close()
         self.store.close()
+
+    def restart(self) -> None:
+        self.end()
+        self.begin()
 
     @property
     def sequences(self) -> list[int]:

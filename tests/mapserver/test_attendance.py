@@ -51,7 +51,7 @@ class Watch:
 
 
 def test_a_robot_that_a_person_has_sent_stands_once_no_operator_is_there(house: House) -> None:
-    watch, (link, control) = Watch(house), house.robot()
+    watch, (_, control) = Watch(house), house.robot()
     watch.after(GRACE + 1.0)
     sent = house.person.go("r0", str(THERE), because="a parcel")
     watch.after(GRACE - 1.0)
@@ -70,26 +70,23 @@ def test_a_robot_that_a_person_has_sent_stands_once_no_operator_is_there(house: 
     watch.after(100.0)
     assert control.report == ended, "once"
     assert house.person.go("r0", str(THERE)).state is MissionState.RUNNING, "it takes orders as before"
-    link.close()
 
 
 def test_it_goes_home_and_is_let_go_home(house: House) -> None:
-    watch, (link, control) = Watch(house, Unattended.HOME), house.robot()
+    watch, (_, control) = Watch(house, Unattended.HOME), house.robot()
     house.person.go("r0", str(THERE))
     watch.after(GRACE + 1.0)
     home = control.report
     assert home is not None and home.order.node == min(house.mapped.truth) and home.order.goal == "home"
     watch.after(GRACE + 1.0)
     assert control.report == home
-    link.close()
 
 
 def test_a_robot_that_has_no_home_stands(house: House) -> None:
-    watch, (link, control) = Watch(house, Unattended.HOME), house.robot("r5")
+    watch, (_, control) = Watch(house, Unattended.HOME), house.robot("r5")
     house.person.explore("r5")
     watch.after(GRACE + 1.0)
     assert control.report is not None and control.report.order.kind is MissionKind.STOP
-    link.close()
 
 
 def test_robots_that_no_person_has_sent_go_on(house: House) -> None:
@@ -102,16 +99,14 @@ def test_robots_that_no_person_has_sent_go_on(house: House) -> None:
     house.person.carried("r0")
     watch.after(GRACE + 1.0)
     assert control.report.order.kind is MissionKind.CARRIED, "a person is beside it"
-    link.close()
 
 
 def test_by_default_all_go_on(house: House) -> None:
     assert AttendanceSettings().words == ""
-    watch, (link, control) = Watch(house, Unattended.GO_ON), house.robot()
+    watch, (_, control) = Watch(house, Unattended.GO_ON), house.robot()
     sent = house.person.go("r0", str(THERE))
     watch.after(1e6)
     assert control.report == sent
-    link.close()
 
 
 def test_a_robot_that_was_away_stands_when_it_is_back(house: House) -> None:
@@ -121,13 +116,12 @@ def test_a_robot_that_was_away_stands_when_it_is_back(house: House) -> None:
     eventually(lambda: not house.server._roster.alive("r0"))
     watch.after(GRACE + 1.0)
     assert len(house.person.missions()) == 1, "nothing waits for it"
-    back, _ = house.robot()
+    house.robot()
     order = control.report
     assert order is not None
     eventually(lambda: house.server._roster.alive("r0"))
     watch.after(1.0)
     assert [report.order.kind for report in house.person.missions()] == [MissionKind.GO, MissionKind.STOP]
-    back.close()
 
 
 def test_who_waits_for_a_mission_is_there(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -147,14 +141,13 @@ def test_who_waits_for_a_mission_is_there(house: House, monkeypatch: pytest.Monk
     link.report(DRIVES, 3)
     waiting.join(20)
     assert waited[0].state is MissionState.REPLACED
-    link.close()
 
 
 @pytest.mark.parametrize("wait", [False, True])
 def test_a_shell_that_does_not_wait_says_what_follows(
     house: House, wait: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    link, _ = house.robot()
+    house.robot()
     monkeypatch.setattr("mapweave.commands.missions.fleet_of", lambda _: nullcontext(house.person))
     give = ["go", "r0", str(THERE), *(["--wait", "--timeout", "0.2"] if wait else [])]
     assert main(give) == (4 if wait else 0)
@@ -167,7 +160,6 @@ def test_a_shell_that_does_not_wait_says_what_follows(
         "Robots that were sent stand 30 s after the last operator's page was closed; --wait counts as a page"
     )
     assert (said in capsys.readouterr().err) is not wait
-    link.close()
 
 
 def test_a_page_that_may_only_look_is_no_operator(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -190,7 +182,7 @@ def test_of_servers_that_share_a_store_the_one_that_leads_gives_the_order(
     house: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """And also the others say that an operator was at their pages, once for as long as nothing is new."""
-    watch, (link, control) = Watch(house), house.robot()
+    watch, (_, control) = Watch(house), house.robot()
     written: list[tuple[str, bytes]] = []
     store = SimpleNamespace(shared=True, leads=False, put_result=lambda *row: written.append(row))
     monkeypatch.setattr(watch.attendance, "_store", store)
@@ -203,7 +195,6 @@ def test_of_servers_that_share_a_store_the_one_that_leads_gives_the_order(
     store.leads = True
     watch.after(1.0)
     assert control.report is not None and control.report.order.kind is MissionKind.STOP
-    link.close()
 
 
 def test_a_store_that_takes_nothing_keeps_no_robot_from_standing(
@@ -212,13 +203,12 @@ def test_a_store_that_takes_nothing_keeps_no_robot_from_standing(
     def full(*_: object) -> None:
         raise InvalidFile("the database does not answer")
 
-    watch, (link, control) = Watch(house), house.robot()
+    watch, (_, control) = Watch(house), house.robot()
     monkeypatch.setattr(watch.attendance, "_store", SimpleNamespace(shared=True, leads=True, put_result=full))
     house.person.go("r0", str(THERE))
     watch.after(1.0)
     watch.after(GRACE)
     assert control.report is not None and control.report.order.kind is MissionKind.STOP
-    link.close()
 
 
 def _still(count: Callable[[], int]) -> bool:

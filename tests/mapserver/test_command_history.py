@@ -62,25 +62,22 @@ def test_missions_and_stops_are_in_the_history_with_who_and_why(house: House) ->
     assert commands(house)[-1] == 'r0: stop, by anna: "a wet floor" (mission ID, as r0 says)'
     # It outlasts the server, and is no part of the map.
     before = commands(house)
-    house.stop_server()
-    house.start_server()
+    house.restart_server()
     assert commands(house) == before
     assert not any(event.kind is MapEventKind.COMMANDED for event in house.person.map().history)
-    link.close()
 
 
 def test_a_command_is_an_event_at_once(house: House) -> None:
-    link, _ = house.robot()
+    house.robot()
     events = house.person.events(30.0)
     house.person.explore("r0")
     event = next(one for one in events if isinstance(one, MapEvent) and one.kind is MapEventKind.COMMANDED)
     assert event.words.startswith("r0: explore, by anna (mission ")
     events.close()  # type: ignore[attr-defined]
-    link.close()
 
 
 def test_a_drive_by_hand_is_in_the_history(house: House) -> None:
-    link, _ = house.robot()
+    house.robot()
     begin = 1_772_366_400_250_000_000
     for over in (False, False, True, True):
         drive = HandDrive("anna", begin, over)
@@ -88,17 +85,15 @@ def test_a_drive_by_hand_is_in_the_history(house: House) -> None:
         house.server._hear(status)
     by = "by anna since 2026-03-01 12:00:00.250 UTC (as r0 says)"
     assert commands(house) == [f"r0: driven by hand, {by}", f"r0: the drive by hand is over, {by}"]
-    link.close()
 
 
 def test_the_reason_of_the_shell_goes_with_the_mission(monkeypatch: pytest.MonkeyPatch, house: House) -> None:
-    link, control = house.robot()
+    _, control = house.robot()
     monkeypatch.setattr("mapweave.commands.missions.fleet_of", lambda arguments: house.person)
     monkeypatch.setattr(type(house.person), "close", lambda self: None)
     for command in (["go", "r0", str(THERE)], ["explore", "r0"], ["stop", "r0"], ["stop", "--all"]):
         assert main([*command, "--because", "a guest waits"]) == 0
         assert control.report is not None and control.report.order.because == "a guest waits"
-    link.close()
 
 
 class Record:

@@ -32,6 +32,10 @@ from tests.waiting import eventually
 THERE = NodeId("r0", 1, 3)
 
 
+def standing(robot: str) -> AgentStatus:
+    return AgentStatus(Status("standing", "", 0, 0, Pose2(), False), 1, robot, 1)
+
+
 def test_a_robot_is_sent_and_reports_and_all_can_see_it(house: House) -> None:
     link, control = house.robot()
     entry = house.entry("r0")
@@ -55,7 +59,6 @@ def test_a_robot_is_sent_and_reports_and_all_can_see_it(house: House) -> None:
     with pytest.raises(InvalidValue, match="there is no robot r9; there are: r0"):
         house.person.missions("r9")
     assert house.entry("r0").status.mission.reason == "a wall"
-    link.close()
 
 
 def test_no_mission_is_older_than_what_waiting_for_it_has_returned(
@@ -80,7 +83,6 @@ def test_no_mission_is_older_than_what_waiting_for_it_has_returned(
     reporting.join()
     assert waited.state is MissionState.FAILED
     assert house.person.missions() == (waited,)
-    link.close()
 
 
 @pytest.mark.parametrize(
@@ -94,11 +96,10 @@ def test_no_mission_is_older_than_what_waiting_for_it_has_returned(
     ],
 )
 def test_a_goal_that_does_not_exist_is_refused_at_once(house: House, goal: str, reason: str) -> None:
-    link, control = house.robot()
+    _, control = house.robot()
     with pytest.raises(InvalidValue, match=reason):
         house.person.go("r0", goal)
     assert control.report is None and house.person.missions() == ()
-    link.close()
 
 
 @pytest.mark.parametrize(
@@ -123,39 +124,32 @@ def test_a_place_on_the_way_that_does_not_exist_is_not_called_the_goal(
 
 
 def test_a_position_leads_to_the_nearest_node(house: House) -> None:
-    link, _ = house.robot()
+    house.robot()
     merged = house.server._worker.current().merged
     place = merged.pose(THERE)
     report = house.person.go("r0", f"{place.x + 0.01:.3f}, {place.y - 0.01:.3f}")
     assert report.order.node is not None
     assert merged.pose(report.order.node).distance(place) < 0.05
-    link.close()
 
 
 def test_a_robot_that_is_away_gets_its_newest_mission_when_it_is_back(house: House) -> None:
-    link, _ = house.robot()
-    link.close()
-    eventually(lambda: not house.entry("r0").alive)
+    house.robot_that_left()
     first = house.person.go("r0", str(THERE))
     assert first.state is MissionState.SENT and "when it is back" in first.reason
     second = house.person.explore("r0")
-    house.stop_server()
-    house.start_server()
+    house.restart_server()
     states = [report.state for report in house.person.missions()]
     assert states == [MissionState.REPLACED, MissionState.SENT], "the record outlasts the server"
-    link, control = house.robot()
+    _, control = house.robot()
     eventually(lambda: control.report is not None)
     assert control.report == MissionReport(second.order, MissionState.RUNNING)
     eventually(lambda: house.person.missions()[-1].state is MissionState.RUNNING)
-    link.close()
 
 
 @pytest.mark.parametrize("by", ["name", "all", "http"])
 def test_a_robot_that_is_away_gets_no_mission_from_before_it_was_stopped(house: House, by: str) -> None:
     """The stop failed, and the robot drove off once it was back."""
-    link, _ = house.robot()
-    link.close()
-    eventually(lambda: not house.entry("r0").alive)
+    house.robot_that_left()
     assert house.person.go("r0", str(THERE)).state is MissionState.SENT
     if by == "http":
         with Web(("127.0.0.1", 0), house.server) as web:
@@ -164,16 +158,15 @@ def test_a_robot_that_is_away_gets_no_mission_from_before_it_was_stopped(house: 
         states = [report.state for report in house.person.stop("r0" if by == "name" else "")]
     assert states == ["sent"], "who stops it must hear that it does not answer"
     assert [one.state for one in house.person.missions()] == [MissionState.REPLACED, MissionState.SENT]
-    link, control = house.robot()
+    _, control = house.robot()
     eventually(lambda: control.report is not None)
     assert control.report is not None and control.report.order.kind is MissionKind.STOP
-    link.close()
 
 
 def test_a_robot_that_drives_is_stopped_before_a_server_says_who_is_away(
     house: House, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    link, control = house.robot()
+    _, control = house.robot()
     asked: list[bool] = []
 
     def slow(person: fleet.Fleet) -> set[str]:
@@ -184,7 +177,6 @@ def test_a_robot_that_drives_is_stopped_before_a_server_says_who_is_away(
     house.person.explore("r0")
     assert [report.order.robot for report in house.person.stop()] == ["r0"]
     assert asked == [True]
-    link.close()
 
 
 def test_a_goal_is_of_the_map_that_a_robot_makes_now(house: House) -> None:
@@ -195,9 +187,7 @@ def test_a_goal_is_of_the_map_that_a_robot_makes_now(house: House) -> None:
     assert house.entry("r0").status is None
     assert house.person.go("r0", "home").order.node == first
     alive.close()
-    link, _ = house.robot()
-    link.close()
-    eventually(lambda: not house.entry("r0").alive)
+    house.robot_that_left()
     assert house.person.go("r0", "home").order.node == first
     bus.announce(KEYS.agent_alive(ROBOT._replace(epoch=2)))
     eventually(lambda: house.entry("r0").alive)
@@ -206,7 +196,7 @@ def test_a_goal_is_of_the_map_that_a_robot_makes_now(house: House) -> None:
 
 
 def test_a_robot_whose_map_is_retired_hears_why_it_has_no_home(house: House) -> None:
-    link, _ = house.robot()
+    house.robot()
     eventually(lambda: house.entry("r0").alive)
     house.person.retire(str(ROBOT), because="before the move")
     assert house.server.settle(30.0)
@@ -214,13 +204,10 @@ def test_a_robot_whose_map_is_retired_hears_why_it_has_no_home(house: House) -> 
         InvalidValue, match=r'^r0 has no home: map r0\.1 is retired by .*: "before the move"$'
     ):
         house.person.go("r0", "home")
-    link.close()
 
 
 def test_a_mission_for_a_robot_that_stays_away_expires(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
-    link, _ = house.robot()
-    link.close()
-    eventually(lambda: not house.entry("r0").alive)
+    house.robot_that_left()
     monkeypatch.setattr(mission_relay, "EXPIRY", 0.0)
     house.person.explore("r0")
     eventually(lambda: house.person.missions()[-1].state is MissionState.FAILED)
@@ -235,12 +222,11 @@ def test_a_robot_that_was_never_heard_of_gets_no_mission(house: House) -> None:
 def test_the_refusal_names_the_robots_that_there_are(house: House) -> None:
     with pytest.raises(InvalidValue, match=r"no robot r7 has been heard of$"):
         house.person.explore("r7")
-    link, _ = house.robot()
+    house.robot()
     eventually(lambda: house.entry("r0").alive)
     for name, rest in (("r00", r" \(is it r0\?\)$"), ("gustav", "; there are: r0$")):
         with pytest.raises(InvalidValue, match=f"no robot {name} has been heard of{rest}"):
             house.person.explore(name)
-    link.close()
 
 
 def test_a_robot_says_nothing_of_the_missions_of_others(house: House) -> None:
@@ -252,7 +238,7 @@ def test_a_robot_says_nothing_of_the_missions_of_others(house: House) -> None:
     liar, gives = house.bus(), [lie]
     liar.announce(KEYS.agent_alive(MapId("r1", 1)))
     liar.serve(KEYS.mission("r1"), lambda request: request.reply(encode(gives[0])))
-    status = AgentStatus(Status("standing", "", 0, 0, Pose2(), False), 1, "r1", 1)
+    status = standing("r1")
     liar.publish(KEYS.agent_status("r1"), encode(status))
     eventually(lambda: house.entry("r1").status == status)
     for gives[0] in (lie, newer):
@@ -264,17 +250,16 @@ def test_a_robot_says_nothing_of_the_missions_of_others(house: House) -> None:
     held = [one for one in house.person.missions("r0") if one.order.id == report.order.id]
     assert held == [control.report] == [report]
     assert house.entry("r1").status == status
-    link.close()
 
 
 @pytest.mark.slow
 def test_one_robot_displaces_no_missions_of_others(house: House) -> None:
     """By very many missions with stamps of the far future, which it says that it has, or is to get."""
-    link, _ = house.robot()
+    house.robot()
     report = house.person.explore("r0")
     liar = house.bus()
     liar.announce(KEYS.agent_alive(MapId("r1", 1)))
-    status = AgentStatus(Status("standing", "", 0, 0, Pose2(), False), 1, "r1", 1)
+    status = standing("r1")
 
     def say(mission_id: str, state: MissionState) -> None:
         order = MissionOrder(mission_id, "r1", MissionKind.EXPLORE, MAX_STAMP_NS, "anna")
@@ -289,16 +274,14 @@ def test_one_robot_displaces_no_missions_of_others(house: House) -> None:
     missions = house.person.missions()
     assert [one for one in missions if one.order.robot == "r0"] == [report] and len(missions) == MAX_KEPT
     assert all(one.state is not MissionState.SENT for one in missions), "only the server sends missions"
-    house.stop_server()
-    house.start_server()
+    house.restart_server()
     assert report in house.person.missions()
     assert house.person.go("r0", str(THERE)) in house.person.missions()
-    link.close()
 
 
 def test_a_robot_that_says_it_is_very_far_away_hides_no_other(house: House) -> None:
     """Where it is by its own words lies beyond the range of messages."""
-    link, _ = house.robot()
+    house.robot()
     liar, there = house.bus(), Pose2(1e6, 1e6, 0.0)
     liar.announce(KEYS.agent_alive(MapId("r1", 1)))
     for number, fix in enumerate(sorted(house.mapped.truth)):
@@ -311,11 +294,10 @@ def test_a_robot_that_says_it_is_very_far_away_hides_no_other(house: House) -> N
         )
         entry = house.entry("r0")
         assert entry.merged_from_robot is not None and entry.component == 0
-    link.close()
 
 
 def test_a_robot_that_was_stopped_on_its_way_is_shown_where_it_stands(house: House) -> None:
-    link, _ = house.robot()
+    house.robot()
     bus, aside = house.bus(), Pose2(0.1, 0.0, 0.2)
     node = min(house.mapped.truth)  # the merged frame is that of the smallest node
     bus.announce(KEYS.agent_alive(MapId("r1", 1)))
@@ -324,18 +306,16 @@ def test_a_robot_that_was_stopped_on_its_way_is_shown_where_it_stands(house: Hou
     eventually(lambda: house.entry("r1").merged_from_robot is not None)
     known = house.entry("r1").merged_from_robot
     assert known is not None and known.vector == pytest.approx(aside.vector)
-    link.close()
 
 
 def test_a_robot_does_not_say_what_was_ordered(house: House) -> None:
-    link, _ = house.robot()
+    house.robot()
     report = house.person.explore("r0")
     other = replace(report.order, kind=MissionKind.STOP, by="bert", stamp_ns=1)
     status = replace(house.entry("r0").status, mission=MissionReport(other, MissionState.DONE, 1.0))
     house.bus().publish(KEYS.agent_status("r0"), encode(status))
     eventually(lambda: house.person.missions()[0].state is MissionState.DONE)
     assert house.person.missions()[0].order == report.order
-    link.close()
 
 
 @pytest.mark.parametrize("by_http", [False, True])
@@ -343,7 +323,7 @@ def test_no_robot_keeps_others_from_being_stopped(
     house: House, monkeypatch: pytest.MonkeyPatch, by_http: bool
 ) -> None:
     """Robots that hang, that answer nonsense, and after whose mission none can come."""
-    link, control = house.robot()
+    _, control = house.robot()
     monkeypatch.setattr(mission_relay, "ANSWER", 20.0)
     monkeypatch.setattr(fleet, "ANSWERED", 20.0)
     over, bus = threading.Event(), house.bus()
@@ -356,7 +336,7 @@ def test_no_robot_keeps_others_from_being_stopped(
     for name, answer in answers.items():
         bus.announce(KEYS.agent_alive(MapId(name, 1)))
         (house.bus() if name == "a2" else bus).serve(KEYS.mission(name), answer)
-        new = AgentStatus(Status("standing", "", 0, 0, Pose2(), False), 1, name, 1)
+        new = standing(name)
         if name == "a1":
             new = replace(new, mission=MissionReport(last, MissionState.RUNNING))
         bus.publish(KEYS.agent_status(name), encode(new))
@@ -384,7 +364,6 @@ def test_no_robot_keeps_others_from_being_stopped(
         ]  # fmt: skip
     else:
         assert "a0" in errors[0]
-    link.close()
 
 
 def test_robots_that_hang_keep_no_other_from_a_mission_that_waits(
@@ -398,9 +377,7 @@ def test_robots_that_hang_keep_no_other_from_a_mission_that_waits(
         bus.publish(KEYS.agent_status(name), encode(standing(name)))
         eventually(lambda name=name: house.entry(name).status is not None)
         assert house.person.explore(name).state is MissionState.SENT
-    link, _ = house.robot()
-    link.close()
-    eventually(lambda: not house.entry("r0").alive)
+    house.robot_that_left()
     house.person.explore("r0")
     monkeypatch.setattr(mission_relay, "ANSWER", 5.0)
     for name in names:
@@ -408,26 +385,20 @@ def test_robots_that_hang_keep_no_other_from_a_mission_that_waits(
         other.serve(KEYS.mission(name), lambda request: (over.wait(60.0), request.reply(b"?")))
         other.announce(KEYS.agent_alive(MapId(name, 1)))
     eventually(lambda: all(house.entry(name).alive for name in names))
-    link, control = house.robot()
+    _, control = house.robot()
     eventually(lambda: control.report is not None, 20.0)
     over.set()
-    link.close()
-
-
-def standing(robot: str) -> AgentStatus:
-    return AgentStatus(Status("standing", "", 0, 0, Pose2(), False), 1, robot, 1)
 
 
 def test_a_mission_of_far_ahead_is_refused(house: House) -> None:
     """Behind the greatest stamp no order could come, not even to stop."""
-    link, control = house.robot()
+    _, control = house.robot()
     for stamp_ns in (MAX_STAMP_NS, time.time_ns() + 2 * 86_400 * 10**9):
         request = MissionRequest(new_id(), "r0", MissionKind.EXPLORE, stamp_ns, "eve")
         with pytest.raises(InvalidValue, match=r"days ahead of the server's clock"):
             house.server.command(request)
     assert control.report is None and house.person.missions() == ()
     assert house.person.explore("r0").state is MissionState.RUNNING
-    link.close()
 
 
 def test_without_a_server_orders_go_to_the_robot_directly(house: House) -> None:
@@ -451,7 +422,7 @@ def test_without_a_server_orders_go_to_the_robot_directly(house: House) -> None:
 
 @pytest.mark.parametrize("with_server", [True, False])
 def test_a_person_whose_clock_is_behind_can_still_stop_a_robot(house: House, with_server: bool) -> None:
-    link, control = house.robot()
+    _, control = house.robot()
     # By an hour: what is a day ahead no server hands on.
     ahead = MissionOrder("late", "r0", MissionKind.EXPLORE, time.time_ns() + 3_600_000_000_000, "bob")
     control.take(ahead)
@@ -461,13 +432,12 @@ def test_a_person_whose_clock_is_behind_can_still_stop_a_robot(house: House, wit
     assert report.state is MissionState.RUNNING and report.order.rank > ahead.rank
     again = house.person.go("r0", "r1.1.1" if not with_server else str(THERE))
     assert again.state is MissionState.RUNNING and control.report == replace(again, reason="")
-    link.close()
 
 
 @pytest.mark.parametrize("with_server", [True, False])
 def test_a_direct_order_of_far_ahead_leaves_later_orders(house: House, with_server: bool) -> None:
     """The robot takes it, as its own clock may be wrong; what is ordered later holds all the same."""
-    link, control = house.robot()
+    _, control = house.robot()
     control.take(MissionOrder("absurd", "r0", MissionKind.EXPLORE, MAX_STAMP_NS, "eve"))
     if not with_server:
         house.stop_server()
@@ -480,7 +450,6 @@ def test_a_direct_order_of_far_ahead_leaves_later_orders(house: House, with_serv
     if with_server:
         known = {report.order.id: report.state for report in house.person.missions()}
         assert [known.get(which) for which in ("absurd", "again")].count(MissionState.RUNNING) == 0
-    link.close()
 
 
 def test_the_map_comes_as_a_map_file(house: House) -> None:

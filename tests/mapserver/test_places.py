@@ -38,7 +38,7 @@ from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode, encode_view
 from synthetic.maps import looking_around, map_tours, write_store
 from synthetic.world import room, take_view
-from tests.mapserver.house import KEYS, House, MappedRoom, ask
+from tests.mapserver.house import KEYS, STANDING, House, MappedRoom, ask
 from tests.waiting import eventually
 
 THERE = NodeId("r0", 1, 3)
@@ -64,9 +64,8 @@ def test_a_place_stands_wherever_a_node_may_stand_and_outlasts_the_server(house:
             RelocalizeAnswer,
         )
         assert (answer.certainty, answer.candidates[0].place) == (Certainty.FOUND, "kitchen")
-        house.stop_server()
-        house.start_server()
-        eventually(lambda: house.entry("r0").status is not None or link.report(link_status(), 3))
+        house.restart_server()
+        eventually(lambda: house.entry("r0").status is not None or link.report(STANDING, 3))
     with pytest.raises(
         InvalidValue, match=r"'kitchn' is no place of this map \(is it kitchen\?\): give a node"
     ):
@@ -87,17 +86,8 @@ def test_a_place_stands_wherever_a_node_may_stand_and_outlasts_the_server(house:
         "place hall",
         "place kitchen",
     ]
-    assert (
-        unpack_map_file(person.map_bytes()).annotations == person.annotations().made
-        and len(person.annotations().made) == 3
-    )
-    link.close()
-
-
-def link_status():
-    from mapweave.hybridmap.agent_status import Status
-
-    return Status("standing", "", 7, 0, Pose2(0.0, 0.1, 0.0), False, "explore", located=True)
+    made = person.annotations().made
+    assert unpack_map_file(person.map_bytes()).annotations == made and len(made) == 3
 
 
 def test_a_letter_with_an_accent_is_the_same_however_it_is_written(
@@ -105,8 +95,8 @@ def test_a_letter_with_an_accent_is_the_same_however_it_is_written(
 ) -> None:
     """As one character, as most keyboards do, or as a letter with an accent behind it."""
     one, two = "caf\u00e9", "cafe\u0301"
-    person, (link, _) = house.person, house.robot()
-    path = tmp_path / "room.mapweave"
+    person, path = house.person, tmp_path / "room.mapweave"
+    house.robot()
     person.save(path)
     assert person.annotate("place", two, node=str(THERE)).startswith(f"place {one} is node")
     for name in (one, two):
@@ -118,7 +108,6 @@ def test_a_letter_with_an_accent_is_the_same_however_it_is_written(
     assert not person.annotations().in_force(Place)
     with pytest.raises(InvalidValue):
         person.go("r0", one)
-    link.close()
     # Likewise in a file.
     assert main(["place", "add", two, str(THERE), "--map", str(path)]) == 0
     assert main(["place", "add", one, str(THERE), "--map", str(path)]) == NO

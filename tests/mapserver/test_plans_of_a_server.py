@@ -76,8 +76,7 @@ def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> 
         placed = fleet.plans().plan("flat")
         assert np.allclose(placed.part().plan_from_merged.vector, PLAN_FROM_MERGED.vector, atol=1e-6)
         assert fleet.plan_image(placed.plan.image.sha256) == PNG.png
-        house.stop_server()
-        house.start_server()
+        house.restart_server()
     content = map_of(fleet)
     assert content.images == {PNG.image.sha256: PNG.png}
     # One whose image the disk has damaged takes no map along.
@@ -85,8 +84,7 @@ def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> 
     for damaged in (b"", PNG.png[:-1]):
         kept.write_bytes(damaged)
         # The packed map is kept as long as nothing changes.
-        house.stop_server()
-        house.start_server()
+        house.restart_server()
         assert house.server.settle(20.0)
         assert len(map_of(fleet).poses) == 7 and map_of(fleet).images == {}
     fleet.withdraw("plan", "flat")
@@ -119,8 +117,7 @@ def test_a_pinned_frame_is_what_everything_of_a_server_is_in(house: House) -> No
     after = fleet.plans().plan("flat").part().plan_from_merged @ pose
     assert np.allclose(after.vector, before.vector, atol=1e-6)
     assert merged_of(map_of(fleet)).pose(node) == pose
-    house.stop_server()
-    house.start_server()
+    house.restart_server()
     assert pose_of(fleet, node) == pose, "also before nodes are compared"
     assert house.server.settle(20.0)
     # A pin without a pose holds its node where it is.
@@ -182,7 +179,7 @@ def test_answers_and_goals_in_coordinates_of_a_plan(
     fleet.put_plan_image(PNG.png)
     assert house.server.settle(20.0)
     fleet.annotate("plan", "flat", **fields())
-    link, _ = house.robot()
+    house.robot()
     (robot,) = fleet.status(plan="flat").robots
     assert robot.merged_from_robot is not None and robot.plan_from_robot is not None
     on_plan = (PLAN_FROM_MERGED @ robot.merged_from_robot).vector
@@ -226,7 +223,6 @@ def test_answers_and_goals_in_coordinates_of_a_plan(
         fleet.go("r0", goal, plan="none")
     with pytest.raises(InvalidValue, match="no plan 'none'"):
         fleet.status(plan="none")
-    link.close()
 
 
 def test_a_photograph_is_placed_on_the_plan_of_a_file(house: House) -> None:

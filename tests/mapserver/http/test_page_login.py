@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import hashlib
 import os
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -19,7 +18,7 @@ from mapweave.mapserver.http.tls import server_context
 from mapweave.mapserver.http.web import Web
 from mapweave.wire.credentials import Role
 from tests.browser import PROGRAMS, Browser, there_is_none
-from tests.mapserver.house import House, MappedRoom
+from tests.mapserver.house import House
 from tests.mapserver.stub_services import StubServices
 from tests.waiting import eventually
 
@@ -43,11 +42,8 @@ fetch("constraints", { method: "POST", headers: { "Content-Type": "application/j
 
 
 @pytest.mark.slow
-def test_a_viewer_looks_and_an_operator_commands(
-    mapped_room: Callable[[], MappedRoom], tmp_path: Path
-) -> None:
-    house = House(mapped_room())
-    link, control = house.robot()
+def test_a_viewer_looks_and_an_operator_commands(house: House, tmp_path: Path) -> None:
+    _, control = house.robot()
     folder = KeyFolder.create(tmp_path / "keys", "fleet", Profile.LAB, [], "s0")
     tokens = {}
     for name, role in (("vera", Role.VIEWER), ("otto", Role.OPERATOR)):
@@ -107,8 +103,6 @@ def test_a_viewer_looks_and_an_operator_commands(
         folder.revoke("otto", "left")
         eventually(lambda: page.run(FORM))
         assert page.run(SUMMARY) == "", "nothing of the fleet is left on the page"
-    link.close()
-    house.close()
 
 
 @pytest.mark.slow

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import tempfile
 from collections.abc import Sequence
-from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
@@ -114,51 +113,41 @@ def test_a_disk_that_is_full_in_the_middle_of_a_group_keeps_what_fits(
 
 
 def test_nothing_of_a_failed_group_is_acknowledged_and_all_of_it_comes_later(
-    hub: MemoryHub, tmp_path: Path
+    hub: MemoryHub, server: Server
 ) -> None:
-    with ExitStack() as closing:
-        server = Server(hub, tmp_path / "s0.sqlite")
-        closing.callback(server.end)
-        agents = [HandAgent(hub, map_id) for map_id in MAPS]
-        for agent in agents:
-            closing.callback(agent.bus.close)
-            agent.serve(3)
-        apply_all, broken = server.store.apply_all, [True]
+    agents = [HandAgent(hub, map_id) for map_id in MAPS]
+    for agent in agents:
+        agent.serve(3)
+    apply_all, broken = server.store.apply_all, [True]
 
-        def fail(runs: list[LogChanges]) -> list[Applied | MapweaveError]:
-            if broken:
-                return [InvalidFile("s0.sqlite: map store cannot be used (disk I/O error)") for _ in runs]
-            return apply_all(runs)
+    def fail(runs: list[LogChanges]) -> list[Applied | MapweaveError]:
+        if broken:
+            return [InvalidFile("s0.sqlite: map store cannot be used (disk I/O error)") for _ in runs]
+        return apply_all(runs)
 
-        server.store.apply_all = fail  # type: ignore[assignment, method-assign]
-        for agent in agents:
-            for sequence in (1, 2, 3):
-                agent.publish(sequence)
-        eventually(lambda: server.ingest.counters().failures >= len(MAPS))
-        assert not any(agent.acks for agent in agents) and not server.seen
-        broken.clear()
-        eventually(lambda: all(agent.acks and agent.acks[-1].watermark == 3 for agent in agents))
-        assert sorted((c.map, c.sequence) for c in server.seen) == [(m, k) for m in MAPS for k in (1, 2, 3)]
+    server.store.apply_all = fail  # type: ignore[assignment, method-assign]
+    for agent in agents:
+        agent.publish_each(1, 2, 3)
+    eventually(lambda: server.ingest.counters().failures >= len(MAPS))
+    assert not any(agent.acks for agent in agents) and not server.seen
+    broken.clear()
+    eventually(lambda: all(agent.acks and agent.acks[-1].watermark == 3 for agent in agents))
+    assert sorted((c.map, c.sequence) for c in server.seen) == [(m, k) for m in MAPS for k in (1, 2, 3)]
 
 
-def test_changes_that_wait_are_committed_together(hub: MemoryHub, tmp_path: Path) -> None:
-    with ExitStack() as closing:
-        server = Server(hub, tmp_path / "s0.sqlite")
-        closing.callback(server.end)
-        agents = [HandAgent(hub, map_id) for map_id in MAPS]
-        apply_all, groups = server.store.apply_all, list[int]()
+def test_changes_that_wait_are_committed_together(hub: MemoryHub, server: Server) -> None:
+    agents = [HandAgent(hub, map_id) for map_id in MAPS]
+    apply_all, groups = server.store.apply_all, list[int]()
 
-        def slow_disk(runs: list[LogChanges]) -> list[Applied | MapweaveError]:
-            groups.append(len(runs))
-            if len(groups) == 1:
-                for agent in agents[1:]:
-                    agent.publish(1)
-                eventually(lambda: server.ingest.waiting == len(agents) - 1)
-            return apply_all(runs)
+    def slow_disk(runs: list[LogChanges]) -> list[Applied | MapweaveError]:
+        groups.append(len(runs))
+        if len(groups) == 1:
+            for agent in agents[1:]:
+                agent.publish(1)
+            eventually(lambda: server.ingest.waiting == len(agents) - 1)
+        return apply_all(runs)
 
-        server.store.apply_all = slow_disk  # type: ignore[assignment, method-assign]
-        for agent in agents:
-            closing.callback(agent.bus.close)
-        agents[0].publish(1)
-        eventually(lambda: all(agent.acks for agent in agents))
-        assert groups == [1, len(agents) - 1]
+    server.store.apply_all = slow_disk  # type: ignore[assignment, method-assign]
+    agents[0].publish(1)
+    eventually(lambda: all(agent.acks for agent in agents))
+    assert groups == [1, len(agents) - 1]

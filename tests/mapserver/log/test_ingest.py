@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -27,8 +27,7 @@ from tests.waiting import eventually
 
 
 def test_changes_are_applied_and_acknowledged(server: Server, agent: HandAgent) -> None:
-    for sequence in (1, 2, 3):
-        agent.publish(sequence)
+    agent.publish_each(1, 2, 3)
     eventually(lambda: agent.acks and agent.acks[-1] == Ack(MAP, LOG_ID, 3, (), server.store.id))
     eventually(lambda: server.sequences == [1, 2, 3])
     assert server.store.watermark(MAP) == 3
@@ -45,8 +44,7 @@ def test_a_change_is_on_the_disk_before_it_is_acknowledged(server: Server, agent
 def test_a_robot_that_is_reminded_hears_again_what_is_settled_of_that_log(
     server: Server, agent: HandAgent
 ) -> None:
-    for sequence in (1, 2):
-        agent.publish(sequence)
+    agent.publish_each(1, 2)
     eventually(lambda: agent.acks and agent.acks[-1].watermark == 2)
     heard = len(agent.acks)
     server.ingest.remind(MapId(MAP.agent, MAP.epoch + 1))
@@ -63,20 +61,17 @@ def test_a_robot_that_is_reminded_hears_again_what_is_settled_of_that_log(
 
 
 def test_a_reordered_change_waits_for_its_turn_without_being_pulled(
-    hub: MemoryHub, agent: HandAgent, tmp_path: Path
+    started: Callable[..., Server], agent: HandAgent
 ) -> None:
     # A busy machine may deliver the next one a good while later.
-    server = Server(hub, tmp_path / "s0.sqlite", settings=IngestSettings(PullSettings(grace=600.0)))
-    for sequence in (1, 3, 2, 4):
-        agent.publish(sequence)
+    server = started(settings=IngestSettings(PullSettings(grace=600.0)))
+    agent.publish_each(1, 3, 2, 4)
     eventually(lambda: server.sequences == [1, 2, 3, 4])
     assert server.ingest.counters().pulls == 0
-    server.end()
 
 
 def test_doubles_are_counted_and_dropped(server: Server, agent: HandAgent) -> None:
-    for sequence in (1, 1, 2, 1, 2, 2):
-        agent.publish(sequence)
+    agent.publish_each(1, 1, 2, 1, 2, 2)
     eventually(lambda: server.ingest.counters().messages == 6)
     eventually(lambda: server.sequences == [1, 2])
     # Each message is counted as such before it turns out to be a double.
@@ -86,8 +81,7 @@ def test_doubles_are_counted_and_dropped(server: Server, agent: HandAgent) -> No
 def test_a_gap_is_pulled_and_only_the_gap(server: Server, agent: HandAgent) -> None:
     agent.serve(9)
     agent.publish(1)
-    for sequence in (5, 6):
-        agent.publish(sequence)
+    agent.publish_each(5, 6)
     eventually(lambda: server.sequences == [1, 2, 3, 4, 5, 6])
     # With what it has before, by which the agent sees whether that is its log.
     before = zlib.crc32(unwrap_body(agent.log[1])[2])
@@ -103,9 +97,8 @@ def test_a_beacon_alone_brings_everything_in_chunks(server: Server, agent: HandA
 
 
 def test_a_store_that_cannot_be_read_is_no_line_for_each_pull(
-    hub: MemoryHub,
+    started: Callable[..., Server],
     agent: HandAgent,
-    tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -118,14 +111,13 @@ def test_a_store_that_cannot_be_read_is_no_line_for_each_pull(
 
     monkeypatch.setattr(SqliteStore, "newest_change", newest_change)
     settings = IngestSettings(PullSettings(grace=0.01, first_pause=0.01, longest_pause=0.02))
-    server = Server(hub, tmp_path / "s0.sqlite", settings=settings)
+    server = started(settings=settings)
     agent.serve(3)
     agent.beacon(3)
     eventually(lambda: server.ingest.counters().pulls >= 5)
     assert not agent.asked and "the store is away" not in caplog.text
     away[0] = False
     eventually(lambda: server.sequences == [1, 2, 3])
-    server.end()
 
 
 def test_a_shorter_answer_than_asked_for_goes_on_where_it_ends(server: Server, agent: HandAgent) -> None:
@@ -212,8 +204,7 @@ def test_a_refusal_is_behind_the_acknowledgement_that_a_beacon_asks_for(
 
 def test_a_restarted_server_replays_and_goes_on(server: Server, agent: HandAgent) -> None:
     agent.serve(5)
-    agent.publish(1)
-    agent.publish(2)
+    agent.publish_each(1, 2)
     eventually(lambda: server.sequences == [1, 2])
     server.end()
     agent.publish(3)
@@ -229,8 +220,7 @@ def test_two_servers_are_each_complete(
 ) -> None:
     other = Server(hub, tmp_path / "s1.sqlite", "s1")
     agent.serve(5)
-    for sequence in (1, 2, 3, 5):
-        agent.publish(sequence)
+    agent.publish_each(1, 2, 3, 5)
     eventually(lambda: server.sequences == other.sequences == [1, 2, 3, 4, 5])
     other.end()
 
@@ -243,7 +233,6 @@ def test_a_fresh_epoch_is_another_map(hub: MemoryHub, server: Server, agent: Han
     fresh.publish(2)
     eventually(lambda: server.store.watermark(fresh.map) == 2)
     assert server.store.watermark(MAP) == 1
-    fresh.bus.close()
 
 
 def test_the_pause_doubles_and_a_sign_of_life_ends_it() -> None:
@@ -277,8 +266,7 @@ def test_memory_for_changes_ahead_is_bounded() -> None:
 
 
 def test_messages_while_closing_are_no_error(server: Server, agent: HandAgent) -> None:
-    for sequence in range(1, 50):
-        agent.publish(sequence)
+    agent.publish_each(*range(1, 50))
     server.ingest.close()
     server.ingest.close()
     server.ingest._hear(Sample(KEYS.head(MAP), b""))

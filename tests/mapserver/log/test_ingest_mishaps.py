@@ -6,7 +6,6 @@ import logging
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -138,9 +137,11 @@ def test_an_agent_that_cannot_be_asked_is_asked_less_and_less(server: Server, ag
     eventually(lambda: server.sequences == [1, 2, 3, 4, 5])
 
 
-def test_a_silent_agent_does_not_hold_up_another(hub: MemoryHub, agent: HandAgent, tmp_path: Path) -> None:
+def test_a_silent_agent_does_not_hold_up_another(
+    hub: MemoryHub, agent: HandAgent, started: Callable[..., Server]
+) -> None:
     # Its silence is longer than the test waits for the other.
-    server = Server(hub, tmp_path / "s0.sqlite", settings=replace(QUICK, ask_timeout=600.0))
+    server = started(settings=replace(QUICK, ask_timeout=600.0))
     kept: list[Request] = []
     agent.bus.serve(KEYS.log(MAP), kept.append)
     agent.beacon(5)
@@ -150,8 +151,6 @@ def test_a_silent_agent_does_not_hold_up_another(hub: MemoryHub, agent: HandAgen
     other.beacon(3)
     eventually(lambda: server.store.watermark(other.map) == 3, seconds=1)
     kept[0].refuse("at last")
-    server.end()
-    other.bus.close()
 
 
 def test_another_log_under_the_same_name_is_refused(hub: MemoryHub, server: Server, agent: HandAgent) -> None:
@@ -166,7 +165,6 @@ def test_another_log_under_the_same_name_is_refused(hub: MemoryHub, server: Serv
     reason = "another log goes by the name r0.3 here: begin a fresh map"
     assert (ack.watermark, ack.refusals) == (0, (Refusal(0, reason),))
     assert server.sequences == [1]
-    impostor.bus.close()
 
 
 def test_messages_that_are_none_are_counted_and_change_nothing(server: Server, agent: HandAgent) -> None:
@@ -190,28 +188,24 @@ def test_a_consumer_that_fails_on_a_change_gets_the_next(
 
     server.on_change = choke
     with caplog.at_level(logging.ERROR):
-        agent.publish(1)
-        agent.publish(2)
+        agent.publish_each(1, 2)
         eventually(lambda: server.sequences == [1, 2])
     assert "choked" in caplog.text
 
 
 def test_a_disk_that_is_full_for_long_takes_nothing_from_what_a_robot_may_send(
-    hub: MemoryHub, agent: HandAgent, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    started: Callable[..., Server], agent: HandAgent, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # The clock stands: 1000 changes may come in all, those that are pulled and not stored included.
     quotas = Quotas(QuotaSettings(changes=1000.0 / BURST), lambda: 0.0)
-    server = Server(hub, tmp_path / "full.sqlite", quotas=quotas)
-    try:
-        agent.serve(600)
-        with monkeypatch.context() as patched:
-            patched.setattr(server.store, "apply_all", lambda runs: [InvalidFile("full") for _ in runs])
-            agent.beacon(600)
-            eventually(lambda: server.ingest.counters().failures >= 20)
-        eventually(lambda: server.store.watermark(MAP) == 600)
-        assert quotas.totals() == {}
-    finally:
-        server.end()
+    server = started(quotas=quotas)
+    agent.serve(600)
+    with monkeypatch.context() as patched:
+        patched.setattr(server.store, "apply_all", lambda runs: [InvalidFile("full") for _ in runs])
+        agent.beacon(600)
+        eventually(lambda: server.ingest.counters().failures >= 20)
+    eventually(lambda: server.store.watermark(MAP) == 600)
+    assert quotas.totals() == {}
 
 
 def test_a_disk_that_is_full_for_a_while(
@@ -224,8 +218,7 @@ def test_a_disk_that_is_full_for_a_while(
 
     with monkeypatch.context() as patched, caplog.at_level(logging.ERROR):
         patched.setattr(server.store, "apply_all", full)
-        for sequence in (1, 2, 3):
-            agent.publish(sequence)
+        agent.publish_each(1, 2, 3)
         eventually(lambda: server.ingest.counters().failures >= 3)
         assert "disk is full" in server.ingest.failure
     assert len(caplog.records) == 1, "one line, not one for each attempt"

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import logging
 import threading
-from collections.abc import Iterator
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 
@@ -34,22 +33,23 @@ from tests.mapserver.played import KEYS, LOG_ID, MAP, QUICK, HandAgent, Server
 from tests.waiting import eventually
 
 OTHER = MapId("r1", 1)
+Start = Callable[..., Server]
+Robot = tuple[MapId, Replicator]
 
 
 @pytest.fixture
-def cleanup() -> Iterator[ExitStack]:
-    with ExitStack() as stack:
-        yield stack
-
-
-def other_agent(hub: MemoryHub, cleanup: ExitStack, map_id: MapId = OTHER) -> HandAgent:
-    other = HandAgent(hub, map_id)
-    cleanup.callback(other.bus.close)
-    return other
+def robot(hub: MemoryHub, tmp_path: Path) -> Iterator[Robot]:
+    """Of a robot with an empty map: the map, and what sends its changes."""
+    journal = Journal(tmp_path / "r0.sqlite", "r0")
+    map_id = journal.open_map(1)
+    replicator = Replicator(MemoryBus(hub), KEYS, journal, map_id, ["s0"], AGENT)
+    yield map_id, replicator
+    replicator.close()
+    journal.close()
 
 
 def test_a_flood_of_one_robot_is_no_queue_for_another(
-    hub: MemoryHub, server: Server, agent: HandAgent, cleanup: ExitStack
+    hub: MemoryHub, server: Server, agent: HandAgent
 ) -> None:
     began, go = threading.Event(), threading.Event()
 
@@ -59,11 +59,10 @@ def test_a_flood_of_one_robot_is_no_queue_for_another(
         go.wait(60)
 
     server.on_change = hold
-    other = other_agent(hub, cleanup)
+    other = HandAgent(hub, OTHER)
     agent.publish(1)
     began.wait(60)
-    for sequence in range(2, 400):
-        agent.publish(sequence)
+    agent.publish_each(*range(2, 400))
     other.publish(1)
     eventually(lambda: len(server.ingest._work._items) == 399)
     go.set()
@@ -73,9 +72,9 @@ def test_a_flood_of_one_robot_is_no_queue_for_another(
 
 
 def test_a_pulled_log_is_no_queue_for_another_either(
-    hub: MemoryHub, server: Server, agent: HandAgent, cleanup: ExitStack
+    hub: MemoryHub, server: Server, agent: HandAgent
 ) -> None:
-    other = other_agent(hub, cleanup)
+    other = HandAgent(hub, OTHER)
 
     def publish_once(change: Change) -> None:
         if not server.seen:
@@ -90,18 +89,14 @@ def test_a_pulled_log_is_no_queue_for_another_either(
     assert [change.map for change in server.seen].index(OTHER) == pulled.AT_ONE_TURN
 
 
-def test_what_is_held_back_is_fetched_later_in_order(
-    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack
-) -> None:
+def test_what_is_held_back_is_fetched_later_in_order(started: Start, hub: MemoryHub) -> None:
     clock = Clock()
     quotas = Quotas(QuotaSettings(changes=10.0), clock)
-    server = Server(hub, tmp_path / "s0.sqlite", quotas=quotas)
-    cleanup.callback(server.end)
-    agent, other = other_agent(hub, cleanup, MAP), other_agent(hub, cleanup)
+    server = started(quotas=quotas)
+    agent, other = HandAgent(hub, MAP), HandAgent(hub, OTHER)
     at_once = round(10 * BURST)
     agent.serve(300)
-    for sequence in range(1, 301):
-        agent.publish(sequence)
+    agent.publish_each(*range(1, 301))
     other.publish(1)
     eventually(lambda: server.store.watermark(OTHER) == 1)
     eventually(lambda: "100 changes" in quotas.over().get("r0", ""))
@@ -118,14 +113,13 @@ def test_what_is_held_back_is_fetched_later_in_order(
 
 
 def test_a_robot_that_sends_more_than_its_quota_is_stored_at_the_rate_of_its_quota(
-    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+    started: Start, hub: MemoryHub, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """What it publishes behind a gap leaves room for the gap."""
     monkeypatch.setattr(quotas_module, "BURST", 1.0)
     clock = Clock()
-    server = Server(hub, tmp_path / "s0.sqlite", quotas=Quotas(QuotaSettings(changes=100.0), clock))
-    cleanup.callback(server.end)
-    agent = other_agent(hub, cleanup, MAP)
+    server = started(quotas=Quotas(QuotaSettings(changes=100.0), clock))
+    agent = HandAgent(hub, MAP)
     steps, sent, at_once = 20, 0, 100
     agent.serve(at_once + 14 * steps)
     for step in range(steps + 1):
@@ -144,13 +138,12 @@ def test_a_robot_that_sends_more_than_its_quota_is_stored_at_the_rate_of_its_quo
 
 
 def test_a_change_that_is_sent_again_and_again_is_shown_and_takes_nothing_from_new_ones(
-    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack
+    started: Start, hub: MemoryHub
 ) -> None:
     clock = Clock()
     quotas = Quotas(QuotaSettings(changes=10.0), clock)
-    server = Server(hub, tmp_path / "s0.sqlite", quotas=quotas)
-    cleanup.callback(server.end)
-    agent = other_agent(hub, cleanup, MAP)
+    server = started(quotas=quotas)
+    agent = HandAgent(hub, MAP)
     at_once = round(10 * BURST)
     agent.publish(1)
     eventually(lambda: server.store.watermark(MAP) == 1)
@@ -162,17 +155,16 @@ def test_a_change_that_is_sent_again_and_again_is_shown_and_takes_nothing_from_n
         agent.publish(1)
     eventually(lambda: server.ingest.counters().doubled == at_once + 150)
     assert quotas.over() == {"r0": "over its quota: 150 changes"}
-    for sequence in range(2, at_once + 1):
-        agent.publish(sequence)
+    agent.publish_each(*range(2, at_once + 1))
     eventually(lambda: server.store.watermark(MAP) == at_once)
     assert quotas.totals() == {"changes": 150}
 
 
 def test_one_map_too_many_is_refused_with_the_reason_until_there_is_room(
-    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack
+    started: Start, hub: MemoryHub
 ) -> None:
-    server = Server(hub, tmp_path / "s0.sqlite", quotas=Quotas(QuotaSettings(maps=3)))
-    agents = [other_agent(hub, cleanup, MapId("r0", epoch)) for epoch in range(1, 6)]
+    server = started(quotas=Quotas(QuotaSettings(maps=3)))
+    agents = [HandAgent(hub, MapId("r0", epoch)) for epoch in range(1, 6)]
     for agent in agents:
         agent.serve(2)
         agent.beacon(2)
@@ -183,37 +175,23 @@ def test_one_map_too_many_is_refused_with_the_reason_until_there_is_room(
     for agent in agents[3:]:
         refusals = [ack.refusals for ack in agent.acks if ack.map == agent.map]
         assert refusals and set(refusals) == {(Refusal(0, reason),)}
-    other = other_agent(hub, cleanup)
+    other = HandAgent(hub, OTHER)
     other.publish(1)
     eventually(lambda: server.store.watermark(OTHER) == 1)
     agents[0].publish(3)
     eventually(lambda: server.store.watermark(agents[0].map) == 3)
     assert len(server.store.maps()) == 4
-    server.end()
     server.quotas = None
-    server.begin()
-    cleanup.callback(server.end)
+    server.restart()
     eventually(lambda: [agent.beacon(2) for agent in agents] and len(server.store.maps()) == 6)
 
 
-def robot(hub: MemoryHub, tmp_path: Path, cleanup: ExitStack) -> tuple[MapId, Replicator]:
-    """A robot with an empty map, and what sends its changes."""
-    bus = MemoryBus(hub)
-    cleanup.callback(bus.close)
-    journal = Journal(tmp_path / "r0.sqlite", "r0")
-    cleanup.callback(journal.close)
-    map_id = journal.open_map(1)
-    replicator = Replicator(bus, KEYS, journal, map_id, ["s0"], AGENT)
-    cleanup.callback(replicator.close)
-    return map_id, replicator
-
-
 def test_nodes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
-    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+    started: Start, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
-    server = Server(hub, tmp_path / "s0.sqlite", quotas=Quotas(QuotaSettings(nodes=10)))
-    map_id, replicator = robot(hub, tmp_path, cleanup)
+    server = started(quotas=Quotas(QuotaSettings(nodes=10)))
+    map_id, replicator = robot
     rng = np.random.default_rng(1)
     puts = [node(map_id, number, rng) for number in range(1, 16)]
     again = [node(map_id, number, rng) for number in range(1, 6)]
@@ -221,24 +199,22 @@ def test_nodes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
     eventually(lambda: "r0 has 10 nodes" in replicator.status().failure)
     assert server.store.watermark(map_id) == 15, "ten nodes, five of them twice"
     assert replicator.unacknowledged() == 5
-    server.end()
     server.quotas = Quotas(QuotaSettings(nodes=15))
-    server.begin()
-    cleanup.callback(server.end)
+    server.restart()
     assert replicator.wait_acknowledged(60)
     eventually(lambda: not replicator.status().failure)
     assert [c.sequence for c in server.seen if c.map == map_id][-5:] == [16, 17, 18, 19, 20]
 
 
 def test_edges_beyond_the_quota_stay_on_the_robot_until_there_is_room(
-    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+    started: Start, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Two nodes may have as many edges as one likes, and each costs every merge: that of all robots."""
     monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
     monkeypatch.setattr(intake, "DRIVEN", 10)
     monkeypatch.setattr(intake, "EDGES", 2)
-    server = Server(hub, tmp_path / "s0.sqlite")
-    map_id, replicator = robot(hub, tmp_path, cleanup)
+    server = started()
+    map_id, replicator = robot
     rng = np.random.default_rng(1)
     nodes = [node(map_id, number, rng) for number in (1, 2)]
     again = [edge(map_id, 3 + number % 5, 1, 2) for number in range(40)]
@@ -250,15 +226,14 @@ def test_edges_beyond_the_quota_stay_on_the_robot_until_there_is_room(
     assert 14 <= kept <= 15 and replicator.unacknowledged() == 27 - kept
     monkeypatch.setattr(intake, "DRIVEN", 100)
     assert replicator.wait_acknowledged(60)
-    server.end()
 
 
 def test_a_node_that_is_put_again_and_again_fills_no_disk(
-    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+    started: Start, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(kept_bytes, "LEAST_GROWN", 20_000)
-    server = Server(hub, tmp_path / "s0.sqlite")
-    map_id, replicator = robot(hub, tmp_path, cleanup)
+    server = started()
+    map_id, replicator = robot
     rng = np.random.default_rng(1)
     start = [node(map_id, 1, rng), node(map_id, 2, rng), edge(map_id, 3, 1, 2)]
     again = [node(map_id, 2, rng) for _ in range(300)]
@@ -266,9 +241,7 @@ def test_a_node_that_is_put_again_and_again_fills_no_disk(
     replicator.submit([*start, *again], 1)
     assert replicator.wait_acknowledged(60)
     assert sent > 4 * server.store.stored_bytes(map_id, 0, 303), "most of it is superseded"
-    server.end()
-    server.begin()
-    cleanup.callback(server.end)
+    server.restart()
     replicator.submit([edge(map_id, 4, 1, 2)], 1)
     assert replicator.wait_acknowledged(60)
     assert server.store.stored_bytes(map_id, 0, 304) < 40_000, "once more after a start"
@@ -278,43 +251,40 @@ def test_a_node_that_is_put_again_and_again_fills_no_disk(
 
 
 def test_bytes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
-    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+    started: Start, robot: Robot, hub: MemoryHub, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
     monkeypatch.setattr(kept_bytes, "LEAST_GROWN", 10_000)
-    server = Server(hub, tmp_path / "s0.sqlite", quotas=Quotas(QuotaSettings(megabytes=0.2)))
-    cleanup.callback(server.end)
-    map_id, replicator = robot(hub, tmp_path, cleanup)
+    server = started(quotas=Quotas(QuotaSettings(megabytes=0.2)))
+    map_id, replicator = robot
     rng = np.random.default_rng(1)
     replicator.submit([node(map_id, number, rng) for number in range(1, 101)], 1)
     eventually(lambda: "`megabytes`" in replicator.status().failure)
     assert "MB of changes here, which is its quota" in replicator.status().failure
     kept = server.store.watermark(map_id)
     assert 10 < kept < 80 and server.store.stored_bytes(map_id, 0, kept) <= 200_000
-    other = other_agent(hub, cleanup)
+    other = HandAgent(hub, OTHER)
     other.publish(1)
     eventually(lambda: server.store.watermark(OTHER) == 1)
     # That its map is retired makes room for its next, and not for more of this one.
     server.retired.add(map_id)
-    following = other_agent(hub, cleanup, MapId("r0", 9))
+    following = HandAgent(hub, MapId("r0", 9))
     following.serve(5)
     following.beacon(5)
     eventually(lambda: server.store.watermark(following.map) == 5)
     assert server.store.watermark(map_id) == kept and replicator.unacknowledged() == 100 - kept
-    server.end()
     server.quotas = Quotas(QuotaSettings(megabytes=1.0))
-    server.begin()
+    server.restart()
     assert replicator.wait_acknowledged(60)
 
 
 def test_what_was_pruned_makes_room_for_the_robot(
-    hub: MemoryHub, tmp_path: Path, cleanup: ExitStack, monkeypatch: pytest.MonkeyPatch
+    started: Start, robot: Robot, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Also where its map grows no more, and where another server has pruned it."""
     monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
-    server = Server(hub, tmp_path / "s0.sqlite", quotas=Quotas(QuotaSettings(megabytes=0.2)))
-    cleanup.callback(server.end)
-    map_id, replicator = robot(hub, tmp_path, cleanup)
+    server = started(quotas=Quotas(QuotaSettings(megabytes=0.2)))
+    map_id, replicator = robot
     rng = np.random.default_rng(1)
     replicator.submit([node(map_id, number, rng) for number in range(1, 61)], 1)
     eventually(lambda: "`megabytes`" in replicator.status().failure)
@@ -324,15 +294,14 @@ def test_what_was_pruned_makes_room_for_the_robot(
 
 
 def test_logs_that_never_answer_do_not_hold_up_one_that_does(
-    hub: MemoryHub, tmp_path: Path, agent: HandAgent, cleanup: ExitStack
+    started: Start, hub: MemoryHub, agent: HandAgent
 ) -> None:
     """They are waited for longer than this test takes, and more of them than are asked at once."""
-    server = Server(hub, tmp_path / "s0.sqlite", settings=replace(QUICK, ask_timeout=600.0))
-    cleanup.callback(server.end)
+    server = started(settings=replace(QUICK, ask_timeout=600.0))
     agent.publish(1)
     eventually(lambda: agent.acks)
     kept: list[Request] = []
-    silent = other_agent(hub, cleanup, MapId("x0", 1))
+    silent = HandAgent(hub, MapId("x0", 1))
     for number in range(60):
         silent.map = MapId(f"x{number}", 1)
         silent.bus.serve(KEYS.log(silent.map), kept.append)
@@ -344,10 +313,8 @@ def test_logs_that_never_answer_do_not_hold_up_one_that_does(
     assert len(kept) == pull_schedule.SILENT_AT_ONCE
 
 
-def test_names_alone_fill_no_memory(
-    hub: MemoryHub, server: Server, agent: HandAgent, cleanup: ExitStack
-) -> None:
-    crowd = other_agent(hub, cleanup)
+def test_names_alone_fill_no_memory(hub: MemoryHub, server: Server, agent: HandAgent) -> None:
+    crowd = HandAgent(hub, OTHER)
     for number in range(3 * known_logs.MOST_UNKNOWN):
         crowd.map = MapId(f"x{number}", number % 7)
         crowd.beacon(0)
@@ -361,17 +328,17 @@ def test_names_alone_fill_no_memory(
 
 
 def test_a_beacon_beyond_all_logs_moves_only_its_own(
-    hub: MemoryHub, server: Server, agent: HandAgent, cleanup: ExitStack
+    hub: MemoryHub, server: Server, agent: HandAgent
 ) -> None:
     """It says 2^53 and answers with nothing, as if all that was pruned: that ends its own map alone."""
     agent.serve(2)
     agent.publish(1)
-    other = other_agent(hub, cleanup, MapId("r0", MAP.epoch + 1))
+    other = HandAgent(hub, MapId("r0", MAP.epoch + 1))
     other.serve(2)
     agent.beacon(2**53)
     other.beacon(2)
     eventually(lambda: server.store.watermark(other.map) == 2)
-    fresh = other_agent(hub, cleanup)
+    fresh = HandAgent(hub, OTHER)
     fresh.publish(1)
     eventually(lambda: server.store.watermark(OTHER) == 1)
     assert server.store.watermark(MAP) <= 2, "it has given no more than two"
@@ -389,11 +356,9 @@ def test_undecodable_changes_fill_no_disk(tmp_path: Path, monkeypatch: pytest.Mo
 
 
 def test_a_robot_whose_changes_are_all_refused_fills_no_log(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+    server: Server, agent: HandAgent, caplog: pytest.LogCaptureFixture
 ) -> None:
     caplog.set_level(logging.INFO, "mapweave.mapserver")
-    hub = MemoryHub()
-    server, agent = Server(hub, tmp_path / "s0.sqlite"), HandAgent(hub)
     agent.serve(1, lambda asked: agent.answer(asked))
     for sequence in range(1, 41):
         agent.log[sequence] = b"\xc1" * 50
