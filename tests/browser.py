@@ -43,12 +43,9 @@ class Browser:
                 "args": [*FLAGS, *flags, f"--user-data-dir={folder}"],
             }
             wanted = {
-                "alwaysMatch": {
-                    "browserName": "chrome",
-                    "goog:chromeOptions": options,
-                    "goog:loggingPrefs": {"browser": "ALL"},
-                }
-            }
+                "alwaysMatch": {"browserName": "chrome", "goog:chromeOptions": options,
+                 "goog:loggingPrefs": {"browser": "ALL"}},
+            }  # fmt: skip
             self._session = f"/session/{self._ask('POST', '/session', {'capabilities': wanted})['sessionId']}"
         except BaseException:
             self._end()

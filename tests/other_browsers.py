@@ -139,15 +139,8 @@ def webkit(folder: Path) -> Iterator[Page]:
     read, write = os.pipe()
     # The server chooses a free display, and names it when it is there.
     command = [
-        "Xvfb",
-        "-displayfd",
-        str(write),
-        "-screen",
-        "0",
-        f"{SIZE[0]}x{SIZE[1]}x24",
-        "-nolisten",
-        "tcp",
-    ]
+        "Xvfb", "-displayfd", str(write), "-screen", "0", f"{SIZE[0]}x{SIZE[1]}x24", "-nolisten", "tcp",
+    ]  # fmt: skip
     display = subprocess.Popen(
         command, pass_fds=[write], stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL
     )

@@ -79,25 +79,22 @@ def test_the_folders_are_those_of_the_package():
     assert {*PRODUCT} == linked | {"mapweave"}
 
 
-@pytest.mark.parametrize(
-    ("source", "what"),
-    [
-        ("import pickle", "pickle"),
-        ("from pickle import loads", "pickle"),
-        ("import json, marshal as m", "marshal"),
-        ("def f():\n    return eval('1')", "eval"),
-        ("run = exec", "exec"),
-        ("import subprocess\nsubprocess.run('ls', shell=True)", "shell"),
-        ("run('ls', shell=quick)", "shell"),
-        ("import os\nos.system('ls')", "os.system"),
-        ("from os import system", "os.system"),
-        ("import os as o", "os as o"),
-        ("import os\\\n as o", "os as o"),
-        ("\uff45val('1')", "eval"),
-        ("np.load('a.npy', allow_pickle=True)", "allow_pickle"),
-        ("connection.recv()", "recv() of a multiprocessing connection"),
-    ],
-)
+@pytest.mark.parametrize(("source", "what"), [
+    ("import pickle", "pickle"),
+    ("from pickle import loads", "pickle"),
+    ("import json, marshal as m", "marshal"),
+    ("def f():\n    return eval('1')", "eval"),
+    ("run = exec", "exec"),
+    ("import subprocess\nsubprocess.run('ls', shell=True)", "shell"),
+    ("run('ls', shell=quick)", "shell"),
+    ("import os\nos.system('ls')", "os.system"),
+    ("from os import system", "os.system"),
+    ("import os as o", "os as o"),
+    ("import os\\\n as o", "os as o"),
+    ("\uff45val('1')", "eval"),
+    ("np.load('a.npy', allow_pickle=True)", "allow_pickle"),
+    ("connection.recv()", "recv() of a multiprocessing connection"),
+])  # fmt: skip
 def test_each_of_them_is_found(source: str, what: str):
     assert [*forbidden(source)] == [what]
 

@@ -106,15 +106,11 @@ def test_what_was_skipped_is_said_in_one_line_for_each_reason():
     assert line == f"skipped {count}: needs chromium and chromedriver on the PATH"
 
 
-@pytest.mark.parametrize(
-    ("status", "found", "said", "words"),
-    [
-        (0, "", "No known vulnerabilities found", "no known vulnerabilities"),
-        (1, "anyio 4.16.0 PYSEC-1", "Found 1 known vulnerability", "anyio 4.16.0 PYSEC-1"),
-        (1, "", "Traceback:\n  a step\nProxyError: refused", "cannot be looked up: ProxyError: refused"),
-    ],
-    ids=["nothing", "found", "no-network"],
-)
+@pytest.mark.parametrize(("status", "found", "said", "words"), [
+    (0, "", "No known vulnerabilities found", "no known vulnerabilities"),
+    (1, "anyio 4.16.0 PYSEC-1", "Found 1 known vulnerability", "anyio 4.16.0 PYSEC-1"),
+    (1, "", "Traceback:\n  a step\nProxyError: refused", "cannot be looked up: ProxyError: refused"),
+], ids=["nothing", "found", "no-network"])  # fmt: skip
 def test_an_audit_says_in_one_line_what_it_has_found_or_why_it_cannot(
     tmp_path, status: int, found: str, said: str, words: str
 ):

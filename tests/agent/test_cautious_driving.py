@@ -54,14 +54,11 @@ class Drive:
 
 
 @pytest.mark.parametrize("wanted", [0.3, -0.3])
-@pytest.mark.parametrize(
-    ("bumper", "slips", "words"),
-    [
-        (True, False, "the bumper is pressed"),
-        (False, False, "the wheels stall"),
-        (False, True, "the wheels turn and the image stands"),
-    ],
-)
+@pytest.mark.parametrize(("bumper", "slips", "words"), [
+    (True, False, "the bumper is pressed"),
+    (False, False, "the wheels stall"),
+    (False, True, "the wheels turn and the image stands"),
+])  # fmt: skip
 def test_a_touch_is_recognised_and_backed_off_from(wanted: float, bumper: bool, slips: bool, words: str):
     drive = Drive(bumper, slips)
     said = drive.run(wanted, 45)

@@ -72,20 +72,17 @@ def dead_encoders(seen: Observation) -> Observation:
     return replace(seen, odometry=STOPPED)
 
 
-@pytest.mark.parametrize(
-    ("broken", "command", "words"),
-    [
-        (covered, DRIVE, "the image is dark"),
-        (dazzled, DRIVE, "overexposed"),
-        (defocused, DRIVE, "is blurred"),
-        (no_camera, DRIVE, "no image for"),
-        ("other camera", DRIVE, "the wheels turn and the image stands still"),
-        (dead_encoders, DRIVE, "the encoders do not count"),
-        (dead_encoders, Command(), "or does neither encoder count"),
-        ("dead motors", DRIVE, "the wheels do not obey"),
-        ("dead motors", Command(), "the robot stands still"),
-    ],
-)
+@pytest.mark.parametrize(("broken", "command", "words"), [
+    (covered, DRIVE, "the image is dark"),
+    (dazzled, DRIVE, "overexposed"),
+    (defocused, DRIVE, "is blurred"),
+    (no_camera, DRIVE, "no image for"),
+    ("other camera", DRIVE, "the wheels turn and the image stands still"),
+    (dead_encoders, DRIVE, "the encoders do not count"),
+    (dead_encoders, Command(), "or does neither encoder count"),
+    ("dead motors", DRIVE, "the wheels do not obey"),
+    ("dead motors", Command(), "the robot stands still"),
+])  # fmt: skip
 def test_a_cause_is_named_once(drive, description, broken, command, words):
     def other_camera(seen: Observation) -> Observation:
         return replace(seen, image=drive[0].image)

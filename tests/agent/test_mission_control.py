@@ -257,15 +257,12 @@ def test_many_missions_do_not_fill_the_disk():
     assert len(control._reports) == MAX_KEPT and control.report is not None
 
 
-@pytest.mark.parametrize(
-    ("setting", "home", "does", "reason"),
-    [
-        (WithoutServer.GO_ON, HOME, None, ""),
-        (WithoutServer.STAND, HOME, Idle(), "stands: no map server for 10 s"),
-        (WithoutServer.HOME, HOME, GoTo(HOME), "goes home: no map server for 10 s"),
-        (WithoutServer.HOME, None, Idle(), "stands: no map server for 10 s"),
-    ],
-)
+@pytest.mark.parametrize(("setting", "home", "does", "reason"), [
+    (WithoutServer.GO_ON, HOME, None, ""),
+    (WithoutServer.STAND, HOME, Idle(), "stands: no map server for 10 s"),
+    (WithoutServer.HOME, HOME, GoTo(HOME), "goes home: no map server for 10 s"),
+    (WithoutServer.HOME, None, Idle(), "stands: no map server for 10 s"),
+])  # fmt: skip
 def test_a_robot_whose_server_is_gone_does_as_it_is_set(setting, home, does, reason):
     control = Disk().robot(setting)
     control.take(order(1, MissionKind.EXPLORE))
@@ -284,14 +281,11 @@ NO_MISSION = Status("idle", "no mission; no camera", 0, 0, Pose2(), False)
 DRIVING = Status("driving", "to r0.1.4", 0, 0, Pose2(), False, "goto")
 
 
-@pytest.mark.parametrize(
-    ("setting", "status", "doing", "detail"),
-    [
-        (WithoutServer.STAND, NO_MISSION, "standing", "no map server for 10 s; no camera"),
-        (WithoutServer.HOME, DRIVING, "driving", "goes home: no map server for 10 s; to r0.1.4"),
-        (WithoutServer.GO_ON, DRIVING, "driving", "to r0.1.4"),
-    ],
-)
+@pytest.mark.parametrize(("setting", "status", "doing", "detail"), [
+    (WithoutServer.STAND, NO_MISSION, "standing", "no map server for 10 s; no camera"),
+    (WithoutServer.HOME, DRIVING, "driving", "goes home: no map server for 10 s; to r0.1.4"),
+    (WithoutServer.GO_ON, DRIVING, "driving", "to r0.1.4"),
+])  # fmt: skip
 def test_a_robot_that_stands_or_goes_home_says_that_it_is_for_the_server(setting, status, doing, detail):
     control = Disk().robot(setting)
     control.take(order(1))

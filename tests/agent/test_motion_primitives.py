@@ -69,14 +69,11 @@ def test_another_refusal_is_final_and_silence_is_waited_for():
 BEARINGS = tuple(np.linspace(-math.pi, math.pi, 8, endpoint=False).tolist())
 
 
-@pytest.mark.parametrize(
-    ("readings", "most", "freest"),
-    [
-        ([1, 1, 1, 1, 1, 2, 3, 2], math.inf, 6),
-        ([1, 1, 1, 1, 1, 2, 3, 2], 0.5, 0),
-        ([0.3, 0.3, 2, 2, 2, 2.5, 3, 2], 0.5, 2),
-    ],
-)
+@pytest.mark.parametrize(("readings", "most", "freest"), [
+    ([1, 1, 1, 1, 1, 2, 3, 2], math.inf, 6),
+    ([1, 1, 1, 1, 1, 2, 3, 2], 0.5, 0),
+    ([0.3, 0.3, 2, 2, 2, 2.5, 3, 2], 0.5, 2),
+])  # fmt: skip
 def test_it_goes_where_there_is_most_room_or_enough(readings, most, freest):
     motion = MotionPrimitives(RobotDescription(BODY.camera, ranger_bearings=BEARINGS, ranger_reach=3.0))
     motion.take_in(Observation(0, Odometry(0.0, 0.0), None, np.array(readings, dtype=float)), ())

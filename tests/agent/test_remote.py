@@ -126,17 +126,14 @@ def test_a_compressed_image_is_decoded(encoding: str, suffix: str, error: int):
         decode_observation(changed(small, s=[47, 64]))
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"v": 99}, {"t": -1}, {"t": 2**63}, {"t": 1.0}, {"u": [0.0]}, {"u": [0.0, float("nan")]},
-        {"u": [0.0, 0.0, 0.0]}, {"u": [float("inf"), 0.0]}, {"u": [10.1, 0.0]},
-        {"u": [0.0, -20.1]}, {"r": [-0.1]}, {"r": [float("nan")]},
-        {"r": [0.0] * 257}, {"r": "far"}, {"b": 1}, {"s": [10, 11]}, {"s": [10]}, {"s": [0, 0]},
-        {"s": [10, 10, 1]}, {"s": [-10, -10]}, {"i": b"x" * 99}, {"i": "text"}, {"encoding": "tiff"},
-        {"encoding": "png"}, {"encoding": "jpeg"}, {"encoding": "png", "i": b""}, {"encoding": 1},
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("fields", [
+    {"v": 99}, {"t": -1}, {"t": 2**63}, {"t": 1.0}, {"u": [0.0]}, {"u": [0.0, float("nan")]},
+    {"u": [0.0, 0.0, 0.0]}, {"u": [float("inf"), 0.0]}, {"u": [10.1, 0.0]}, {"u": [0.0, -20.1]},
+    {"r": [-0.1]}, {"r": [float("nan")]}, {"r": [0.0] * 257}, {"r": "far"}, {"b": 1}, {"s": [10, 11]},
+    {"s": [10]}, {"s": [0, 0]}, {"s": [10, 10, 1]}, {"s": [-10, -10]}, {"i": b"x" * 99}, {"i": "text"},
+    {"encoding": "tiff"}, {"encoding": "png"}, {"encoding": "jpeg"}, {"encoding": "png", "i": b""},
+    {"encoding": 1},
+])  # fmt: skip
 def test_a_wrong_observation_is_refused(fields: dict[str, object]):
     data = encode_observation(an_observation(np.zeros((10, 10), np.uint8)))
     decode_observation(changed(data))
@@ -144,14 +141,11 @@ def test_a_wrong_observation_is_refused(fields: dict[str, object]):
         decode_observation(changed(data, **fields))
 
 
-@pytest.mark.parametrize(
-    "fields",
-    [
-        {"camera": b""}, {"distortion": [0.0] * 4}, {"radius": 0.0}, {"radius": float("nan")}, {"axle": -1.0},
-        {"wheel_noise": 2.0}, {"ranger_bearings": [9.0]}, {"max_forward": -0.1}, {"max_turn": float("inf")},
-        {"tick": 0.0}, {"tick": "soon"},
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("fields", [
+    {"camera": b""}, {"distortion": [0.0] * 4}, {"radius": 0.0}, {"radius": float("nan")}, {"axle": -1.0},
+    {"wheel_noise": 2.0}, {"ranger_bearings": [9.0]}, {"max_forward": -0.1}, {"max_turn": float("inf")},
+    {"tick": 0.0}, {"tick": "soon"},
+])  # fmt: skip
 def test_a_wrong_description_is_refused(fields: dict[str, object]):
     with pytest.raises(InvalidMessage):
         decode_description(changed(encode_description(DESCRIPTION), **fields))
@@ -334,13 +328,10 @@ def far_away(request: Request) -> None:
     request.reply(changed(encode_observation(an_observation()), u=[1e4, 0.0]))
 
 
-@pytest.mark.parametrize(
-    ("answer", "reason"),
-    [
-        (wrong_image, "an image of 1x1 px from a camera described as 320x240 px"),
-        (far_away, "odometry of 10000 m and 0 rad in one step"),
-    ],
-)
+@pytest.mark.parametrize(("answer", "reason"), [
+    (wrong_image, "an image of 1x1 px from a camera described as 320x240 px"),
+    (far_away, "odometry of 10000 m and 0 rad in one step"),
+])  # fmt: skip
 def test_an_impossible_observation_is_retried_once_then_refused_in_one_line(
     body: Body, bus: MemoryBus, answer: Callable[[Request], None], reason: str
 ):

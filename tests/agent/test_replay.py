@@ -354,13 +354,10 @@ def test_errors_are_reported_in_one_line(folder, case):
     assert str(folder) in words
 
 
-@pytest.mark.parametrize(
-    ("options", "words"),
-    [
-        (RecordingOptions(image_topic="/camera"), "has no topics: leave out --image-topic"),
-        (RecordingOptions(camera_height=0.3), "is height_m of {folder}/camera.toml: leave out"),
-    ],
-)
+@pytest.mark.parametrize(("options", "words"), [
+    (RecordingOptions(image_topic="/camera"), "has no topics: leave out --image-topic"),
+    (RecordingOptions(camera_height=0.3), "is height_m of {folder}/camera.toml: leave out"),
+])  # fmt: skip
 def test_options_without_effect_are_refused(folder, options, words):
     """They were ignored: the map had another height than the person had said."""
     assert words.format(folder=folder) in refused(lambda: open_recording(folder, options))

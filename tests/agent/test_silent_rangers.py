@@ -48,11 +48,9 @@ class Drive:
         return steps
 
 
-@pytest.mark.parametrize(
-    ("broken", "read"),
-    first_quick([(NONE, "none"), (NAN, "23"), (FEWER, "5"), (MORE, "48")], 2),
-    ids=["none", "nan", "fewer", "more"],
-)
+@pytest.mark.parametrize(("broken", "read"), first_quick([
+    (NONE, "none"), (NAN, "23"), (FEWER, "5"), (MORE, "48"),
+], 2), ids=["none", "nan", "fewer", "more"])  # fmt: skip
 @pytest.mark.parametrize(
     ("mission", "ticks"), [(Explore(), 20), (GoTo(NodeId("r0", 1, 1)), 130)], ids=["explore", "goto"]
 )

@@ -66,17 +66,8 @@ class DiskFleet:
         data = self.disk if self.postgres is None else root / "data"
         orders = Orders(0, (port,), str(self.robot), ("s0",), INTERVAL, SEED)
         server = [
-            "mapweave",
-            "server",
-            "--name",
-            "s0",
-            "--fleet",
-            FLEET,
-            "--listen",
-            port,
-            "--data",
-            str(data),
-        ]
+            "mapweave", "server", "--name", "s0", "--fleet", FLEET, "--listen", port, "--data", str(data),
+        ]  # fmt: skip
         self._commands = {
             "server": server if self.postgres is None else [*server, "--store", self.address],
             "robot": ["benchmarks.chaos.agent_process", json.dumps(asdict(orders))],

@@ -69,14 +69,11 @@ def test_figures_that_are_not_good_are_kept_and_named(tmp_path, capsys):
     assert "exit status 1, its figures are not good" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("text", "why"),
-    [
-        ("print('no figures')", "no JSON object"),
-        ("raise SystemExit(1)", "exit status 1"),
-        ("print('{}'); raise SystemExit(3)", "exit status 3"),
-    ],
-)
+@pytest.mark.parametrize(("text", "why"), [
+    ("print('no figures')", "no JSON object"),
+    ("raise SystemExit(1)", "exit status 1"),
+    ("print('{}'); raise SystemExit(3)", "exit status 3"),
+])  # fmt: skip
 def test_a_command_without_figures_is_said(tmp_path, text: str, why: str):
     script = tmp_path / "measure.py"
     script.write_text(text)

@@ -66,16 +66,13 @@ def test_maps_of_two_servers_are_as_good_as_the_worse(monkeypatch):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize(
-    ("change", "is_good"),
-    [
-        ({}, True),
-        ({"lost": 1}, False),
-        ({"wrong": 1}, False),
-        ({"same_links": False}, False),
-        ({"max_pose_difference_m": float("inf")}, False),
-    ],
-)
+@pytest.mark.parametrize(("change", "is_good"), [
+    ({}, True),
+    ({"lost": 1}, False),
+    ({"wrong": 1}, False),
+    ({"same_links": False}, False),
+    ({"max_pose_difference_m": float("inf")}, False),
+])  # fmt: skip
 def test_it_is_good_if_nothing_is_lost_wrong_or_linked_otherwise(change: dict[str, object], is_good: bool):
     row = {"lost": 0, "wrong": 0, "same_links": True, "max_pose_difference_m": 0.0}
     rows = {"without": {"lost": 0, "wrong": 0}, "2 shards": row, "killed": {**row, **change}}

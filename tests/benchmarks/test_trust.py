@@ -90,13 +90,10 @@ def test_without_a_lie_the_answers_are_the_truth(asked: Asked):
     assert max(off(end_of(way, TOUR[0]), TOUR[-1])) < AGREE
 
 
-@pytest.mark.parametrize(
-    ("lie", "distance", "angle"),
-    [
-        ("right place, 0.5 m off", math.hypot(0.35, 0.35), 0.0),
-        ("right place, 90 degrees off", 0.0, math.pi / 2),
-    ],
-)
+@pytest.mark.parametrize(("lie", "distance", "angle"), [
+    ("right place, 0.5 m off", math.hypot(0.35, 0.35), 0.0),
+    ("right place, 90 degrees off", 0.0, math.pi / 2),
+])  # fmt: skip
 def test_whereabouts_are_as_wrong_as_the_lie_says(asked: Asked, lie: str, distance: float, angle: float):
     asked.server.lie = LIES[lie]()
     assert off(asked.stated(asked.where()), ROBOT) == pytest.approx((distance, angle), abs=AGREE)

@@ -27,11 +27,10 @@ def test_every_command_has_help(command, capfd):
         assert option in usage, f"{option} is none of its options"
 
 
-@pytest.mark.parametrize(
-    "arguments",
-    [[], ["agent"], ["agent", "r0", "--mission", "fly"], ["demo", "--robots", "many"], ["map"],
-     ["replay"], ["relocalize"], ["server", "--port", "1"]],
-)  # fmt: skip
+@pytest.mark.parametrize("arguments", [
+    [], ["agent"], ["agent", "r0", "--mission", "fly"], ["demo", "--robots", "many"], ["map"], ["replay"],
+    ["relocalize"], ["server", "--port", "1"],
+])  # fmt: skip
 def test_a_wrong_use_is_one_line_that_names_the_help(arguments, capfd):
     with pytest.raises(SystemExit) as ended:
         main(arguments)
@@ -41,14 +40,11 @@ def test_a_wrong_use_is_one_line_that_names_the_help(arguments, capfd):
     assert line.startswith(f"{command}: ") and line.endswith(f"; see `{command} --help`")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "meant"),
-    [
-        ("serve", "did you mean `mapweave server`?"),
-        ("map shw office.mapweave", "did you mean `mapweave map show`?"),
-        ("fly", "`mapweave --help` lists them"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "meant"), [
+    ("serve", "did you mean `mapweave server`?"),
+    ("map shw office.mapweave", "did you mean `mapweave map show`?"),
+    ("fly", "`mapweave --help` lists them"),
+])  # fmt: skip
 def test_a_command_that_is_none_is_refused_with_the_nearest(arguments, meant, capfd):
     assert complaint(capfd, *arguments.split(), status=USAGE).endswith(meant)
 
@@ -81,19 +77,16 @@ def test_demos_out_of_range(arguments, capfd, tmp_path):
     assert arguments.replace("=", " ") in output
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        (["office", "--seed", "-1"], "--seed -1: use 0 or more"),
-        (["office", "--set", "robots=0"], "robots must be a whole number, 1 to 16"),
-        (["office", "--set", "robots=17"], "office.toml with --set robots=17: robots must be a whole number"),
-        (["office", "--set", "world.rooms=0"], "rooms"),
-        (["office", "--set", "world.kind=castle"], "no kind of world 'castle'"),
-        (["office", "--set", "robots"], "write key=value"),
-        (["ofice"], "no scenario 'ofice'"),
-        (["nowhere.toml"], "nowhere.toml: no such file"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["office", "--seed", "-1"], "--seed -1: use 0 or more"),
+    (["office", "--set", "robots=0"], "robots must be a whole number, 1 to 16"),
+    (["office", "--set", "robots=17"], "office.toml with --set robots=17: robots must be a whole number"),
+    (["office", "--set", "world.rooms=0"], "rooms"),
+    (["office", "--set", "world.kind=castle"], "no kind of world 'castle'"),
+    (["office", "--set", "robots"], "write key=value"),
+    (["ofice"], "no scenario 'ofice'"),
+    (["nowhere.toml"], "nowhere.toml: no such file"),
+])  # fmt: skip
 def test_scenarios_that_cannot_be_run(arguments, words, capfd, closed, tmp_path):
     for what in (["run", "--out", tmp_path / "out"], ["serve", "--connect", closed]):
         status = FAILED if words.endswith("no such file") else USAGE
@@ -101,16 +94,13 @@ def test_scenarios_that_cannot_be_run(arguments, words, capfd, closed, tmp_path)
     assert not (tmp_path / "out" / "agents").exists()
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ("server --store maps.sqlite", "a file needs no --store: it is in the folder of --data"),
-        ("place add hall r0.1.1 --radius nan", "--radius nan: give metres, more than 0 and less than 10000"),
-        ("place add hall r0.1.1 --radius -1", "--radius -1: give metres, more than 0 and less than 10000"),
-        ("go r0 1.0 0.5", "goal '1.0': this is a map; a position has a comma and no blank, as 3.1,-2.0"),
-        ("go r0 r1.3", "goal 'r1.3': this is a map: give one of its nodes, r1.3.1 for example"),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "words"), [
+    ("server --store maps.sqlite", "a file needs no --store: it is in the folder of --data"),
+    ("place add hall r0.1.1 --radius nan", "--radius nan: give metres, more than 0 and less than 10000"),
+    ("place add hall r0.1.1 --radius -1", "--radius -1: give metres, more than 0 and less than 10000"),
+    ("go r0 1.0 0.5", "goal '1.0': this is a map; a position has a comma and no blank, as 3.1,-2.0"),
+    ("go r0 r1.3", "goal 'r1.3': this is a map: give one of its nodes, r1.3.1 for example"),
+])  # fmt: skip
 def test_a_wrong_value_is_answered_with_what_is_right(arguments, words, capfd):
     assert complaint(capfd, *arguments.split(), status=USAGE).endswith(words)
 
@@ -139,16 +129,8 @@ def test_a_trial_prints_one_json_object(capfd, tmp_path):
         'robots = 1\n[world]\nkind = "arena"\n[[events]]\nat = 1.0\ndo = "wait"\n[expect]\ncollisions = 0\n'
     )
     arguments = [
-        "sim",
-        "run",
-        str(path),
-        "--one-process",
-        "--out",
-        str(tmp_path / "out"),
-        "--json",
-        "--seed",
-        "9",
-    ]
+        "sim", "run", str(path), "--one-process", "--out", str(tmp_path / "out"), "--json", "--seed", "9",
+    ]  # fmt: skip
     assert main(arguments) == 0
     output = capfd.readouterr()
     assert "wait" in output.err, "its progress, beside what a script reads"

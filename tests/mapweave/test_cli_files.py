@@ -107,13 +107,10 @@ def test_recordings(tmp_path, capfd, recording):
     assert "camera's intrinsics" in complaint(capfd, "replay", recording)
 
 
-@pytest.mark.parametrize(
-    ("name", "content", "words"),
-    [
-        ("images/1.png", b"\x89PNG\r\n\x1a\n" + b"\0" * 50, "1.png: not an image that can be read"),
-        ("odometry.csv", b"forward_m,turn_rad\n0,0\n0,0\n0,fa\n", "line 4: turn_rad"),
-    ],
-)
+@pytest.mark.parametrize(("name", "content", "words"), [
+    ("images/1.png", b"\x89PNG\r\n\x1a\n" + b"\0" * 50, "1.png: not an image that can be read"),
+    ("odometry.csv", b"forward_m,turn_rad\n0,0\n0,0\n0,fa\n", "line 4: turn_rad"),
+])  # fmt: skip
 def test_a_damaged_recording_is_mapped_as_far_as_it_can_be_read(
     name, content, words, tmp_path, capfd, recording
 ):

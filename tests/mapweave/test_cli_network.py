@@ -89,10 +89,9 @@ def test_asking_without_a_server(capfd, recording, closed):
     assert f"no router at {closed}: start" in output
 
 
-@pytest.mark.parametrize(
-    "words",
-    ["link r0.1 r1.1", "unmerge r0.1 r1.1.1", "retire r0.1 r0.1.1", "explain r0.1 r0.1", "route r0.1 r0.1.1"],
-)
+@pytest.mark.parametrize("words", [
+    "link r0.1 r1.1", "unmerge r0.1 r1.1.1", "retire r0.1 r0.1.1", "explain r0.1 r0.1", "route r0.1 r0.1.1",
+])  # fmt: skip
 def test_wrong_ids_are_a_wrong_command_line_also_without_a_server(capfd, closed, words):
     complaint(capfd, "map", *words.split(), "--connect", closed, status=USAGE)
 
@@ -205,16 +204,11 @@ def test_an_agent_interrupted_before_its_base_answers_reports_it(closed, tmp_pat
     assert process.returncode == 1
 
 
-@pytest.mark.parametrize(
-    ("command", "hints"),
-    [
-        (["agent", "r0"], {"r0: waits for its robot", "r0 finds no router at {closed}: start"}),
-        pytest.param(
-            ["sim", "serve", "office"], {"the simulator finds no router at {closed}: start"},
-            marks=needs_simulator,
-        ),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("command", "hints"), [
+    (["agent", "r0"], {"r0: waits for its robot", "r0 finds no router at {closed}: start"}),
+    pytest.param(["sim", "serve", "office"], {"the simulator finds no router at {closed}: start"},
+     marks=needs_simulator),
+])  # fmt: skip
 def test_waiting_is_reported_with_its_reason(command, hints, closed, tmp_path):
     data = ["--data", tmp_path] if command[0] == "agent" else []
     with started(*command, "--connect", closed, *data) as (process, stderr):

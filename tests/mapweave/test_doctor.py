@@ -55,10 +55,9 @@ def doctor(capfd: pytest.CaptureFixture[str], *words: object) -> tuple[int, dict
 # Libraries
 
 
-@pytest.mark.parametrize(
-    "missing",
-    [["cv2"], ["cv2", "msgpack", "msgspec", "networkx", "numpy", "rich", "rosbags", "serial", "zenoh"]],
-)
+@pytest.mark.parametrize("missing", [
+    ["cv2"], ["cv2", "msgpack", "msgspec", "networkx", "numpy", "rich", "rosbags", "serial", "zenoh"],
+])  # fmt: skip
 def test_it_runs_without_libraries_and_names_them(missing: list[str], tmp_path):
     commands = [
         ["doctor", "--json", "--data", str(tmp_path), "--offline"],
@@ -115,17 +114,14 @@ def test_a_full_or_slow_disk(tmp_path, monkeypatch):
 CAMERA = Camera(640, 480, 610.0, 612.0, 322.0, 238.0, 0.25, 0.1)
 
 
-@pytest.mark.parametrize(
-    ("declared", "distortion", "words"),
-    [
-        (replace(CAMERA, fx=61.0), (0.0,) * 5, "field of view 158 degrees"),
-        (replace(CAMERA, fy=480.0), (0.0,) * 5, "not the same"),
-        (replace(CAMERA, cx=610.0), (0.0,) * 5, "cx = 610"),
-        (replace(CAMERA, mount_height=25.0), (0.0,) * 5, "height_m = 25"),
-        (replace(CAMERA, mount_forward=10.0), (0.0,) * 5, "forward_m = 10"),
-        (CAMERA, (-1.2, 0.0, 0.0, 0.0, 0.0), "folds the image back"),
-    ],
-)
+@pytest.mark.parametrize(("declared", "distortion", "words"), [
+    (replace(CAMERA, fx=61.0), (0.0,) * 5, "field of view 158 degrees"),
+    (replace(CAMERA, fy=480.0), (0.0,) * 5, "not the same"),
+    (replace(CAMERA, cx=610.0), (0.0,) * 5, "cx = 610"),
+    (replace(CAMERA, mount_height=25.0), (0.0,) * 5, "height_m = 25"),
+    (replace(CAMERA, mount_forward=10.0), (0.0,) * 5, "forward_m = 10"),
+    (CAMERA, (-1.2, 0.0, 0.0, 0.0, 0.0), "folds the image back"),
+])  # fmt: skip
 def test_a_calibration_that_cannot_be_right(declared, distortion, words):
     (finding,) = camera_model.examine(RobotDescription(declared, distortion))
     assert (
@@ -298,25 +294,22 @@ def push(walls: PhotoWalls) -> list:
     return [walls.observe(before, now, k) for k, (before, now) in enumerate(pairwise(poses))]
 
 
-@pytest.mark.parametrize(
-    ("spoil", "verdict", "words"),
-    [
-        (lambda one, first: one, FindingLevel.GOOD, "agree with the image"),
-        (lambda one, first: replace(one, odometry=Odometry(0.0, 0.0)),
-         FindingLevel.WRONG, "encoders do not count"),
-        (lambda one, first: replace(one, image=first.image), FindingLevel.WRONG, "the image stands still"),
-        (lambda one, first: replace(one, odometry=Odometry(one.odometry.forward, -one.odometry.turn)),
-         FindingLevel.WRONG, "the image turns the other way"),
-        (lambda one, first: replace(one, odometry=Odometry(-one.odometry.forward, one.odometry.turn)),
-         FindingLevel.WRONG, "forward by the encoders is backward by the image"),
-        (lambda one, first: replace(one, odometry=Odometry(one.odometry.forward, one.odometry.turn / 2)),
-         FindingLevel.WRONG, "turns 2.0"),
-        (lambda one, first: replace(one, image=first.image, odometry=Odometry(0.0, 0.0)),
-         FindingLevel.SKIPPED, "nothing has moved"),
-        (lambda one, first: replace(one, image=np.full_like(one.image, 90)),
-         FindingLevel.SKIPPED, "too little to follow"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("spoil", "verdict", "words"), [
+    (lambda one, first: one, FindingLevel.GOOD, "agree with the image"),
+    (lambda one, first: replace(one, odometry=Odometry(0.0, 0.0)), FindingLevel.WRONG,
+     "encoders do not count"),
+    (lambda one, first: replace(one, image=first.image), FindingLevel.WRONG, "the image stands still"),
+    (lambda one, first: replace(one, odometry=Odometry(one.odometry.forward, -one.odometry.turn)),
+     FindingLevel.WRONG, "the image turns the other way"),
+    (lambda one, first: replace(one, odometry=Odometry(-one.odometry.forward, one.odometry.turn)),
+     FindingLevel.WRONG, "forward by the encoders is backward by the image"),
+    (lambda one, first: replace(one, odometry=Odometry(one.odometry.forward, one.odometry.turn / 2)),
+     FindingLevel.WRONG, "turns 2.0"),
+    (lambda one, first: replace(one, image=first.image, odometry=Odometry(0.0, 0.0)), FindingLevel.SKIPPED,
+     "nothing has moved"),
+    (lambda one, first: replace(one, image=np.full_like(one.image, 90)), FindingLevel.SKIPPED,
+     "too little to follow"),
+])  # fmt: skip
 def test_encoders_are_compared_with_the_image(push, spoil, verdict, words):
     comparison = MotionComparison(DESCRIPTION)
     for one in push:

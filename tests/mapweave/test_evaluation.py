@@ -132,13 +132,10 @@ def test_a_map_that_is_there_is_asked(drive: Path, capfd, tmp_path):
     assert values["recall_at_1"] >= 0.8 and values["error_m_median"] < 0.1
 
 
-@pytest.mark.parametrize(
-    ("see", "camera_toml"),
-    [
-        pytest.param(lambda pose: render(pose, SMALL), SMALL_TOML, id="160x120", marks=pytest.mark.slow),
-        pytest.param(seen_by_fisheye, FISHEYE_TOML, id="fisheye", marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize(("see", "camera_toml"), [
+    pytest.param(lambda pose: render(pose, SMALL), SMALL_TOML, id="160x120", marks=pytest.mark.slow),
+    pytest.param(seen_by_fisheye, FISHEYE_TOML, id="fisheye", marks=pytest.mark.slow),
+])  # fmt: skip
 def test_other_cameras_map_and_recognise_the_same_drive(see, camera_toml: str, capfd, tmp_path):
     folder = recorded(tmp_path / "drive", see, camera_toml)
     values = report(capfd, folder)

@@ -248,22 +248,16 @@ def test_vertices_without_a_line_are_placed_along_edges(tmp_path):
 LINE = "VERTEX_SE2 0 0 0 0\nVERTEX_SE2 1 0 0 0\n"
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("", "holds neither vertex nor edge"),
-        ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n", "line 1: 'VERTEX_SE3:QUAT' is none of"),
-        ("VERTEX_SE2 0 0 0\n", "line 1: VERTEX_SE2 needs 4 numbers, not 3"),
-        ("VERTEX_SE2 0 0 zero 0\n", "line 1: a word is no number"),
-        ("VERTEX_SE2 0 nan 0 0\n", "line 1: a number is not finite"),
-        (LINE + "EDGE_SE2 0 1 0 0 0 1 2 0 1 0 1\n", "line 3: the information must be positive definite"),
-        (
-            LINE + "EDGE_SE2 4 5 0 0 0 1 0 0 1 0 1\n",
-            "neither a vertex nor a chain of edges gives the pose of 4",
-        ),
-        ("\x89PNG", "is none of"),
-    ],
-)
+@pytest.mark.parametrize(("text", "words"), [
+    ("", "holds neither vertex nor edge"),
+    ("VERTEX_SE3:QUAT 0 0 0 0 0 0 0 1\n", "line 1: 'VERTEX_SE3:QUAT' is none of"),
+    ("VERTEX_SE2 0 0 0\n", "line 1: VERTEX_SE2 needs 4 numbers, not 3"),
+    ("VERTEX_SE2 0 0 zero 0\n", "line 1: a word is no number"),
+    ("VERTEX_SE2 0 nan 0 0\n", "line 1: a number is not finite"),
+    (LINE + "EDGE_SE2 0 1 0 0 0 1 2 0 1 0 1\n", "line 3: the information must be positive definite"),
+    (LINE + "EDGE_SE2 4 5 0 0 0 1 0 0 1 0 1\n", "neither a vertex nor a chain of edges gives the pose of 4"),
+    ("\x89PNG", "is none of"),
+])  # fmt: skip
 def test_non_planar_graphs_are_reported_with_the_line(text: str, words: str, tmp_path):
     path = tmp_path / "bad.g2o"
     path.write_text(text)

@@ -136,14 +136,10 @@ class Tutorial:
 
 @pytest.mark.timeout(900)
 @needs_simulator
-@pytest.mark.parametrize(
-    ("name", "ready"),
-    [
-        pytest.param("first-map", "(7 nodes)", marks=pytest.mark.slow),
-        pytest.param("two-robots", "r0.1 and r1.1 are one map now", marks=pytest.mark.scenario),
-    ],
-    ids=["first-map", "two-robots"],
-)
+@pytest.mark.parametrize(("name", "ready"), [
+    pytest.param("first-map", "(7 nodes)", marks=pytest.mark.slow),
+    pytest.param("two-robots", "r0.1 and r1.1 are one map now", marks=pytest.mark.scenario),
+], ids=["first-map", "two-robots"])  # fmt: skip
 def test_the_first_tutorials_run_as_they_stand(name: str, ready: str, tmp_path):
     """What a page shows has a line of the same form in what its commands print."""
     page, tutorial = ROOT / "docs" / f"{name}.md", Tutorial(tmp_path)

@@ -56,13 +56,8 @@ class Hostile:
         self.answer: Callable[[Request], None] = lambda request: request.refuse("nothing is known")
         self.bus.serve(sent_by_any(KEYS.relocalize("s0")), lambda request: self.answer(request))
         arguments = [
-            "--robot",
-            f"{DRIVER}:WallRobot",
-            "--data",
-            str(folder / "agents"),
-            "--mission",
-            "explore",
-        ]
+            "--robot", f"{DRIVER}:WallRobot", "--data", str(folder / "agents"), "--mission", "explore",
+        ]  # fmt: skip
         children.start("r0", ["agent", "r0", *arguments, "--connect", endpoint, *more])
         eventually(lambda: self.status() and (folder / "way").exists(), 120.0)
 

@@ -8,18 +8,15 @@ from mapweave.commands.http_access import http_access
 from mapweave.identities.key_folder import KeyFolder, Profile
 
 
-@pytest.mark.parametrize(
-    ("at", "words", "url"),
-    [
-        (["maps.local"], "0.0.0.0:8080", "https://maps.local:8080/"),
-        (["192.168.1.10"], "0.0.0.0:8080", "https://192.168.1.10:8080/"),
-        (["fd00::1"], "[::]:8080", "https://[fd00::1]:8080/"),
-        (["maps.local", "maps2.local"], "0.0.0.0:8080", "https://localhost:8080/"),
-        ([socket.gethostname()], "0.0.0.0:8080", "https://localhost:8080/"),
-        ([], "0.0.0.0:8080", "https://localhost:8080/"),
-        (["maps.local"], "8080", "https://127.0.0.1:8080/"),
-    ],
-)
+@pytest.mark.parametrize(("at", "words", "url"), [
+    (["maps.local"], "0.0.0.0:8080", "https://maps.local:8080/"),
+    (["192.168.1.10"], "0.0.0.0:8080", "https://192.168.1.10:8080/"),
+    (["fd00::1"], "[::]:8080", "https://[fd00::1]:8080/"),
+    (["maps.local", "maps2.local"], "0.0.0.0:8080", "https://localhost:8080/"),
+    ([socket.gethostname()], "0.0.0.0:8080", "https://localhost:8080/"),
+    ([], "0.0.0.0:8080", "https://localhost:8080/"),
+    (["maps.local"], "8080", "https://127.0.0.1:8080/"),
+])  # fmt: skip
 def test_the_address_of_the_page_is_one_that_its_certificate_has(
     tmp_path, at: list[str], words: str, url: str
 ):

@@ -287,42 +287,33 @@ def test_linking_in_a_file_and_taking_it_back(files: list[Path], said: Said, tmp
     assert [str(node) for node in content.poses] == [str(node) for node in before.poses]
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words", "status"),
-    [
-        (["explain", "r0.1.1"], "give two nodes or two maps, not 1", USAGE),
-        (["explain", "r0.1.1", "r1.1"], "are a node and a map", USAGE),
-        (["explain", "here", "there"], "'here' is no place of this map", NO),
-        (["explain", "r0.1.1", "r9.1.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1", NO),
-        (
-            ["explain", "r0.1.1", "r1.1.2"],
-            "map r1.1 has no node 2; of its 4 nodes the nearest are 1, 3, 5, 7",
-            NO,
-        ),
-        (["explain", "r0.1", "r1.1", "--draw", "x.png"], "--draw needs two nodes", USAGE),
-        (["explain", "--draw", "x.png"], "--draw needs two nodes", USAGE),
-        (["unmerge", "r0.1", "r2.1"], "no link joins r0.1 and r2.1: there is nothing to undo", NO),
-        (["unmerge", "r0.1.3", "r0.1.1"], "joined by their robot's way (edge r0.1.2, ", NO),
-        (["unmerge", "r0.1", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1", NO),
-        (
-            ["unmerge", "r0.1.1", "r1.1.2"],
-            "map r1.1 has no node 2; of its 4 nodes the nearest are 1, 3, 5, 7",
-            NO,
-        ),
-        (["unmerge", "r0.1", "r0.1"], "two different maps", USAGE),
-        (["retire", "r0.1", "r0.1.1"], "give one map (r0.1), or nodes", USAGE),
-        (["retire", "r0.1.99"], "map r0.1 has no node 99", NO),
-        (["retire", "--area", "r0.1.1", "0,0 1,0"], "3 to 64 corners", USAGE),
-        (["retire", "r0.1.1", "--from", "7"], "r0.1.1 is a node: give its map, r0.1", USAGE),
-        (["link", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2", NO),
-        (["link", "r0.1.1", "r2.1.1", "--undo"], "r0.1.1 and r2.1.1 are not linked by hand", NO),
-        (["undo", "7"], "there is no constraint 7", NO),
-        (["retire", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1", NO),
-        (["retire", "r0.1", "--undo"], "map r0.1 is not retired", NO),
-        (["unmerge", "r0.1", "r1.1", "--undo"], "no manual constraint keeps r0.1 and r1.1 apart", NO),
-        (["unmerge", "r0.1", "r1.1", "--because", "a\nb"], "one printable line", USAGE),
-    ],
-)
+@pytest.mark.parametrize(("arguments", "words", "status"), [
+    (["explain", "r0.1.1"], "give two nodes or two maps, not 1", USAGE),
+    (["explain", "r0.1.1", "r1.1"], "are a node and a map", USAGE),
+    (["explain", "here", "there"], "'here' is no place of this map", NO),
+    (["explain", "r0.1.1", "r9.1.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1", NO),
+    (["explain", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2; of its 4 nodes the nearest are 1, 3, 5, 7",
+     NO),
+    (["explain", "r0.1", "r1.1", "--draw", "x.png"], "--draw needs two nodes", USAGE),
+    (["explain", "--draw", "x.png"], "--draw needs two nodes", USAGE),
+    (["unmerge", "r0.1", "r2.1"], "no link joins r0.1 and r2.1: there is nothing to undo", NO),
+    (["unmerge", "r0.1.3", "r0.1.1"], "joined by their robot's way (edge r0.1.2, ", NO),
+    (["unmerge", "r0.1", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1", NO),
+    (["unmerge", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2; of its 4 nodes the nearest are 1, 3, 5, 7",
+     NO),
+    (["unmerge", "r0.1", "r0.1"], "two different maps", USAGE),
+    (["retire", "r0.1", "r0.1.1"], "give one map (r0.1), or nodes", USAGE),
+    (["retire", "r0.1.99"], "map r0.1 has no node 99", NO),
+    (["retire", "--area", "r0.1.1", "0,0 1,0"], "3 to 64 corners", USAGE),
+    (["retire", "r0.1.1", "--from", "7"], "r0.1.1 is a node: give its map, r0.1", USAGE),
+    (["link", "r0.1.1", "r1.1.2"], "map r1.1 has no node 2", NO),
+    (["link", "r0.1.1", "r2.1.1", "--undo"], "r0.1.1 and r2.1.1 are not linked by hand", NO),
+    (["undo", "7"], "there is no constraint 7", NO),
+    (["retire", "r9.1"], "there is no map r9.1; known are: r0.1, r1.1, r2.1", NO),
+    (["retire", "r0.1", "--undo"], "map r0.1 is not retired", NO),
+    (["unmerge", "r0.1", "r1.1", "--undo"], "no manual constraint keeps r0.1 and r1.1 apart", NO),
+    (["unmerge", "r0.1", "r1.1", "--because", "a\nb"], "one printable line", USAGE),
+])  # fmt: skip
 def test_bad_input_is_reported_in_one_line(
     files: list[Path], capfd, arguments: list[str], words: str, status: int
 ):

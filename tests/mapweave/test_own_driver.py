@@ -104,10 +104,9 @@ def test_a_second_agent_of_a_robot_is_refused_before_it_moves_anything(tmp_path)
 
 @pytest.mark.slow
 @pytest.mark.waits
-@pytest.mark.parametrize(
-    ("stamp", "words"),
-    [("time.time()", "stamp_ns .* whole nanoseconds"), ("7", "stamp_ns stands still at 7")],
-)
+@pytest.mark.parametrize(("stamp", "words"), [
+    ("time.time()", "stamp_ns .* whole nanoseconds"), ("7", "stamp_ns stands still at 7"),
+])  # fmt: skip
 def test_a_mistake_of_the_driver_is_one_line(stamp: str, words: str, tmp_path, closed: str):
     agent = started_agent(tmp_path, "agent", closed, DRIVER.replace("{stamp}", stamp))
     assert agent.process.wait(60) == 1

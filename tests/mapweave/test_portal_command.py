@@ -43,13 +43,10 @@ def test_it_is_run_once_a_request_and_knows_where_the_robot_is_to_go(tmp_path):
     assert (tmp_path / "report").read_text() == "r0, lift east lift, 2, 1\nr0, lift east lift, 2, 2\n"
 
 
-@pytest.mark.parametrize(
-    ("command", "line"),
-    [
-        (("sh", "-c", "exit 3"), "the portal command ended with exit status 3: waits for a person"),
-        (("/nowhere/lift",), "the portal command cannot be run: [Errno 2]"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("command", "line"), [
+    (("sh", "-c", "exit 3"), "the portal command ended with exit status 3: waits for a person"),
+    (("/nowhere/lift",), "the portal command cannot be run: [Errno 2]"),
+])  # fmt: skip
 def test_one_that_fails_leaves_the_robot_to_people(command: tuple[str, ...], line: str):
     trial = Trial(*command)
     eventually(lambda: trial.seen(PortalWait(LIFT)))

@@ -86,58 +86,43 @@ def test_every_setting_there_is_can_be_written_down(tmp_path):
     assert load(tmp_path, as_toml(dataclasses.asdict(Settings()))) == Settings()
 
 
-@pytest.mark.parametrize(
-    ("text", "said"),
-    [
-        ("[netwrok]", "no setting 'netwrok'; did you mean 'network'?"),
-        ("[network]\nendpoint = []", "network: no setting 'endpoint'; did you mean 'endpoints'?"),
-        (
-            "[agent.exploration]\ntravel_sped = 1",
-            "agent.exploration: no setting 'travel_sped'; did you mean 'travel_speed'?",
-        ),
-        ("[network]\nzzz = 1", "no setting 'zzz'; known are fleet, endpoints, routers, server"),
-        ("network = 3", "network: expected table, got int; it is 3"),
-        ("agent = []", "agent: expected table, got list"),
-        ("[network]\nfleet = 3", "network.fleet: expected str, got int; it is 3"),
-        ("[network]\nendpoints = 'tcp/1.2.3.4:5'", "network.endpoints: expected list, got str"),
-        ("[network]\nendpoints = ['tcp/1.2.3.4:5', 7447]", "network.endpoints[1]: expected str, got int"),
-        ("[agent]\nseed = 1.5", "agent.seed: expected int, got float; it is 1.5"),
-        ("[agent]\nseed = true", "agent.seed: expected int, got bool; it is True"),
-        ("[agent.navigation]\nspeed = 'far'", "agent.navigation.speed: expected float, got str; it is 'far'"),
-        ("[agent.navigation]\nspeed = false", "agent.navigation.speed: expected float, got bool"),
-        ("[agent.navigation]\nspeed = nan", "agent.navigation.speed: nan is no float"),
-        ("[agent.navigation]\nspeed = inf", "agent.navigation.speed: inf is no float"),
-        ("[agent.navigation]\nspeed = 0", "agent.navigation.speed must be a number, above 0; it is 0"),
-        ("[agent.navigation]\nspeed = -0.2", "agent.navigation.speed must be a number, above 0; it is -0.2"),
-        (
-            f"[agent.navigation]\nspeed = 1{'0' * 400}",
-            "agent.navigation.speed: the number has too many digits",
-        ),
-        ("[agent.navigation]\nspeed = [1]", "agent.navigation.speed: expected float, got list"),
-        (
-            "[agent.tracking]\nfiltered = 2",
-            "agent.tracking.filtered must be a whole number, 4 or more; it is 2",
-        ),
-        ("[robot.camera]\ndelay = 5.5", "robot.camera.delay must be a number, 0 to 5; it is 5.5"),
-        (
-            "[admission_control]\nworkers = 65",
-            "admission_control.workers must be a whole number, 0 to 64; it is 65",
-        ),
-        ("[agent.landmarks]\nmost_bytes = 100", "robot.toml: most_bytes: a node needs 660 at least, not 100"),
-        ("[merge]\nexclusions = 9.0", "merge: no setting 'exclusions'; did you mean 'exclusion'?"),
-        ("[merge.exclusion]\ndoubt = 'much'", "merge.exclusion.doubt: expected float, got str"),
-        ("[merge.consistency]\nleast_links = 1.5", "merge.consistency.least_links: expected int, got float"),
-        ("[network", "robot.toml: last line: is not TOML: Expected ']'"),
-        ("a = 1\na = 2", "robot.toml: last line: is not TOML: Cannot overwrite a value; correct it there"),
-        (
-            "\n[robot]\ndriver = koala",
-            "robot.toml: line 3, column 10: is not TOML: Invalid value; correct it there",
-        ),
-        (b"\xff\xfe", "robot.toml: is not text in UTF-8"),
-        ("when = 1979-05-27", "no setting 'when'"),
-        ("[agent]\nseed = 1979-05-27", "agent.seed: expected int"),
-    ],
-)
+@pytest.mark.parametrize(("text", "said"), [
+    ("[netwrok]", "no setting 'netwrok'; did you mean 'network'?"),
+    ("[network]\nendpoint = []", "network: no setting 'endpoint'; did you mean 'endpoints'?"),
+    ("[agent.exploration]\ntravel_sped = 1",
+     "agent.exploration: no setting 'travel_sped'; did you mean 'travel_speed'?"),
+    ("[network]\nzzz = 1", "no setting 'zzz'; known are fleet, endpoints, routers, server"),
+    ("network = 3", "network: expected table, got int; it is 3"),
+    ("agent = []", "agent: expected table, got list"),
+    ("[network]\nfleet = 3", "network.fleet: expected str, got int; it is 3"),
+    ("[network]\nendpoints = 'tcp/1.2.3.4:5'", "network.endpoints: expected list, got str"),
+    ("[network]\nendpoints = ['tcp/1.2.3.4:5', 7447]", "network.endpoints[1]: expected str, got int"),
+    ("[agent]\nseed = 1.5", "agent.seed: expected int, got float; it is 1.5"),
+    ("[agent]\nseed = true", "agent.seed: expected int, got bool; it is True"),
+    ("[agent.navigation]\nspeed = 'far'", "agent.navigation.speed: expected float, got str; it is 'far'"),
+    ("[agent.navigation]\nspeed = false", "agent.navigation.speed: expected float, got bool"),
+    ("[agent.navigation]\nspeed = nan", "agent.navigation.speed: nan is no float"),
+    ("[agent.navigation]\nspeed = inf", "agent.navigation.speed: inf is no float"),
+    ("[agent.navigation]\nspeed = 0", "agent.navigation.speed must be a number, above 0; it is 0"),
+    ("[agent.navigation]\nspeed = -0.2", "agent.navigation.speed must be a number, above 0; it is -0.2"),
+    (f"[agent.navigation]\nspeed = 1{'0' * 400}", "agent.navigation.speed: the number has too many digits"),
+    ("[agent.navigation]\nspeed = [1]", "agent.navigation.speed: expected float, got list"),
+    ("[agent.tracking]\nfiltered = 2", "agent.tracking.filtered must be a whole number, 4 or more; it is 2"),
+    ("[robot.camera]\ndelay = 5.5", "robot.camera.delay must be a number, 0 to 5; it is 5.5"),
+    ("[admission_control]\nworkers = 65",
+     "admission_control.workers must be a whole number, 0 to 64; it is 65"),
+    ("[agent.landmarks]\nmost_bytes = 100", "robot.toml: most_bytes: a node needs 660 at least, not 100"),
+    ("[merge]\nexclusions = 9.0", "merge: no setting 'exclusions'; did you mean 'exclusion'?"),
+    ("[merge.exclusion]\ndoubt = 'much'", "merge.exclusion.doubt: expected float, got str"),
+    ("[merge.consistency]\nleast_links = 1.5", "merge.consistency.least_links: expected int, got float"),
+    ("[network", "robot.toml: last line: is not TOML: Expected ']'"),
+    ("a = 1\na = 2", "robot.toml: last line: is not TOML: Cannot overwrite a value; correct it there"),
+    ("\n[robot]\ndriver = koala",
+     "robot.toml: line 3, column 10: is not TOML: Invalid value; correct it there"),
+    (b"\xff\xfe", "robot.toml: is not text in UTF-8"),
+    ("when = 1979-05-27", "no setting 'when'"),
+    ("[agent]\nseed = 1979-05-27", "agent.seed: expected int"),
+])  # fmt: skip
 def test_errors_are_reported_in_one_line(tmp_path, text, said):
     assert said in refused(tmp_path, text)
 
@@ -215,13 +200,10 @@ def test_any_value_anywhere_is_taken_or_refused(data):
         assert field.type == "tuple[str, ...]" and all(type(one) is str for one in made)
 
 
-@pytest.mark.parametrize(
-    ("table", "words"),
-    [
-        ({"agent": {"landmarks": {"most_bytes": 0}}}, "file: most_bytes: a node needs 660 at least, not 0"),
-        ({"robot": {"geometry": {"axle": 400.0}}}, "file: geometry: axle is 400; it is in metres, at most"),
-    ],
-)
+@pytest.mark.parametrize(("table", "words"), [
+    ({"agent": {"landmarks": {"most_bytes": 0}}}, "file: most_bytes: a node needs 660 at least, not 0"),
+    ({"robot": {"geometry": {"axle": 400.0}}}, "file: geometry: axle is 400; it is in metres, at most"),
+])  # fmt: skip
 def test_what_settings_refuse_themselves_names_the_file(table, words):
     with pytest.raises(SettingsError, match=f"^{re.escape(words)}"):
         settings_from(table, "file")

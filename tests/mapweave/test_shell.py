@@ -317,21 +317,18 @@ def test_a_file_whose_name_begins_with_a_dash_is_named(line: str, tmp_path, monk
     assert said.count("\n") == 1
 
 
-@pytest.mark.parametrize(
-    ("arguments", "words"),
-    [
-        ("map import {graph} -o {tmp}/optimum.g2o", "optimising 1 edge"),
-        ("map from-photos {tmp}/walk/images --camera {tmp}/walk/camera.toml --spacing 1 -o {tmp}/p.mapweave",
-         "reading photographs"),
-        ("map extract {store} -o {tmp}/maps", "reading the map"),
-        ("map show {store} --no-picture", "reading nodes"),
-        ("place add sink r0.1.1 --map {store} -o {tmp}/a.mapweave", "reading nodes"),
-        ("plan show --map {store}", "reading nodes"),
-        ("relocalize {tmp}/walk/images/0.png --map {store}", "looking for the place"),
-        ("info {tmp}/walk", "reading the recording"),
-        ("replay {tmp}/walk --offline --data {tmp}/replayed", "finding where the images were taken"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("arguments", "words"), [
+    ("map import {graph} -o {tmp}/optimum.g2o", "optimising 1 edge"),
+    ("map from-photos {tmp}/walk/images --camera {tmp}/walk/camera.toml --spacing 1 -o {tmp}/p.mapweave",
+     "reading photographs"),
+    ("map extract {store} -o {tmp}/maps", "reading the map"),
+    ("map show {store} --no-picture", "reading nodes"),
+    ("place add sink r0.1.1 --map {store} -o {tmp}/a.mapweave", "reading nodes"),
+    ("plan show --map {store}", "reading nodes"),
+    ("relocalize {tmp}/walk/images/0.png --map {store}", "looking for the place"),
+    ("info {tmp}/walk", "reading the recording"),
+    ("replay {tmp}/walk --offline --data {tmp}/replayed", "finding where the images were taken"),
+])  # fmt: skip
 def test_work_that_may_take_long_is_shown(arguments: str, words: str, recording: Path, tmp_path, monkeypatch):
     """With thousands of nodes, vertices or images each is silent for longer than a person waits."""
     graph = tmp_path / "in.g2o"

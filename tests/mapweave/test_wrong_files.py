@@ -232,18 +232,14 @@ def test_a_folder_that_is_there_or_made_keeps_what_was_in_it(
     assert (tmp_path / "full" / "mine.txt").read_text() == "keep me"
 
 
-@pytest.mark.parametrize(
-    ("line", "words"),
-    [
-        ("go r9 r0.1.1", "r9"), ("explore r9", "r9"), ("stop r9", "r9"), ("missions r9", "r9"),
-        ("portal done r9", "r9"),
-        ("place add sink r0.1.999", "no node 999"), ("place remove sink", "sink"), ("reopen sink", "sink"),
-        ("close r0.1.1 r0.1.999", "no node 999"), ("floor ground r9.1.1", "no map r9.1"),
-        ("map pin r9.1.1", "no map r9.1"), ("place add sink kitchn", "kitchn"),
-        ("plan export attic --format tf", "attic"), ("place add sink 1,1 --plan attic", "attic"),
-        ("status --plan attic", "attic"), ("map portal remove gate", "gate"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("line", "words"), [
+    ("go r9 r0.1.1", "r9"), ("explore r9", "r9"), ("stop r9", "r9"), ("missions r9", "r9"),
+    ("portal done r9", "r9"), ("place add sink r0.1.999", "no node 999"), ("place remove sink", "sink"),
+    ("reopen sink", "sink"), ("close r0.1.1 r0.1.999", "no node 999"), ("floor ground r9.1.1", "no map r9.1"),
+    ("map pin r9.1.1", "no map r9.1"), ("place add sink kitchn", "kitchn"),
+    ("plan export attic --format tf", "attic"), ("place add sink 1,1 --plan attic", "attic"),
+    ("status --plan attic", "attic"), ("map portal remove gate", "gate"),
+])  # fmt: skip
 def test_what_a_running_server_does_not_know_is_one_line_and_nothing_is_kept(
     line: str, words: str, tmp_path, monkeypatch, capfd
 ):

@@ -44,26 +44,21 @@ def test_a_robot_describes_what_was_ordered():
     assert (setup.body.slip, setup.body.motor_lag, setup.body.ticks_per_turn) == (0.03, 0.3, 512)
 
 
-@pytest.mark.parametrize(
-    ("table", "says"),
-    [
-        ({"name": "a", "camera": "telephoto"}, "no camera 'telephoto'; there are webcam"),
-        ({"name": "a", "camera": 3}, "must be a name"),
-        ({"name": "a", "camera": {"read_nois": 1.0}}, "did you mean 'read_noise'"),
-        (
-            {"name": "a", "camera": {"exposure": {"seconds": 9.0}}},
-            "exposure.seconds must be a number, 0 to 0.1; it is 9",
-        ),
-        ({"name": "a", "camera": {"distortion": [-2.0, 0, 0, 0, 0]}}, "folds"),
-        ({"name": "a", "camera": {"intrinsics": 3}}, "expected table"),
-        ({"name": "a b"}, "a b"),
-        ({"camera": "wide"}, "name is missing"),
-        ({"name": "a", "body": {"slip": -1.0}}, "slip"),
-        ({"name": "a", "body": {"ticks_per_turn": 0}}, "ticks_per_turn"),
-        ({"name": "a", "rangers": 1000}, "rangers must be a whole number, 0 to 256; it is 1000"),
-        ({"name": "a", "start": [1, 2]}, "start: expected list of length 3"),
-    ],
-)
+@pytest.mark.parametrize(("table", "says"), [
+    ({"name": "a", "camera": "telephoto"}, "no camera 'telephoto'; there are webcam"),
+    ({"name": "a", "camera": 3}, "must be a name"),
+    ({"name": "a", "camera": {"read_nois": 1.0}}, "did you mean 'read_noise'"),
+    ({"name": "a", "camera": {"exposure": {"seconds": 9.0}}},
+     "exposure.seconds must be a number, 0 to 0.1; it is 9"),
+    ({"name": "a", "camera": {"distortion": [-2.0, 0, 0, 0, 0]}}, "folds"),
+    ({"name": "a", "camera": {"intrinsics": 3}}, "expected table"),
+    ({"name": "a b"}, "a b"),
+    ({"camera": "wide"}, "name is missing"),
+    ({"name": "a", "body": {"slip": -1.0}}, "slip"),
+    ({"name": "a", "body": {"ticks_per_turn": 0}}, "ticks_per_turn"),
+    ({"name": "a", "rangers": 1000}, "rangers must be a whole number, 0 to 256; it is 1000"),
+    ({"name": "a", "start": [1, 2]}, "start: expected list of length 3"),
+])  # fmt: skip
 def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says: str):
     """One line."""
     with pytest.raises(MapweaveError, match=says) as caught:

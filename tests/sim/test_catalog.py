@@ -9,22 +9,19 @@ from mapweave.hybridmap.errors import InvalidValue, MapweaveError, SettingsError
 from mapweave.sim.worlds.catalog import KINDS, make_world, world_from_table
 
 
-@pytest.mark.parametrize(
-    ("kind", "parameters", "says"),
-    [
-        ("offices", {}, "no kind of world 'offices'; there are office, corridor"),
-        ("office", {"rooms": 0}, "rooms must be a whole number, 1 to 32; it is 0"),
-        ("office", {"rooms": 2.5}, "expected int"),
-        ("office", {"room": 2}, "did you mean 'rooms'"),
-        ("corridor", {"breadth": math.nan}, "is no float"),
-        ("corridor", {"breadth": 0.2}, "breadth must be a number, 1.2 to 5; it is 0.2"),
-        ("corridor", {"width": 5.0, "breadth": 3.0}, "has no middle"),
-        ("warehouse", {"rows": 21}, "rows must be a whole number, 1 to 20; it is 21"),
-        ("warehouse", {"bays": True}, "expected int"),
-        ("twins", {"joined": 1}, "expected bool"),
-        ("arena", {"length": -3.0}, "length must be a number, 2 to 60; it is -3.0"),
-    ],
-)
+@pytest.mark.parametrize(("kind", "parameters", "says"), [
+    ("offices", {}, "no kind of world 'offices'; there are office, corridor"),
+    ("office", {"rooms": 0}, "rooms must be a whole number, 1 to 32; it is 0"),
+    ("office", {"rooms": 2.5}, "expected int"),
+    ("office", {"room": 2}, "did you mean 'rooms'"),
+    ("corridor", {"breadth": math.nan}, "is no float"),
+    ("corridor", {"breadth": 0.2}, "breadth must be a number, 1.2 to 5; it is 0.2"),
+    ("corridor", {"width": 5.0, "breadth": 3.0}, "has no middle"),
+    ("warehouse", {"rows": 21}, "rows must be a whole number, 1 to 20; it is 21"),
+    ("warehouse", {"bays": True}, "expected int"),
+    ("twins", {"joined": 1}, "expected bool"),
+    ("arena", {"length": -3.0}, "length must be a number, 2 to 60; it is -3.0"),
+])  # fmt: skip
 def test_wrong_parameters_are_reported_in_one_line(kind: str, parameters: dict[str, object], says: str):
     """Which parameter, and what it may be."""
     with pytest.raises(MapweaveError, match=says) as caught:

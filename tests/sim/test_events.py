@@ -30,31 +30,22 @@ def test_tables_become_events():
     assert fail.size == 0.1
 
 
-@pytest.mark.parametrize(
-    ("table", "says"),
-    [
-        ({"do": "explode"}, "known are kidnap, light, walk, move_furniture, fail"),
-        ({}, "known are kidnap"),
-        ({"do": "kidnap", "robot": "r0"}, "say where"),
-        ({"do": "kidnap", "robot": "r0", "x": 1.0}, "say where"),
-        ({"do": "kidnap", "robot": "r0", "x": 1.0, "y": 1.0, "room": "room 1"}, "say where"),
-        ({"do": "kidnap", "x": 1.0, "y": 1.0}, "robot is missing"),
-        ({"do": "light", "factor": -1}, "factor must be a number, 0 to 20; it is -1"),
-        ({"do": "walk"}, "say where"),
-        ({"do": "walk", "near": "r0", "what": "dog"}, "known are person, box"),
-        ({"do": "walk", "path": [[0, 0]]}, "2 to 1000"),
-        ({"do": "fail", "robot": "r0", "sensor": "nose", "how": "drop"}, "there are camera, encoders"),
-        (
-            {"do": "fail", "robot": "r0", "sensor": "camera", "how": "spike"},
-            "known are drop, blocked, freeze",
-        ),
-        (
-            {"do": "fail", "robot": "r0", "sensor": "camera", "how": "drop", "second": 1},
-            "did you mean 'seconds'",
-        ),
-        ({"do": "fail", "robot": "r0", "sensor": "rangers", "how": "spike", "amount": 3}, "amount is 3"),
-    ],
-)
+@pytest.mark.parametrize(("table", "says"), [
+    ({"do": "explode"}, "known are kidnap, light, walk, move_furniture, fail"),
+    ({}, "known are kidnap"),
+    ({"do": "kidnap", "robot": "r0"}, "say where"),
+    ({"do": "kidnap", "robot": "r0", "x": 1.0}, "say where"),
+    ({"do": "kidnap", "robot": "r0", "x": 1.0, "y": 1.0, "room": "room 1"}, "say where"),
+    ({"do": "kidnap", "x": 1.0, "y": 1.0}, "robot is missing"),
+    ({"do": "light", "factor": -1}, "factor must be a number, 0 to 20; it is -1"),
+    ({"do": "walk"}, "say where"),
+    ({"do": "walk", "near": "r0", "what": "dog"}, "known are person, box"),
+    ({"do": "walk", "path": [[0, 0]]}, "2 to 1000"),
+    ({"do": "fail", "robot": "r0", "sensor": "nose", "how": "drop"}, "there are camera, encoders"),
+    ({"do": "fail", "robot": "r0", "sensor": "camera", "how": "spike"}, "known are drop, blocked, freeze"),
+    ({"do": "fail", "robot": "r0", "sensor": "camera", "how": "drop", "second": 1}, "did you mean 'seconds'"),
+    ({"do": "fail", "robot": "r0", "sensor": "rangers", "how": "spike", "amount": 3}, "amount is 3"),
+])  # fmt: skip
 def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says: str):
     """One line."""
     with pytest.raises(MapweaveError, match=says) as caught:

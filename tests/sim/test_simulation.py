@@ -135,13 +135,8 @@ def test_the_solver_loses_next_to_nothing(bare: World):
     """Ideal wheels over 9 m and three turns: where odometry says, to 1 % of what slip costs."""
     ideal = BodySettings(radius_error=0.0, axle_error=0.0, slip=0.0)
     legs = [
-        (0.3, 0.0, 100),
-        (0.0, 0.8, 80),
-        (0.3, 0.2, 100),
-        (0.0, -0.8, 80),
-        (0.3, -0.4, 100),
-        (0.0, 0.0, 10),
-    ]
+        (0.3, 0.0, 100), (0.0, 0.8, 80), (0.3, 0.2, 100), (0.0, -0.8, 80), (0.3, -0.4, 100), (0.0, 0.0, 10),
+    ]  # fmt: skip
     with Simulation(bare, [RobotSetup("r0", body=ideal)], 1, [Pose2()]) as simulation:
         pose = Pose2()
         for forward, turn, ticks in legs:

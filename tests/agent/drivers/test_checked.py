@@ -97,14 +97,11 @@ def test_bearings_in_degrees():
         robot.sense()
 
 
-@pytest.mark.parametrize(
-    ("changes", "words"),
-    [
-        ({"ranger_bearings": np.zeros(2)}, "ranger_bearings must be a tuple of radians, not ndarray"),
-        ({"axle": None}, r"gives no robot description: Expected `float`, got `null` - at `\$.axle`"),
-        ({"tick": 0.0}, r"gives no robot description: Expected `float` >= 0.0001 - at `\$.tick`"),
-    ],
-)
+@pytest.mark.parametrize(("changes", "words"), [
+    ({"ranger_bearings": np.zeros(2)}, "ranger_bearings must be a tuple of radians, not ndarray"),
+    ({"axle": None}, r"gives no robot description: Expected `float`, got `null` - at `\$.axle`"),
+    ({"tick": 0.0}, r"gives no robot description: Expected `float` >= 0.0001 - at `\$.tick`"),
+])  # fmt: skip
 def test_a_wrong_description(changes: dict[str, Any], words: str):
     with pytest.raises(DeviceError, match=rf"^driver: describe\(\) {words}"):
         checked(description=replace(DESCRIPTION, **changes)).describe()
@@ -126,14 +123,11 @@ class Raises(Scripted):
         raise OSError("no\nport")
 
 
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda robot: robot.describe(), "KeyError: 'camera'"),
-        (lambda robot: robot.sense(), "ValueError: cannot reshape array of size 3"),
-        (lambda robot: robot.act(Command()), "AttributeError: 'Command' object has no attribute 'left'"),
-    ],
-)
+@pytest.mark.parametrize(("call", "words"), [
+    (lambda robot: robot.describe(), "KeyError: 'camera'"),
+    (lambda robot: robot.sense(), "ValueError: cannot reshape array of size 3"),
+    (lambda robot: robot.act(Command()), "AttributeError: 'Command' object has no attribute 'left'"),
+])  # fmt: skip
 def test_an_error_of_the_drivers_own_code_names_its_file_and_line(
     call: Callable[[CheckedRobot], object], words: str, monkeypatch
 ):
@@ -161,14 +155,11 @@ def test_a_description_that_is_none():
         checked(description={}).describe()
 
 
-@pytest.mark.parametrize(
-    ("second", "words"),
-    [
-        (NOW_NS, "stamp_ns stands still"),
-        (NOW_NS - 1, "stamp_ns goes backwards, from 1795000000000000000 to 1794999999999999999"),
-        (NOW_NS + 100, "stamp_ns rises by 100 in a tick of 0.1 s; it must be nanoseconds"),
-    ],
-)
+@pytest.mark.parametrize(("second", "words"), [
+    (NOW_NS, "stamp_ns stands still"),
+    (NOW_NS - 1, "stamp_ns goes backwards, from 1795000000000000000 to 1794999999999999999"),
+    (NOW_NS + 100, "stamp_ns rises by 100 in a tick of 0.1 s; it must be nanoseconds"),
+])  # fmt: skip
 def test_stamps_that_do_not_rise_as_they_should(second: int, words: str):
     robot = checked(GOOD, good(stamp_ns=second))
     robot.sense()
@@ -237,14 +228,11 @@ def test_a_robot_that_is_pushed_or_late_moves_as_it_may():
     assert carried.sense() is not None
 
 
-@pytest.mark.parametrize(
-    ("applied", "words"),
-    [
-        (None, "must return the Command that is applied, not None"),
-        ((0.1, 0.0), "not tuple"),
-        (Command(math.nan, 0.0), "is not finite"),
-    ],
-)
+@pytest.mark.parametrize(("applied", "words"), [
+    (None, "must return the Command that is applied, not None"),
+    ((0.1, 0.0), "not tuple"),
+    (Command(math.nan, 0.0), "is not finite"),
+])  # fmt: skip
 def test_act_without_an_answer(applied: Any, words: str):
     with pytest.raises(DeviceError, match=rf"^driver: act\(\) .*{words}"):
         checked(applied=applied).act(Command())

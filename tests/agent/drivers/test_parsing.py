@@ -82,33 +82,18 @@ def test_what_a_waveshare_says():
     assert parse_info('{"T":1002,"L":0.1,"R":-0.2}') is None
 
 
-@pytest.mark.parametrize(
-    ("driver", "options", "words"),
-    [
-        ("koala", {"prot": "x"}, r"\[robot.options\]: no setting 'prot'; did you mean 'port'"),
-        (
-            "create",
-            {},
-            r"\[robot.options\]: port is missing: write it in .* --settings FILE .*`mapweave find-port`",
-        ),
-        (
-            "arduino",
-            {"port": "x"},
-            r"wheel_radius is missing: write it in .* --settings FILE \(docs/drivers.md\)$",
-        ),
-        (
-            "arduino",
-            {"port": "x", "wheel_radius": 0.0, "counts_per_turn": 1},
-            "wheel_radius must be a number, above 0; it is 0.0",
-        ),
-        (
-            "arduino",
-            {"port": "x", "wheel_radius": 1.0, "counts_per_turn": 1, "baud": 0},
-            "baud must be a whole number, 50 to 10000000; it is 0",
-        ),
-        ("waveshare", {"port": "x"}, r"no \[robot.camera\]"),
-    ],
-)
+@pytest.mark.parametrize(("driver", "options", "words"), [
+    ("koala", {"prot": "x"}, r"\[robot.options\]: no setting 'prot'; did you mean 'port'"),
+    ("create", {},
+     r"\[robot.options\]: port is missing: write it in .* --settings FILE .*`mapweave find-port`"),
+    ("arduino", {"port": "x"},
+     r"wheel_radius is missing: write it in .* --settings FILE \(docs/drivers.md\)$"),
+    ("arduino", {"port": "x", "wheel_radius": 0.0, "counts_per_turn": 1},
+     "wheel_radius must be a number, above 0; it is 0.0"),
+    ("arduino", {"port": "x", "wheel_radius": 1.0, "counts_per_turn": 1, "baud": 0},
+     "baud must be a whole number, 50 to 10000000; it is 0"),
+    ("waveshare", {"port": "x"}, r"no \[robot.camera\]"),
+])  # fmt: skip
 def test_options_that_cannot_be(driver: str, options: dict[str, object], words: str):
     with pytest.raises(SettingsError, match=words):
         find_driver(driver)(RobotSettings(options=options))

@@ -78,17 +78,11 @@ def test_a_class_in_a_file_with_a_dataclass_for_its_options(tmp_path):
     assert robot.o.port == "x"  # type: ignore[attr-defined]
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (
-            "import a_library_that_is_not_there\n",
-            "needs the library a_library_that_is_not_there, which is not",
-        ),
-        ("1 / 0\n", "cannot be loaded: ZeroDivisionError: division by zero"),
-        ("", "cannot be loaded: AttributeError: .* has no attribute 'Rover'"),
-    ],
-)
+@pytest.mark.parametrize(("text", "words"), [
+    ("import a_library_that_is_not_there\n", "needs the library a_library_that_is_not_there, which is not"),
+    ("1 / 0\n", "cannot be loaded: ZeroDivisionError: division by zero"),
+    ("", "cannot be loaded: AttributeError: .* has no attribute 'Rover'"),
+])  # fmt: skip
 def test_a_driver_of_another_package_that_cannot_be_loaded(text: str, words: str, tmp_path, monkeypatch):
     """Before, an agent with it ended in a traceback."""
     (tmp_path / "a_rover.py").write_text(text)
@@ -108,17 +102,14 @@ def test_a_class_that_tells_no_signature(tmp_path):
     assert find_driver(f"{path}:Rover")(settings) == str(settings)
 
 
-@pytest.mark.parametrize(
-    ("text", "name", "words"),
-    [
-        (None, "Rover", "no such file"),
-        (CLASS, "Rower", "no class 'Rower'; there are Rover"),
-        ("def f(:\n", "Rover", "line 1: SyntaxError"),
-        ("\n\nraise ValueError('no')\n", "Rover", "line 3: ValueError: no"),
-        (CLASS.replace("act", "move"), "Rover", "lacks act"),
-        ("Rover = 7\n", "Rover", "needs a class"),
-    ],
-)
+@pytest.mark.parametrize(("text", "name", "words"), [
+    (None, "Rover", "no such file"),
+    (CLASS, "Rower", "no class 'Rower'; there are Rover"),
+    ("def f(:\n", "Rover", "line 1: SyntaxError"),
+    ("\n\nraise ValueError('no')\n", "Rover", "line 3: ValueError: no"),
+    (CLASS.replace("act", "move"), "Rover", "lacks act"),
+    ("Rover = 7\n", "Rover", "needs a class"),
+])  # fmt: skip
 def test_a_file_that_is_no_driver(text: str | None, name: str, words: str, tmp_path):
     path = tmp_path / "rover.py"
     if text is not None:
@@ -128,19 +119,12 @@ def test_a_file_that_is_no_driver(text: str | None, name: str, words: str, tmp_p
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (
-            CLASS.replace("self, settings", "self"),
-            r"^driver .*rover.py:Rover: __init__ must take one argument, the settings$",
-        ),
-        (
-            CLASS.replace("self.settings = settings", "self.settings = settings.options['gate']"),
-            r"^driver: .*rover.py, line \d+: KeyError: 'gate'$",
-        ),
-    ],
-)
+@pytest.mark.parametrize(("text", "words"), [
+    (CLASS.replace("self, settings", "self"),
+     r"^driver .*rover.py:Rover: __init__ must take one argument, the settings$"),
+    (CLASS.replace("self.settings = settings", "self.settings = settings.options['gate']"),
+     r"^driver: .*rover.py, line \d+: KeyError: 'gate'$"),
+])  # fmt: skip
 def test_a_constructor_that_fails(text: str, words: str, tmp_path):
     path = tmp_path / "rover.py"
     path.write_text(text)
@@ -216,13 +200,10 @@ def test_wrong_values_are_one_line(text: str, words: str, tmp_path):
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize(
-    ("settings", "known", "words"),
-    [
-        (RobotSettings(), KNOWN, r"no \[robot.camera\]: give source, width"),
-        (RobotSettings(camera=CAMERA), Geometry(), "radius is missing"),
-    ],
-)
+@pytest.mark.parametrize(("settings", "known", "words"), [
+    (RobotSettings(), KNOWN, r"no \[robot.camera\]: give source, width"),
+    (RobotSettings(camera=CAMERA), Geometry(), "radius is missing"),
+])  # fmt: skip
 def test_settings_that_lack_something(settings: RobotSettings, known: Geometry, words: str):
     with pytest.raises(SettingsError, match=words):
         settings.describe(known)

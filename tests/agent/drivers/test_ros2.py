@@ -215,27 +215,21 @@ def test_another_clock_is_translated(start: Start):
     assert sum(o.image is not None for o in seen) > len(seen) - 3
 
 
-@pytest.mark.parametrize(
-    ("given", "options", "line"),
-    [
-        ({"silent": ["odom"]}, {}, "no odometry on /odom"),
-        ({"silent": ["image"]}, {}, "no images on /camera/image_raw; there are "),
-        ({"silent": ["camera_info"]}, {}, r"no camera calibration \(\[robot.camera\] can replace it\)"),
-        ({"silent": ["tf_static"]}, {}, "/tf_static does not tell where camera_optical_frame is"),
-        ({}, {"odometry": "scan"}, "/scan has sensor_msgs/msg/LaserScan; odometry are nav_msgs"),
-        ({}, {"odometry": "joint_states"}, "/joint_states: joint states need .* wheel_radius"),
-        (
-            {},
-            {"odometry": "joint_states", "wheel_radius": 0.03, "joints": ["fl", "fr"]},
-            r"no joint 'fl' \(there are wheel_left_joint, wheel_right_joint\)",
-        ),
-        ({"pose": [math.nan, 0.0, 0.0]}, {}, "/odom: odometry is not finite"),
-        ({"lens": {"width": 128}}, {}, "images of 64x48 px, but /camera/camera_info is for 128x48"),
-        ({"lens": {"model": "thin_prism"}}, {}, "/camera/camera_info: lens model 'thin_prism'"),
-        ({"lens": {"focal": 0.0}}, {}, "focal lengths must be positive; calibrate it"),
-        ({"encoding": "bayer_rggb8"}, {}, "/camera/image_raw: images of encoding 'bayer_rggb8'"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("given", "options", "line"), [
+    ({"silent": ["odom"]}, {}, "no odometry on /odom"),
+    ({"silent": ["image"]}, {}, "no images on /camera/image_raw; there are "),
+    ({"silent": ["camera_info"]}, {}, r"no camera calibration \(\[robot.camera\] can replace it\)"),
+    ({"silent": ["tf_static"]}, {}, "/tf_static does not tell where camera_optical_frame is"),
+    ({}, {"odometry": "scan"}, "/scan has sensor_msgs/msg/LaserScan; odometry are nav_msgs"),
+    ({}, {"odometry": "joint_states"}, "/joint_states: joint states need .* wheel_radius"),
+    ({}, {"odometry": "joint_states", "wheel_radius": 0.03, "joints": ["fl", "fr"]},
+     r"no joint 'fl' \(there are wheel_left_joint, wheel_right_joint\)"),
+    ({"pose": [math.nan, 0.0, 0.0]}, {}, "/odom: odometry is not finite"),
+    ({"lens": {"width": 128}}, {}, "images of 64x48 px, but /camera/camera_info is for 128x48"),
+    ({"lens": {"model": "thin_prism"}}, {}, "/camera/camera_info: lens model 'thin_prism'"),
+    ({"lens": {"focal": 0.0}}, {}, "focal lengths must be positive; calibrate it"),
+    ({"encoding": "bayer_rggb8"}, {}, "/camera/image_raw: images of encoding 'bayer_rggb8'"),
+])  # fmt: skip
 def test_what_is_wrong_is_said_in_one_line(
     start: Start, given: dict[str, Any], options: dict[str, Any], line: str, monkeypatch
 ):
@@ -280,19 +274,13 @@ def test_without_a_router_one_line_says_so(monkeypatch):
         robot.close()
 
 
-@pytest.mark.parametrize(
-    ("degrees", "lens", "words"),
-    first_quick(
-        [
-            (2.0, {}, ""),
-            (12.0, {}, "the camera looks 12 deg down by tf"),
-            (0.0, {"lens": (-0.1, 0.02, 0.001)}, "3 coefficients of distortion"),
-            (-12.0, {}, "the camera looks 12 deg up by tf"),
-            (0.0, {}, ""),
-        ],
-        3,
-    ),
-)
+@pytest.mark.parametrize(("degrees", "lens", "words"), first_quick([
+    (2.0, {}, ""),
+    (12.0, {}, "the camera looks 12 deg down by tf"),
+    (0.0, {"lens": (-0.1, 0.02, 0.001)}, "3 coefficients of distortion"),
+    (-12.0, {}, "the camera looks 12 deg up by tf"),
+    (0.0, {}, ""),
+], 3))  # fmt: skip
 def test_what_is_not_taken_into_account_of_a_camera_is_said(
     start: Start, caplog, degrees: float, lens: dict[str, Any], words: str
 ):

@@ -23,16 +23,13 @@ def ends() -> Iterator[tuple[int, SerialPort]]:
     os.close(master)
 
 
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda port: port.clear(),
-        lambda port: port.write(b"x"),
-        lambda port: port.read(1),
-        lambda port: port.line(),
-        lambda port: port.line_waiting(),
-    ],
-)
+@pytest.mark.parametrize("call", [
+    lambda port: port.clear(),
+    lambda port: port.write(b"x"),
+    lambda port: port.read(1),
+    lambda port: port.line(),
+    lambda port: port.line_waiting(),
+])  # fmt: skip
 def test_a_port_that_vanishes_is_a_device_error(call: Callable[[SerialPort], object]):
     master, slave = pty.openpty()
     port = SerialPort(os.ttyname(slave), 115200)

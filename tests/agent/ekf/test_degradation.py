@@ -101,15 +101,12 @@ def undisturbed(number: int) -> MappingFilter:
     return drive(drawn(number), recorded)[0]
 
 
-@pytest.mark.parametrize(
-    ("fault", "named", "share", "growth"),
-    [
-        (dropped_frames, Health.NO_IMAGE, 0.9, 1.5),
-        (blocked_lens, Health.BLIND, 1.0, 1.5),
-        (one_landmark, Health.FEW, 1.0, 1.2),
-        (scrambled, Health.DISAGREEMENT, 0.9, 1.5),
-    ],
-)
+@pytest.mark.parametrize(("fault", "named", "share", "growth"), [
+    (dropped_frames, Health.NO_IMAGE, 0.9, 1.5),
+    (blocked_lens, Health.BLIND, 1.0, 1.5),
+    (one_landmark, Health.FEW, 1.0, 1.2),
+    (scrambled, Health.DISAGREEMENT, 0.9, 1.5),
+])  # fmt: skip
 def test_without_landmarks_the_uncertainty_grows_and_is_reported(
     number: int, run: MappingRun, fault: Fault, named: Health, share: float, growth: float
 ):

@@ -34,24 +34,21 @@ def tick(mapping: CarriedMapping) -> list[EpisodeRequest]:
     return moves
 
 
-@pytest.mark.parametrize(
-    ("stage", "node"),
-    [
-        (Stage(Pose2()), False),
-        (Stage(Pose2(0.49), converged_share=0.9), False),
-        (Stage(Pose2(0.51), converged_share=0.9), True),
-        (Stage(Pose2(0.3, -0.45), converged_share=0.7), True),
-        (Stage(Pose2(0.51), converged_share=0.69), False),
-        (Stage(Pose2(0, 0, -0.36), converged_share=0.7), True),
-        (Stage(Pose2(0, 0, 0.34), converged_share=0.9), False),
-        (Stage(Pose2(0.05), anchored=44), True),
-        (Stage(Pose2(0.05), anchored=46), False),
-        (Stage(Pose2(0, 0, 0.11), anchored=10), True),
-        (Stage(Pose2(0.03), anchored=10), False),
-        (Stage(Pose2(0.05), anchored=15, anchor_features=20), True),
-        (Stage(Pose2(0.05), anchored=16, anchor_features=20), False),
-    ],
-)
+@pytest.mark.parametrize(("stage", "node"), [
+    (Stage(Pose2()), False),
+    (Stage(Pose2(0.49), converged_share=0.9), False),
+    (Stage(Pose2(0.51), converged_share=0.9), True),
+    (Stage(Pose2(0.3, -0.45), converged_share=0.7), True),
+    (Stage(Pose2(0.51), converged_share=0.69), False),
+    (Stage(Pose2(0, 0, -0.36), converged_share=0.7), True),
+    (Stage(Pose2(0, 0, 0.34), converged_share=0.9), False),
+    (Stage(Pose2(0.05), anchored=44), True),
+    (Stage(Pose2(0.05), anchored=46), False),
+    (Stage(Pose2(0, 0, 0.11), anchored=10), True),
+    (Stage(Pose2(0.03), anchored=10), False),
+    (Stage(Pose2(0.05), anchored=15, anchor_features=20), True),
+    (Stage(Pose2(0.05), anchored=16, anchor_features=20), False),
+])  # fmt: skip
 def test_a_node_is_made_when_the_view_is_known_or_leaving(stage, node):
     assert tick(CarriedMapping(stage)) == [EpisodeRequest.FINISH] * node
 

@@ -192,11 +192,9 @@ def test_it_turns_to_where_there_is_most_room(elsewhere, own_map):
     assert all(command.forward == 0.0 for command in robot.commands)
 
 
-@pytest.mark.parametrize(
-    ("proximity", "description"),
-    [(np.full(len(BEARINGS), 0.2), BODY), (np.zeros(0), replace(BODY, ranger_bearings=(), ranger_reach=0.0))],
-    ids=["no room", "no rangers"],
-)
+@pytest.mark.parametrize(("proximity", "description"), [
+    (np.full(len(BEARINGS), 0.2), BODY), (np.zeros(0), replace(BODY, ranger_bearings=(), ranger_reach=0.0)),
+], ids=["no room", "no rangers"])  # fmt: skip
 def test_without_room_that_it_can_see_it_stays(elsewhere, own_map, proximity, description):
     robot = Body(elsewhere, PLACE)
     assert search(own_map, robot, proximity=proximity, description=description).lost

@@ -255,13 +255,12 @@ def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, t
         assert error.mean() < 3.0, "not the same frame"
 
 
-@pytest.mark.parametrize(
-    ("name", "codec", "share", "says"),
-    [("walk.avi", "MJPG", 0.999, "the file ends before its index"),
-     ("walk.avi", "MJPG", 0.3, "the file ends before its index"),
-     ("walk.mkv", "mp4v", 0.6, "its header says 9.0 s"),
-     ("walk.webm", "VP80", 1.0, "")],
-)  # fmt: skip
+@pytest.mark.parametrize(("name", "codec", "share", "says"), [
+    ("walk.avi", "MJPG", 0.999, "the file ends before its index"),
+    ("walk.avi", "MJPG", 0.3, "the file ends before its index"),
+    ("walk.mkv", "mp4v", 0.6, "its header says 9.0 s"),
+    ("walk.webm", "VP80", 1.0, ""),
+])  # fmt: skip
 def test_a_video_that_was_cut_off_says_so(
     name: str, codec: str, share: float, says: str, drive: Drive, tmp_path
 ):
@@ -345,10 +344,9 @@ def test_odometry_that_begins_again_at_zero_goes_on(drive: Drive, tmp_path):
     assert recording.increments[others] == pytest.approx(drive.increments[others], abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("scale", "way", "words"),
-    [(1e3, 0.02, "every 100 s: times must be in seconds"), (1.0, 0.02, ""), (1e3, 2.0, ""), (1e3, 0.0, "")],
-)
+@pytest.mark.parametrize(("scale", "way", "words"), [
+    (1e3, 0.02, "every 100 s: times must be in seconds"), (1.0, 0.02, ""), (1e3, 2.0, ""), (1e3, 0.0, ""),
+])  # fmt: skip
 def test_times_in_milliseconds_are_named(scale: float, way: float, words: str, drive: Drive, tmp_path):
     folder_with_poses(drive, tmp_path)
     (tmp_path / "camera.toml").write_text(CAMERA_TOML)
@@ -364,17 +362,14 @@ def test_odometry_of_another_clock_is_refused(drive: Drive, poses_file: Path, tm
         open_recording(tmp_path, RecordingOptions(odometry=poses_file, camera_height=1.65))
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        ("1 2 3\n", "line 1: a pose is `stamp x y z qx qy qz qw`"),
-        ("", "0 poses; there must be two or more"),
-        ("1 0 0 0 0 0 0 1\n2 nan 0 0 0 0 0 1\n", "line 2: all numbers must be finite"),
-        ("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n", "line 2: a quaternion of zeros is none"),
-        ("1 0 0 0 0 0 0 1\n1e10 0 0 0 0 0 0 1\n", "times are seconds since 1970 or since the start"),
-        ("# only a comment\n1 0 0 0 0 0 0 1\n", "1 poses"),
-    ],
-)
+@pytest.mark.parametrize(("text", "words"), [
+    ("1 2 3\n", "line 1: a pose is `stamp x y z qx qy qz qw`"),
+    ("", "0 poses; there must be two or more"),
+    ("1 0 0 0 0 0 0 1\n2 nan 0 0 0 0 0 1\n", "line 2: all numbers must be finite"),
+    ("1 0 0 0 0 0 0 1\n2 0 0 0 0 0 0 0\n", "line 2: a quaternion of zeros is none"),
+    ("1 0 0 0 0 0 0 1\n1e10 0 0 0 0 0 0 1\n", "times are seconds since 1970 or since the start"),
+    ("# only a comment\n1 0 0 0 0 0 0 1\n", "1 poses"),
+])  # fmt: skip
 def test_wrong_poses_are_refused_in_one_line(text: str, words: str, drive: Drive, tmp_path):
     kitti(drive, tmp_path)
     (tmp_path / "odometry.txt").write_text(text)

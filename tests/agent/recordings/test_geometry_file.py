@@ -58,17 +58,13 @@ def test_angles_are_degrees(tmp_path):
     assert tomllib.loads((tmp_path / "r0.toml").read_text())["heading_deg"] == pytest.approx(-2.0)
 
 
-@pytest.mark.parametrize(
-    ("text", "word"),
-    [
-        ("forward_m = ", "Invalid value"), ("pitch_deg = 80", "pitch_deg is 80"),
-        ("height_m = 0", "height_m"), ("wheel_scale = 0.01", "wheel_scale"), ("delay_s = nan", "delay_s"),
-        ('left_m = "x"', "left_m"),
-        ("forward_m = inf", "forward_m"),
-        ("foward_m = 0.1", "no setting 'foward_m'; did you mean 'forward_m'?"), ("foo = 1", "known are"),
-        ("left_m = " + "9" * 400, "left_m has too many digits"), ("left_m = " + "[" * 5000, "r0.toml"),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("text", "word"), [
+    ("forward_m = ", "Invalid value"), ("pitch_deg = 80", "pitch_deg is 80"), ("height_m = 0", "height_m"),
+    ("wheel_scale = 0.01", "wheel_scale"), ("delay_s = nan", "delay_s"), ('left_m = "x"', "left_m"),
+    ("forward_m = inf", "forward_m"), ("foward_m = 0.1", "no setting 'foward_m'; did you mean 'forward_m'?"),
+    ("foo = 1", "known are"), ("left_m = " + "9" * 400, "left_m has too many digits"),
+    ("left_m = " + "[" * 5000, "r0.toml"),
+])  # fmt: skip
 def test_what_cannot_be_right_is_refused_in_one_line(tmp_path, text: str, word: str):
     file = tmp_path / "r0.toml"
     file.write_text(text)

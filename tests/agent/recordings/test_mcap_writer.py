@@ -130,15 +130,12 @@ def test_a_lossless_recording_is_replayed_to_the_very_same_map(walls: PhotoWalls
         assert replayed[stamp].vector == pytest.approx(pose.vector, abs=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("given", "line"),
-    [
-        ("'-3.0'", "gives what no wheels can have: mapweave.axle_m '-3.0'"),
-        ("wide", "gives what no wheels can have: mapweave.axle_m 'wide'"),
-        (".nan", "gives what no wheels can have: mapweave.axle_m nan"),
-        (None, "lacks mapweave.axle_m"),
-    ],
-)
+@pytest.mark.parametrize(("given", "line"), [
+    ("'-3.0'", "gives what no wheels can have: mapweave.axle_m '-3.0'"),
+    ("wide", "gives what no wheels can have: mapweave.axle_m 'wide'"),
+    (".nan", "gives what no wheels can have: mapweave.axle_m nan"),
+    (None, "lacks mapweave.axle_m"),
+])  # fmt: skip
 def test_wheels_of_the_metadata_that_cannot_be_right_are_named(
     drive: Drive, given: str | None, line: str, tmp_path
 ):
@@ -273,10 +270,9 @@ def test_what_cannot_be_written_ends_the_recording_with_one_line(drive: Drive, t
     assert len(Replay(tmp_path / "walk")) >= 5
 
 
-@pytest.mark.parametrize(
-    ("height", "pitch", "line"),
-    [(0.3, 0.6, "34 deg down by tf"), (0.3, -0.2, "11 deg up by tf"), (0.0, 0.0, ""), (-0.3, 0.0, "")],
-)
+@pytest.mark.parametrize(("height", "pitch", "line"), [
+    (0.3, 0.6, "34 deg down by tf"), (0.3, -0.2, "11 deg up by tf"), (0.0, 0.0, ""), (-0.3, 0.0, ""),
+])  # fmt: skip
 def test_a_mount_that_cannot_be_right_or_is_not_level_is_named(
     drive: Drive, height: float, pitch: float, line: str, tmp_path, monkeypatch
 ):

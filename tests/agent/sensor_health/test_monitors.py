@@ -62,11 +62,9 @@ def test_a_black_and_a_white_image_are_faults(grey, words):
     assert words in seen[first] and 1 < first * TICK * 10 <= 10 and not seen[-1]
 
 
-@pytest.mark.parametrize(
-    "image",
-    [noisy(235.0), noisy(128.0), noisy(40.0), np.full((240, 320), 128, np.uint8), noisy(12.0, 6.0)],
-    ids=["white wall", "grey wall", "dark wall", "drawn wall", "dim room"],
-)
+@pytest.mark.parametrize("image", [
+    noisy(235.0), noisy(128.0), noisy(40.0), np.full((240, 320), 128, np.uint8), noisy(12.0, 6.0),
+], ids=["white wall", "grey wall", "dark wall", "drawn wall", "dim room"])  # fmt: skip
 def test_a_wall_and_a_dim_room_are_no_dead_camera(image):
     assert not any(faults([image.copy() if k % 2 else image + (k % 3) for k in range(40)], DRIVES))
     assert image.min() < image.max() or not any(faults([image] * 40, DRIVES))
@@ -92,15 +90,12 @@ def stamped(steps: list[float]) -> list[str]:
     return out
 
 
-@pytest.mark.parametrize(
-    ("bad", "within", "words"),
-    [
-        ([0.0] * 10, 7, "stands still"),
-        ([-3600.0], 1, "jumped back by 3600.0 s"),
-        ([3600.0], 1, "jumped ahead by 3600.0 s"),
-        ([-0.1] * 3, 1, "jumped back"),
-    ],
-)
+@pytest.mark.parametrize(("bad", "within", "words"), [
+    ([0.0] * 10, 7, "stands still"),
+    ([-3600.0], 1, "jumped back by 3600.0 s"),
+    ([3600.0], 1, "jumped ahead by 3600.0 s"),
+    ([-0.1] * 3, 1, "jumped back"),
+])  # fmt: skip
 def test_a_clock_that_fails_is_named_and_believed_again_after_a_second(bad, within, words):
     before, after = [TICK] * 5, [TICK] * 12
     said = stamped([*before, *bad, *after])
@@ -119,18 +114,14 @@ AHEAD = np.array([1.0, *[3.0] * 7])
 ASIDE = np.array([3.0, 3.0, 0.5, 3.0, 3.0, 3.0, 0.5, 3.0])
 
 
-@pytest.mark.parametrize(
-    ("readings", "odometry", "frozen"),
-    [
-        (AHEAD, DRIVES, True),
-        (AHEAD, Odometry(-0.02, 0.0), False),
-        (ASIDE, DRIVES, False),
-        (ASIDE, Odometry(0.0, 0.05), True),
-        (np.full(8, 3.0), Odometry(0.02, 0.05), False),
-        (AHEAD, STANDS, False),
-    ],
-    ids=["toward", "away from", "along a corridor", "turning", "open floor", "standing"],
-)
+@pytest.mark.parametrize(("readings", "odometry", "frozen"), [
+    (AHEAD, DRIVES, True),
+    (AHEAD, Odometry(-0.02, 0.0), False),
+    (ASIDE, DRIVES, False),
+    (ASIDE, Odometry(0.0, 0.05), True),
+    (np.full(8, 3.0), Odometry(0.02, 0.05), False),
+    (AHEAD, STANDS, False),
+], ids=["toward", "away from", "along a corridor", "turning", "open floor", "standing"])  # fmt: skip
 def test_readings_that_stay_though_they_cannot_are_frozen(readings, odometry, frozen):
     monitor = RangerMonitor(RobotDescription(BODY.camera, ranger_bearings=BEARINGS, ranger_reach=3.0))
     for _ in range(20):
@@ -174,17 +165,13 @@ def first_fault(images, wheels, commands=COMMANDS) -> tuple[float, str]:
     return math.inf, ""
 
 
-@pytest.mark.parametrize(
-    ("wheels", "words"),
-    [
-        (lambda ways, tick: 0.0 * ways, "the encoders do not count while the image moves"),
-        (lambda ways, tick: ways * [0.0, 1.0], "the left encoder does not count"),
-        (lambda ways, tick: ways * [1.0, 0.0], "the right encoder does not count"),
-        (lambda ways, tick: ways + np.array([0.0, 0.03]), "one of them runs away"),
-        (lambda ways, tick: ways + np.array([0.5 * (tick == 5), 0.0]), "the encoders jump by 0.52 m"),
-    ],
-    ids=["dead", "left dead", "right dead", "right runs away", "jump"],
-)
+@pytest.mark.parametrize(("wheels", "words"), [
+    (lambda ways, tick: 0.0 * ways, "the encoders do not count while the image moves"),
+    (lambda ways, tick: ways * [0.0, 1.0], "the left encoder does not count"),
+    (lambda ways, tick: ways * [1.0, 0.0], "the right encoder does not count"),
+    (lambda ways, tick: ways + np.array([0.0, 0.03]), "one of them runs away"),
+    (lambda ways, tick: ways + np.array([0.5 * (tick == 5), 0.0]), "the encoders jump by 0.52 m"),
+], ids=["dead", "left dead", "right dead", "right runs away", "jump"])  # fmt: skip
 def test_encoders_that_fail_are_named_within_a_second_and_a_half(drive, wheels, words):
     when, said = first_fault(drive, wheels)
     assert words in said and when <= 1.5

@@ -57,13 +57,10 @@ def complaint(seen: list[Observation]) -> str:
 
 
 @pytest.mark.parametrize("every", [1, 4])
-@pytest.mark.parametrize(
-    ("times", "words"),
-    [
-        (1.0, ()), (0.8, ()), (1.25, ()), (0.0, ()), (5.0, ()), (-1.0, (REVERSED,)),
-        (math.degrees(1.0), (DEGREES,)), (-math.degrees(1.0), (DEGREES, REVERSED)),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("times", "words"), [
+    (1.0, ()), (0.8, ()), (1.25, ()), (0.0, ()), (5.0, ()), (-1.0, (REVERSED,)),
+    (math.degrees(1.0), (DEGREES,)), (-math.degrees(1.0), (DEGREES, REVERSED)),
+])  # fmt: skip
 def test_a_wrong_unit_or_sign_is_named_and_a_wrong_scale_is_not(
     walls: PhotoWalls, every: int, times: float, words: tuple[str, ...]
 ):
@@ -73,15 +70,11 @@ def test_a_wrong_unit_or_sign_is_named_and_a_wrong_scale_is_not(
         assert (word in line) is (word in words), line
 
 
-@pytest.mark.parametrize(
-    ("turned", "words"),
-    [
-        (lambda image: image[:, ::-1], "mirrored"),
-        (lambda image: image[::-1, ::-1], "upside down"),
-        (lambda image: image, ""),
-    ],
-    ids=["mirrored", "upside down", "right"],
-)
+@pytest.mark.parametrize(("turned", "words"), [
+    (lambda image: image[:, ::-1], "mirrored"),
+    (lambda image: image[::-1, ::-1], "upside down"),
+    (lambda image: image, ""),
+], ids=["mirrored", "upside down", "right"])  # fmt: skip
 def test_an_image_that_is_mirrored_or_upside_down_turns_the_other_way(walls, turned, words: str):
     seen = [replace(one, image=np.ascontiguousarray(turned(one.image))) for one in drive(walls, 1.0)]
     line = complaint(seen)
@@ -163,19 +156,15 @@ def spoilt(seen: list[Observation], how: str) -> list[Observation]:
     return [replace(a, odometry=b, image=c) for a, b, c in zip(seen, odometry, images, strict=True)]
 
 
-@pytest.mark.parametrize(
-    ("how", "words"),
-    [
-        ("right", ()), ("dark", ()),
-        ("late", ("the odometry turns 1.0 s after the images",)),
-        ("early", ("the images turn 1.0 s after the odometry",)),
-        ("exchanged", ("columns of ways and turns are exchanged",)),
-        ("rates", ("turns 10 times as far", "in rad/s and must be in radians since the", "speeds?")),
-        ("centimetres", ("times as low as the floor", "in centimetres")),
-        ("to the left", ("turned by 90 degrees",)), ("to the right", ("turned by 90 degrees",)),
-        ("another drive", ("show nothing in common", "in the wrong order")),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("how", "words"), [
+    ("right", ()), ("dark", ()), ("late", ("the odometry turns 1.0 s after the images",)),
+    ("early", ("the images turn 1.0 s after the odometry",)),
+    ("exchanged", ("columns of ways and turns are exchanged",)),
+    ("rates", ("turns 10 times as far", "in rad/s and must be in radians since the", "speeds?")),
+    ("centimetres", ("times as low as the floor", "in centimetres")),
+    ("to the left", ("turned by 90 degrees",)), ("to the right", ("turned by 90 degrees",)),
+    ("another drive", ("show nothing in common", "in the wrong order")),
+])  # fmt: skip
 def test_the_likeliest_cause_is_named_and_no_other(walls: PhotoWalls, how: str, words: tuple[str, ...]):
     line = complaint(spoilt(drive(walls, 1.0, count=150), how))
     assert all(word in line for word in words), line

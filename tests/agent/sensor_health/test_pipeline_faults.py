@@ -54,16 +54,12 @@ def run(
     return pose, steps
 
 
-@pytest.mark.parametrize(
-    ("mission", "broken", "sensor"),
-    [
-        (Explore(), Frozen(), "camera"),
-        (GoTo(NodeId("r1", 1, 1)), Frozen(), "camera"),
-        (Explore(), lambda seen: replace(seen, odometry=Odometry(0.0, 0.0)), "encoders"),
-        (Explore(), lambda seen: replace(seen, stamp_ns=seen.stamp_ns - HOUR_NS), "clock"),
-    ],
-    ids=["frozen exploring", "frozen navigating", "dead encoders", "clock jumps back"],
-)
+@pytest.mark.parametrize(("mission", "broken", "sensor"), [
+    (Explore(), Frozen(), "camera"),
+    (GoTo(NodeId("r1", 1, 1)), Frozen(), "camera"),
+    (Explore(), lambda seen: replace(seen, odometry=Odometry(0.0, 0.0)), "encoders"),
+    (Explore(), lambda seen: replace(seen, stamp_ns=seen.stamp_ns - HOUR_NS), "clock"),
+], ids=["frozen exploring", "frozen navigating", "dead encoders", "clock jumps back"])  # fmt: skip
 def test_it_stands_says_which_and_goes_on(walls, mission, broken, sensor):
     pipeline = on(mission)
     pose, moving = run(walls, pipeline, Pose2(), 0, 12, lambda seen: seen)

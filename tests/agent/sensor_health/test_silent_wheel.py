@@ -49,10 +49,9 @@ def test_the_encoder_that_is_dead_is_named(steps: list[tuple[float, float]], sid
     )
 
 
-@pytest.mark.parametrize(
-    "steps",
-    [STRAIGHT, WEAVE, [(0.0, 0.02)] * 8 + [(0.0, -0.02)] * 16 + [(0.0, 0.02)] * 16, [(0.0, 0.0)] * 40],
-)
+@pytest.mark.parametrize("steps", [
+    STRAIGHT, WEAVE, [(0.0, 0.02)] * 8 + [(0.0, -0.02)] * 16 + [(0.0, 0.02)] * 16, [(0.0, 0.0)] * 40,
+])  # fmt: skip
 def test_encoders_that_count_are_believed_also_in_a_turn_about_a_wheel(steps: list[tuple[float, float]]):
     assert not complaint(ticks(steps))
 

@@ -154,14 +154,11 @@ def test_a_robot_cannot_be_alive_or_answer_as_another(fleet: Fleet):
 IN_ANOTHERS_NAME = {f"{what}/{name}" for what in OF_ROBOTS for name in ("r1", "*")}
 
 
-@pytest.mark.parametrize(
-    ("name", "may"),
-    [
-        ("r0", frozenset({"status", *(f"{what}/r0" for what in OF_ROBOTS)})),
-        ("bob", frozenset(ASKS) - COMMANDS),
-        ("anna", frozenset(ASKS)),
-    ],
-)
+@pytest.mark.parametrize(("name", "may"), [
+    ("r0", frozenset({"status", *(f"{what}/r0" for what in OF_ROBOTS)})),
+    ("bob", frozenset(ASKS) - COMMANDS),
+    ("anna", frozenset(ASKS)),
+])  # fmt: skip
 def test_each_role_asks_what_it_may(certified: Fleet, name: str, may: frozenset[str]):
     asks = {*ASKS, *IN_ANOTHERS_NAME, *(f"{what}/r0" for what in OF_ROBOTS)}
     root = f"{KEYS.root}/server/s0"
@@ -387,19 +384,10 @@ def test_who_was_alive_is_so_after_the_keys_have_changed_unless_revoked(fleet: F
     eventually(lambda: alive == {"r0"})
 
 
-@pytest.mark.parametrize(
-    "endpoint",
-    [
-        "tcp/0.0.0.0:7447",
-        "tcp/192.168.1.7:7447",
-        "tcp/[::]:7447",
-        "tcp/maps.local:1",
-        "tcp/[fe80::1%lo]:1",
-        "tcp/[::ffff:127.0.0.1]:1",
-        "tcp/127.0.0.1:1,tcp/0.0.0.0:1",
-        "tcp/0.0.0.0:1?a=127.0.0.1:1",
-    ],
-)
+@pytest.mark.parametrize("endpoint", [
+    "tcp/0.0.0.0:7447", "tcp/192.168.1.7:7447", "tcp/[::]:7447", "tcp/maps.local:1", "tcp/[fe80::1%lo]:1",
+    "tcp/[::ffff:127.0.0.1]:1", "tcp/127.0.0.1:1,tcp/0.0.0.0:1", "tcp/0.0.0.0:1?a=127.0.0.1:1",
+])  # fmt: skip
 def test_without_keys_a_router_listens_on_its_own_machine_alone(endpoint: str):
     with pytest.raises(SettingsError, match="mapweave keys init"):
         BusSettings(mode="router", listen=(endpoint,))

@@ -247,17 +247,14 @@ def test_a_damaged_date_is_one_line_and_lets_no_client_in(expires: str, folder: 
         KeyFolder(folder.path / "elsewhere")
 
 
-@pytest.mark.parametrize(
-    ("field", "value"),
-    [
-        ("name", "../r1"),
-        ("name", "*"),
-        ("name", "r/1"),
-        ("fleet", "**"),
-        ("listen", []),
-        ("listen", ["here"]),
-    ],
-)
+@pytest.mark.parametrize(("field", "value"), [
+    ("name", "../r1"),
+    ("name", "*"),
+    ("name", "r/1"),
+    ("fleet", "**"),
+    ("listen", []),
+    ("listen", ["here"]),
+])  # fmt: skip
 def test_a_name_that_leaves_its_folder_or_key_is_one_line(
     field: str, value: object, folder: KeyFolder, capfd
 ):

@@ -107,13 +107,10 @@ def test_a_server_takes_its_new_key_when_that_can_be_read(running: Running):
     eventually(lambda: answered(r0, "r0"))
 
 
-@pytest.mark.parametrize(
-    ("now", "words"),
-    [
-        (timedelta(days=-3), "the certificate of s0 expired on "),
-        (timedelta(days=1), "the certificate of s0 holds from "),
-    ],
-)
+@pytest.mark.parametrize(("now", "words"), [
+    (timedelta(days=-3), "the certificate of s0 expired on "),
+    (timedelta(days=1), "the certificate of s0 holds from "),
+])  # fmt: skip
 def test_a_server_whose_own_certificate_does_not_hold_says_so_once(
     running: Running, monkeypatch, now: timedelta, words: str
 ):

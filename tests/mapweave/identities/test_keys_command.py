@@ -133,13 +133,10 @@ def test_a_robot_that_is_not_let_in_hears_that_its_key_may_be_no_longer_good(key
 
 
 @pytest.mark.parametrize("role", ["viewer", "robot"])
-@pytest.mark.parametrize(
-    "words",
-    [
-        "map link r0.1.1 r1.1.1", "map unmerge r0.1 r1.1", "map retire r0.1", "map retire r0.1 --undo",
-        "map retire r0.1 --check", "map undo 1", "place add kitchen r0.1.1", "drive r0 --gamepad /dev/null",
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize("words", [
+    "map link r0.1.1 r1.1.1", "map unmerge r0.1 r1.1", "map retire r0.1", "map retire r0.1 --undo",
+    "map retire r0.1 --check", "map undo 1", "place add kitchen r0.1.1", "drive r0 --gamepad /dev/null",
+])  # fmt: skip
 def test_a_command_with_a_viewers_key_is_said_to_need_anothers(keys: Path, words: str, role: str, capfd):
     """The router drops it without a word: it was said that no map server answers."""
     assert main(["keys", "add", "vic", "--role", role, "--keys", str(keys)]) == 0
@@ -383,13 +380,10 @@ def test_a_server_that_comes_later_may_be_on_another_machine(keys: Path, capfd):
     assert KeyFolder(keys).catalogue.endpoints == endpoints, "said again, it is there once"
 
 
-@pytest.mark.parametrize(
-    ("words", "said"),
-    [
-        (["s1", "--role", "server", "--at", "maps2:7447"], "without a port"),
-        (["r1", "--at", "maps2"], "is for a server"),
-    ],
-)
+@pytest.mark.parametrize(("words", "said"), [
+    (["s1", "--role", "server", "--at", "maps2:7447"], "without a port"),
+    (["r1", "--at", "maps2"], "is for a server"),
+])  # fmt: skip
 def test_where_a_server_is_reached_is_said_of_servers_alone(keys: Path, capfd, words: list[str], said: str):
     before = contents(keys)
     capfd.readouterr()

@@ -61,27 +61,24 @@ def test_bounds_are_included(name, value, low, high):
     assert edge.good
 
 
-@pytest.mark.parametrize(
-    ("toml", "words"),
-    [
-        ("merged_ate = 0.1", "did you mean 'merged_ate_m'?"),
-        ("zzz = 1", "known are components"),
-        ("robots = 1", "no figure 'robots'"),
-        ("components = 1.0", "1.0 is no whole number"),
-        ("components = true", "True is no whole number"),
-        ("found = 1", "1 is no true or false"),
-        ("map_hash = 3", "3 is no text"),
-        ("merged_ate_m = 'small'", "'small' is no number"),
-        ("merged_ate_m = true", "True is no number"),
-        ("merged_ate_m = nan", "finite"),
-        ("merged_ate_m = [0.1]", "no number"),
-        ("nodes = {most = 3}", "no bound 'most'"),
-        ("nodes = {}", "give min, max or both"),
-        ("nodes = {min = 3, max = 2}", "min 3 is above max 2"),
-        ("nodes = {min = inf}", "nodes: min: must be a finite number"),
-        ("found = {min = 1}", "is a true or false, it has no min and max"),
-    ],
-)
+@pytest.mark.parametrize(("toml", "words"), [
+    ("merged_ate = 0.1", "did you mean 'merged_ate_m'?"),
+    ("zzz = 1", "known are components"),
+    ("robots = 1", "no figure 'robots'"),
+    ("components = 1.0", "1.0 is no whole number"),
+    ("components = true", "True is no whole number"),
+    ("found = 1", "1 is no true or false"),
+    ("map_hash = 3", "3 is no text"),
+    ("merged_ate_m = 'small'", "'small' is no number"),
+    ("merged_ate_m = true", "True is no number"),
+    ("merged_ate_m = nan", "finite"),
+    ("merged_ate_m = [0.1]", "no number"),
+    ("nodes = {most = 3}", "no bound 'most'"),
+    ("nodes = {}", "give min, max or both"),
+    ("nodes = {min = 3, max = 2}", "min 3 is above max 2"),
+    ("nodes = {min = inf}", "nodes: min: must be a finite number"),
+    ("found = {min = 1}", "is a true or false, it has no min and max"),
+])  # fmt: skip
 def test_contradicting_options_are_refused_in_one_line(toml, words):
     with pytest.raises(SettingsError) as refusal:
         parse_expectations(tomllib.loads(toml), "a.toml: expect")

@@ -60,17 +60,14 @@ def test_non_finite_numbers_are_none_in_json(value):
     assert measured(value) == (value if math.isfinite(value) else None)
 
 
-@pytest.mark.parametrize(
-    ("value", "text"),
-    [
-        (None, "-"),
-        (True, "yes"),
-        (False, "no"),
-        (3, "3"),
-        (0.0123456, "0.01235"),
-        (12345.6, "12346"),
-        ("x", "x"),
-    ],
-)
+@pytest.mark.parametrize(("value", "text"), [
+    (None, "-"),
+    (True, "yes"),
+    (False, "no"),
+    (3, "3"),
+    (0.0123456, "0.01235"),
+    (12345.6, "12346"),
+    ("x", "x"),
+])  # fmt: skip
 def test_figures_for_people(value, text):
     assert as_text(value) == text

@@ -113,17 +113,14 @@ def test_a_goal_in_the_corridor_is_the_last_resort():
     assert PLAN.room_at(goal.x, goal.y) == "corridor"
 
 
-@pytest.mark.parametrize(
-    "case",
-    [
-        {"where": {"r0": [(2, 3)], "r1": [(2, 4)], "r2": [(2, 5)]}},
-        {"where": {"r0": [(2, 1)], "r1": [(6, 1)], "r2": [(10, 1)]}},
-        {"landmarks": LEAST_LANDMARKS - 1},
-        {"components": {NodeId(f"r{k}", 1, n): k for k in range(3) for n in (1, 2, 3)}},
-        {"where": {"r0": [(2, 3)]}, "robots": ("r0",)},
-    ],
-    ids=["all in one room", "only in the corridor", "poor views", "maps that did not join", "alone"],
-)
+@pytest.mark.parametrize("case", [
+    {"where": {"r0": [(2, 3)], "r1": [(2, 4)], "r2": [(2, 5)]}},
+    {"where": {"r0": [(2, 1)], "r1": [(6, 1)], "r2": [(10, 1)]}},
+    {"landmarks": LEAST_LANDMARKS - 1},
+    {"components": {NodeId(f"r{k}", 1, n): k for k in range(3) for n in (1, 2, 3)}},
+    {"where": {"r0": [(2, 3)]}, "robots": ("r0",)},
+],
+ids=["all in one room", "only in the corridor", "poor views", "maps that did not join", "alone"])  # fmt: skip
 def test_impossible_kidnappings_are_reported(case):
     with pytest.raises(NothingToShow, match="no room is known to one robot alone"):
         plot(**case)

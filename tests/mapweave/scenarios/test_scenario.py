@@ -83,27 +83,24 @@ def test_robots_of_different_kinds(tmp_path):
     assert scenario.missions["r1"] == "idle"
 
 
-@pytest.mark.parametrize(
-    ("change", "said"),
-    [
-        (("robots = 2", "robots = 0"), "robots must be a whole number, 1 to 16; it is 0"),
-        (("robots = 2", "robot = 2"), "robot: expected list, got int; it is 2"),
-        (("robots = 2", "robots = 1"), "no robot 'r1'; there are r0"),
-        (('kind = "office"', 'kind = "ofice"'), None),
-        (('do = "cut"', 'do = "cutt"'), "do = 'cutt'; known are"),
-        (('do = "cut"', ""), "do is missing"),
-        (('robot = "r1"', 'robott = "r1"'), "did you mean 'robot'"),
-        (('robot = "r1"', ""), "robot is missing"),
-        (("factor = 0.5", "factor = -1.0"), "factor"),
-        (("at = 5.0", "at = -5.0"), "at must be a number, 0 to 86400; it is -5.0"),
-        (("at = 5.0", 'at = "soon"'), "at: expected float, got str; it is 'soon'"),
-        (('after = "joined"', 'after = "merged"'), "known are joined"),
-        (("within = 60.0", ""), "needs within"),
-        (("components = 1", "component = 1"), "did you mean 'components'"),
-        (('name = "try"', 'title = "try"'), "no setting 'title'"),
-        (("[expect]", "[expect"), "try.toml"),
-    ],
-)
+@pytest.mark.parametrize(("change", "said"), [
+    (("robots = 2", "robots = 0"), "robots must be a whole number, 1 to 16; it is 0"),
+    (("robots = 2", "robot = 2"), "robot: expected list, got int; it is 2"),
+    (("robots = 2", "robots = 1"), "no robot 'r1'; there are r0"),
+    (('kind = "office"', 'kind = "ofice"'), None),
+    (('do = "cut"', 'do = "cutt"'), "do = 'cutt'; known are"),
+    (('do = "cut"', ""), "do is missing"),
+    (('robot = "r1"', 'robott = "r1"'), "did you mean 'robot'"),
+    (('robot = "r1"', ""), "robot is missing"),
+    (("factor = 0.5", "factor = -1.0"), "factor"),
+    (("at = 5.0", "at = -5.0"), "at must be a number, 0 to 86400; it is -5.0"),
+    (("at = 5.0", 'at = "soon"'), "at: expected float, got str; it is 'soon'"),
+    (('after = "joined"', 'after = "merged"'), "known are joined"),
+    (("within = 60.0", ""), "needs within"),
+    (("components = 1", "component = 1"), "did you mean 'components'"),
+    (('name = "try"', 'title = "try"'), "no setting 'title'"),
+    (("[expect]", "[expect"), "try.toml"),
+])  # fmt: skip
 def test_errors_are_reported_in_one_line(tmp_path, change, said):
     text = GOOD.replace(*change)
     assert text != GOOD

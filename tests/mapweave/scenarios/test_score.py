@@ -198,10 +198,9 @@ def test_a_lost_robot_that_was_found_and_arrived(eventful):
     assert figures.goal_s == pytest.approx(16.0)
 
 
-@pytest.mark.parametrize(
-    ("dx", "turn_deg", "good"),
-    [(0.24, 0, True), (0.26, 0, False), (0, 4.9, True), (0, -5.1, False), (0, 180, False)],
-)
+@pytest.mark.parametrize(("dx", "turn_deg", "good"), [
+    (0.24, 0, True), (0.26, 0, False), (0, 4.9, True), (0, -5.1, False), (0, 180, False),
+])  # fmt: skip
 def test_found_means_a_quarter_of_a_metre_and_five_degrees(eventful, dx, turn_deg, good):
     (lost,) = eventful.lost
     known = lost.fix.node

@@ -11,14 +11,11 @@ from mapweave.teleoperation.gamepad import Gamepad
 from mapweave.teleoperation.keyboard import Keyboard
 
 
-@pytest.mark.parametrize(
-    ("keys", "wanted"),
-    [
-        (b"w", (0.5, 0.0)), (b"\x1b[A", (0.5, 0.0)), (b"\x1bOB", (-0.5, 0.0)), (b"S", (-0.5, 0.0)),
-        (b"\x1b[D", (0.0, 0.5)), (b"d", (0.0, -0.5)), (b"wa", (0.5, 0.5)), (b"w ", (0.0, 0.0)),
-        (b"w++", (0.7, 0.0)), (b"w" + b"-" * 9, (0.1, 0.0)), (b"x\x1bw", (0.5, 0.0)),
-    ],
-)  # fmt: skip
+@pytest.mark.parametrize(("keys", "wanted"), [
+    (b"w", (0.5, 0.0)), (b"\x1b[A", (0.5, 0.0)), (b"\x1bOB", (-0.5, 0.0)), (b"S", (-0.5, 0.0)),
+    (b"\x1b[D", (0.0, 0.5)), (b"d", (0.0, -0.5)), (b"wa", (0.5, 0.5)), (b"w ", (0.0, 0.0)),
+    (b"w++", (0.7, 0.0)), (b"w" + b"-" * 9, (0.1, 0.0)), (b"x\x1bw", (0.5, 0.0)),
+])  # fmt: skip
 def test_keys_drive(keys: bytes, wanted: tuple[float, float]):
     keyboard = Keyboard(0.5)
     keyboard.feed(keys, 10.0)
