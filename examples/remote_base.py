@@ -10,21 +10,21 @@ import zenoh
 ROOT, ROUTER = "mapweave/1/demo/robot/r0", sys.argv[1] if sys.argv[1:] else "tcp/127.0.0.1:7447"
 CAMERA = struct.pack("<HH6d", 320, 240, 277.0, 277.0, 160.0, 120.0, 0.3, 0.0)
 BASE = {"v": 1, "camera": CAMERA, "radius": 0.16, "axle": 0.24, "max_forward": 0.3, "max_turn": 0.8}
-last = {"q": 0, "answer": b""}
+last, SEEN = {"q": 0}, {"v": 1, "r": [], "b": False, "s": [240, 320], "encoding": "raw", "i": bytes(76_800)}
 
 
 def step(query: zenoh.Query) -> None:
-    asked = msgpack.unpackb(query.payload.to_bytes())
-    if asked["q"] != last["q"]:  # a repeated number requests the same answer again
+    if (asked := msgpack.unpackb(query.payload.to_bytes()))["q"] != last["q"]:  # else the same answer again
         time.sleep(0.1)  # it drives by asked["c"], m/s and rad/s; stop if no step arrives for 0.5 s
-        seen = {"v": 1, "t": time.time_ns(), "u": [0.1 * speed for speed in asked["c"]], "r": [], "b": False}
-        seen |= {"s": [240, 320], "encoding": "raw", "i": bytes(240 * 320)}  # height, width; grey
-        last.update(q=asked["q"], answer=msgpack.packb(seen))
-    query.reply(f"{ROOT}/step", last["answer"])
+        last.update(q=asked["q"], new={"t": time.time_ns(), "u": [0.1 * speed for speed in asked["c"]]})
+    query.reply(f"{ROOT}/step", msgpack.packb(SEEN | last["new"]))
 
 
-CONFIG = zenoh.Config.from_json5(f'{{mode: "client", connect: {{endpoints: ["{ROUTER}"]}}}}')
-with zenoh.open(CONFIG) as session:
+try:
+    session = zenoh.open(zenoh.Config.from_json5(f'{{mode: "client", connect: {{endpoints: ["{ROUTER}"]}}}}'))
+except zenoh.ZError:
+    sys.exit(f"no router at {ROUTER}: start `mapweave server`, or give the router's address")
+with session:
     session.declare_queryable(f"{ROOT}/describe", lambda q: q.reply(f"{ROOT}/describe", msgpack.packb(BASE)))
     session.declare_queryable(f"{ROOT}/step", step)
     time.sleep(1e9)

@@ -1,7 +1,5 @@
 """The examples are short; the own driver passes the contract, the remote base answers an agent."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time
@@ -50,11 +48,11 @@ class TestOwnRobot(RobotContract):
     COUNT = 0.2e-3 + 0.002
 
 
-def test_they_are_short() -> None:
+def test_they_are_short():
     assert len((EXAMPLES / "own_robot.py").read_text().splitlines()) <= 30
 
 
-def test_the_remote_base_answers_an_agent() -> None:
+def test_the_remote_base_answers_an_agent():
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     router = ZenohBus(BusSettings(mode="router", listen=(endpoint,)))
     body = subprocess.Popen([sys.executable, EXAMPLES / "remote_base.py", endpoint])
@@ -75,3 +73,14 @@ def test_the_remote_base_answers_an_agent() -> None:
         body.kill()
         body.wait()
         router.close()
+
+
+def test_the_remote_base_without_a_router_ends_in_one_line() -> None:
+    """Zenoh's traceback named a file of its author's computer."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    ran = subprocess.run(
+        [sys.executable, EXAMPLES / "remote_base.py", endpoint],
+        capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert ran.stderr == f"no router at {endpoint}: start `mapweave server`, or give the router's address\n"
+    assert ran.returncode == 1
