@@ -4,14 +4,16 @@
 
 It prints `ready` when every agent has handed over its first node, then reads one line with the time of the
 start, prints one JSON object when all is acknowledged, and stays connected until stdin ends: other processes
-may still wait. Times are those of the system's monotonic clock, s.
+may still wait. Times are those of the system's monotonic clock, s. It ends with the process that started it.
 """
 
 from __future__ import annotations
 
+import ctypes
 import heapq
 import json
 import os
+import signal
 import sys
 import threading
 import time
@@ -45,6 +47,8 @@ CONNECTING = 30.0
 """Longest wait for a session, s."""
 PATIENCE = 60.0
 """Longest wait for acknowledgements behind the last change, s."""
+PR_SET_PDEATHSIG = 1
+"""Of prctl(2)."""
 
 
 @dataclass(frozen=True)
@@ -263,6 +267,13 @@ def main() -> None:
     os._exit(0)
 
 
+def end_with_parent() -> None:
+    """Let Linux kill this process when its parent is gone, also while it is frozen and reads no stdin."""
+    ctypes.CDLL(None).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+    if os.getppid() == 1:  # it was gone before
+        os._exit(1)
+
+
 def wait_until_acknowledged(agents: Sequence[AgentLink]) -> None:
     """Until all is acknowledged, or patience ends."""
     end = time.monotonic() + PATIENCE
@@ -271,4 +282,5 @@ def wait_until_acknowledged(agents: Sequence[AgentLink]) -> None:
 
 
 if __name__ == "__main__":
+    end_with_parent()
     main()

@@ -166,6 +166,7 @@ def measure_fleet(
             stack.callback(disturbers[kind].close)
         began = time.monotonic()
         connecting = threading.Timer(CONNECTING, end_all, ([*generators, *disturbers.values()],))
+        stack.callback(connecting.cancel)
         connecting.start()
         for generator in (*generators, *disturbers.values()):
             generator.line()
@@ -181,7 +182,7 @@ def measure_fleet(
             Freeze(disturbers["frozen"], begin, end).start()
         progress.update(step, description=f"{agents} agents map", total=options.seconds + 1.0)
         asked: list[tuple[list[float], int]] = []
-        asking = threading.Thread(target=lambda: asked.append(ask(bus, views, begin, end + 1.0)))
+        asking = threading.Thread(target=lambda: asked.append(ask(bus, views, begin, end + 1.0)), daemon=True)
         asking.start()
         server, pids = children.pid("server"), [generator.pid for generator in generators]
         time.sleep(max(0.0, begin - time.monotonic()))

@@ -1,11 +1,16 @@
 """The benchmark of fleets: what it says of agents that disturb, and its report by made-up figures."""
 
 import json
+import os
+import signal
+import socket
 import subprocess
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import asdict, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -26,6 +31,7 @@ from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
 from mapweave.wire.bus import Reply
 from mapweave.wire.messages import encode
+from tests.waiting import eventually
 
 FIGURES: Figures = {
     "ack_p99_ms": 200.0, "burst_p99_ms": None, "burst_s": None, "unacked": 0, "relocalize_p95_ms": 100.0,
@@ -109,6 +115,43 @@ def test_agents_stay_connected_until_the_others_are_acknowledged(monkeypatch, ca
     with pytest.raises(SystemExit):
         agents_process.main()
     assert [json.loads(out.splitlines()[-1])["burst"] for out in printed] == [[]]
+
+
+def test_a_frozen_agent_ends_with_a_benchmark_that_is_killed(tmp_path):
+    """It stayed for ever, and those that are not frozen drove on."""
+    with socket.create_server(("127.0.0.1", 0)) as router:
+        router.settimeout(60.0)
+        orders = Orders(f"tcp/127.0.0.1:{router.getsockname()[1]}", str(tmp_path), 0, 1, 1, 10.0, 0, 1)
+        program = (
+            "import time\n"
+            "from benchmarks.fleet.agents_process import Orders\n"
+            "from benchmarks.fleet.benchmark import Generator\n"
+            f"print(Generator({orders!r}).pid, flush=True)\n"
+            "time.sleep(60)\n"
+        )
+        parent = subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE, text=True)
+        try:
+            assert parent.stdout is not None
+            child = Path("/proc", parent.stdout.readline().strip())
+            connection, _ = router.accept()  # and it waits for an answer
+            os.kill(int(child.name), signal.SIGSTOP)
+        finally:
+            parent.kill()
+            parent.communicate()
+        with connection:
+            try:
+                eventually(lambda: not running(child), 5.0)
+            finally:
+                with suppress(ProcessLookupError):
+                    os.kill(int(child.name), signal.SIGKILL)
+
+
+def running(process: Path) -> bool:
+    """Whether a process of `/proc` has not ended."""
+    try:
+        return "\nState:\tZ" not in (process / "status").read_text()
+    except FileNotFoundError:
+        return False
 
 
 def test_a_slow_agent_is_asked_about_behind_each_of_its_nodes():
