@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from mapweave.agent.drivers.settings import RobotSettings
-from mapweave.agent.recordings.settings import RecordingSettings
+from mapweave.agent.recordings.options import RecordingSettings
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
 from mapweave.mapserver.admission_control import AdmissionSettings

@@ -7,8 +7,7 @@ import struct
 import time
 
 from mapweave.agent.drivers.base import BaseReading, WheelCounter, Wheels
-from mapweave.agent.drivers.guarded_base import GuardedBase
-from mapweave.agent.drivers.serial_port import SerialOptions, SerialPort
+from mapweave.agent.drivers.serial_port import GuardedBase, SerialOptions, SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.drivers.wheel_guard import WheelGuard
 from mapweave.agent.drivers.wheeled import WheeledRobot

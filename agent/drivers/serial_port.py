@@ -11,6 +11,7 @@ from typing import Any
 
 import serial
 
+from mapweave.agent.drivers.wheel_guard import WheelGuard
 from mapweave.hybridmap.errors import DeviceError
 
 TIMEOUT = 0.3
@@ -154,3 +155,22 @@ def _reason(error: Exception) -> str:
         return f"takes no bytes for {TIMEOUT:g} s"
     gone = number == 5 or "disconnected" in words or "Errno 5" in words
     return "the port is gone" if gone else " ".join(words.split())
+
+
+class GuardedBase:
+    """An open port and the guard that stops the wheels behind it: of bases without a hardware watchdog."""
+
+    def __init__(self, path: str) -> None:
+        """Create a base without opening its port."""
+        self._path = path
+        self._port: SerialPort | None = None
+        self._guard: WheelGuard | None = None
+
+    def close(self) -> None:
+        """Stop the wheels by the guard, and close the port."""
+        if self._guard is not None:
+            self._guard.close()
+            self._guard = None
+        if self._port is not None:
+            self._port.close()
+            self._port = None

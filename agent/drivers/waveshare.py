@@ -3,19 +3,51 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import http.client
 import json
+import socket
 import time
 import urllib.parse
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol
 
-from mapweave.agent.drivers.address_lock import AddressLock
 from mapweave.agent.drivers.base import BaseReading, Wheels
 from mapweave.agent.drivers.serial_port import SerialPort
 from mapweave.agent.drivers.settings import Geometry, RobotSettings
 from mapweave.agent.drivers.wheeled import WheeledRobot
 from mapweave.hybridmap.errors import DeviceError, SettingsError
+
+
+class AddressLock:
+    """Held until closed, or until the process ends.
+
+    The lock is a name in Linux's abstract namespace of sockets: it leaves no file behind, and holds for all
+    users of the machine. Programs on other machines do not see it.
+    """
+
+    def __init__(self, host: str, port: int) -> None:
+        """Take the lock.
+
+        Args:
+            host: IP address of the robot: one robot may have several names.
+            port: of its server.
+
+        Raises:
+            DeviceError: another driver holds it.
+        """
+        self._socket = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM)
+        try:
+            self._socket.bind(f"\0mapweave/robot/{host}/{port}")
+        except OSError as error:
+            self._socket.close()
+            reason = "is in use by another process" if error.errno == errno.EADDRINUSE else error.strerror
+            raise DeviceError(f"http://{host}:{port}: {reason}") from error
+
+    def close(self) -> None:
+        """Release the lock. May be called twice."""
+        self._socket.close()
+
 
 SPEEDS, FEEDBACK, STREAM, WATCHDOG, INTERVAL, ECHO = 1, 130, 131, 136, 142, 143
 """`T` of the commands."""

@@ -11,10 +11,17 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.drivers.author_errors import DriverMistake, driver_error, kind_of, mistake
+from mapweave.agent.drivers.author_errors import (
+    DriverMistake,
+    check_base,
+    check_reading,
+    check_wheels,
+    driver_error,
+    kind_of,
+    mistake,
+)
 from mapweave.agent.drivers.base import Base, BaseReading, Wheels
 from mapweave.agent.drivers.camera import Capture, FrameSource, StampedImage
-from mapweave.agent.drivers.checked_base import check_base, check_reading, check_wheels
 from mapweave.agent.drivers.clock import now_ns
 from mapweave.agent.drivers.robot import clip
 from mapweave.agent.drivers.settings import Geometry, RobotSettings

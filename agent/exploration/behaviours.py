@@ -4,17 +4,32 @@ from __future__ import annotations
 
 import math
 from collections.abc import Generator, Iterator
+from enum import StrEnum
 
 import numpy as np
 
 from mapweave.agent.clearance import clearance
-from mapweave.agent.exploration.phase import Phase
 from mapweave.agent.mapping.episode import Episode, EpisodeRequest, Move
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.servo.image_drive import ImageDrive
 from mapweave.agent.servo.leg_controller import clip
 from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.pose import Array, Pose2, wrap_angle
+
+
+class Phase(StrEnum):
+    """What the explorer is doing, in words for the status line."""
+
+    LOOKING = "waiting for a first image"
+    DRIVING = "driving back and forth to map the view"
+    TURNING = "turning to the next view"
+    SCANNING = "turning where the map shows everything already"
+    TRAVELLING = "travelling to the next place"
+    WAITING = "standing: a place could not be reached; trying it again later"
+    STUCK = "standing: the wheels do not move the robot"
+    DONE = "no new place in reach: exploration is complete"
+    NOT_DARED = "standing: the rest cannot be reached over floor that the camera has shown free"
+
 
 DRIVE = 0.6
 """How far it drives back and forth to map a view, m."""

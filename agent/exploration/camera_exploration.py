@@ -8,8 +8,8 @@ from dataclasses import replace
 from mapweave.agent.camera_occupancy import BEARINGS, CameraOccupancyGrid
 from mapweave.agent.camera_occupancy import REACH as READ
 from mapweave.agent.cautious_driving import CREEP, SLOW
+from mapweave.agent.exploration.behaviours import Phase
 from mapweave.agent.exploration.explorer import Explorer
-from mapweave.agent.exploration.phase import Phase
 from mapweave.agent.exploration.viewpoint_selection import REACH
 from mapweave.agent.mapping.episode import Episode, Move
 from mapweave.agent.observation import Command, RobotDescription

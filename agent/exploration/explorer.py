@@ -8,9 +8,8 @@ from collections.abc import Generator, Iterator
 import numpy as np
 
 from mapweave.agent.exploration.avoided_places import AvoidedPlaces
-from mapweave.agent.exploration.behaviours import ExplorationBehaviours
+from mapweave.agent.exploration.behaviours import ExplorationBehaviours, Phase
 from mapweave.agent.exploration.fleet_coverage import FleetCoverage
-from mapweave.agent.exploration.phase import Phase
 from mapweave.agent.exploration.viewpoint_selection import (
     REACH,
     SPACING,

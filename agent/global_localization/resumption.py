@@ -7,8 +7,7 @@ from collections import deque
 import numpy as np
 
 from mapweave.agent.global_localization.candidates import OwnMapSource, RecognizedNode
-from mapweave.agent.global_localization.global_localization import GlobalLocalization
-from mapweave.agent.global_localization.search_policy import TO_MAP, SearchPolicy
+from mapweave.agent.global_localization.global_localization import TO_MAP, GlobalLocalization, SearchPolicy
 from mapweave.agent.motion_primitives import Behaviour, MotionPrimitives
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.hybridmap.hybrid_map import HybridMap

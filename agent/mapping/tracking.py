@@ -15,19 +15,55 @@ from mapweave.agent.mapping.image_acceptance import ImageAcceptance
 from mapweave.agent.mapping.initial_depth import initial_inverse_depths
 from mapweave.agent.mapping.kidnap_detection import KidnapDetector, turned
 from mapweave.agent.mapping.odometry_consistency import OdometryConsistency
-from mapweave.agent.mapping.prediction_offset import PredictionOffset
 from mapweave.agent.mapping.track_history import TrackHistory
 from mapweave.agent.mapping.view import PendingKeyframe, RawImage, associate, even_choice
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.vision.occluded_tracks import OccludedTracks
-from mapweave.agent.vision.rejection_counter import RejectionCounter
 from mapweave.agent.vision.template import HALF_PX, Templates
-from mapweave.agent.vision.track_quality import TrackQuality
+from mapweave.agent.vision.track_quality import RejectionCounter, TrackQuality
 from mapweave.agent.vision.tracker import BORDER_PX, Tracker
 from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features
+
+
+class PredictionOffset:
+    """Tracks that are followed and do not correct the filter: too few, or all in one corner.
+
+    In between the wheels' error grows, and the filter's predictions of all tracks are off by a common motion.
+    The motion from one image to the next it still predicts.
+    """
+
+    def __init__(self) -> None:
+        """None: the filter is where the tracks are."""
+        self.forget()
+
+    def forget(self) -> None:
+        """The filter is where the tracks are."""
+        self._ids: NDArray[np.int64] = np.zeros(0, np.int64)
+        self._aside: Array = np.zeros((0, 2))
+
+    def note(self, ids: NDArray[np.int64], pixels: Array, expected: Array) -> None:
+        """Take note of where tracks are and were not expected.
+
+        Args:
+            ids: (N,) tracks, each once.
+            pixels: (N, 2) px, where they are.
+            expected: (N, 2) px, where the filter has them; NaN where it has them nowhere.
+        """
+        order = np.argsort(ids)
+        self._ids, self._aside = ids[order], np.nan_to_num((pixels - expected)[order])
+
+    def aside(self, ids: NDArray[np.int64]) -> Array:
+        """(N, 2) px, how far tracks are from where the filter expects them; zeros for those not noted."""
+        out = np.zeros((len(ids), 2))
+        if len(self._ids):
+            place = self._ids.searchsorted(ids)
+            matching = self._ids.take(place, mode="clip") == ids
+            out[matching] = self._aside[place[matching]]
+        return out
+
 
 # The values between the stages of a step. A stage takes the value that only the stage before makes.
 

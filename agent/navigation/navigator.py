@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator
 from dataclasses import replace
+from enum import StrEnum
 from functools import partial
 
 import numpy as np
@@ -23,7 +24,6 @@ from mapweave.agent.navigation.positioning import Positioning
 from mapweave.agent.navigation.right_of_way import Passage, RightOfWay
 from mapweave.agent.navigation.route_follower import NEAR, RouteFollower, RouteProgress
 from mapweave.agent.navigation.route_source import RouteSource
-from mapweave.agent.navigation.stage import NavigationStage
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import AgentSettings
@@ -36,6 +36,21 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import RouteAnswer, RouteLeg
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
+
+
+class NavigationStage(StrEnum):
+    """What navigation is doing, in words for people."""
+
+    LOST = "turning to localize"
+    ASKING = "asking for a route"
+    BLOCKED = "waiting at an obstacle"
+    WAITING = "waiting for a route"
+    YIELDING = "waiting for another robot"
+    ASIDE = "stepping aside for another robot"
+    PORTAL = "waiting at a portal"
+    ARRIVED = "parked at the goal"
+    GIVEN_UP = "gave up its goal"
+
 
 HIDDEN = ", twice by what is seen of nodes nearby; of its own landmarks not enough is recognised"
 UNDERWAY = (RouteProgress.DRIVING, RouteProgress.PARKING)

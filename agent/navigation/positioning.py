@@ -8,8 +8,13 @@ from collections.abc import Generator
 import numpy as np
 
 from mapweave.agent.global_localization.candidates import Candidate, FleetMapSource, OwnMapSource
-from mapweave.agent.global_localization.global_localization import LENIENT, STILL, GlobalLocalization
-from mapweave.agent.global_localization.search_policy import BEYOND_PORTAL, TO_NAVIGATE
+from mapweave.agent.global_localization.global_localization import (
+    BEYOND_PORTAL,
+    LENIENT,
+    STILL,
+    TO_NAVIGATE,
+    GlobalLocalization,
+)
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.localization.node_localizer import NodeLocalizer

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from enum import StrEnum
 
 import numpy as np
@@ -12,7 +13,6 @@ from mapweave.agent.localization.fix import Fix, joined, position_sigma
 from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.localization.node_localizer import NodeLocalizer
 from mapweave.agent.navigation.local_planner import LocalPlanner
-from mapweave.agent.navigation.progress_monitor import ProgressMonitor
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.servo.odometry_drive import OdometryDrive
 from mapweave.agent.servo.proximity import ranger_points
@@ -24,6 +24,28 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian, averaged, wrap_angle
 from mapweave.hybridmap.query import RouteLeg
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
+
+
+@dataclass
+class ProgressMonitor:
+    """The least distance to the target, and its age.
+
+    Attributes:
+        step: m, nearer by this counts.
+        best: m, the nearest so far.
+        stood: s since the distance last decreased.
+    """
+
+    step: float = 0.03
+    best: float = math.inf
+    stood: float = 0.0
+
+    def take(self, distance: float, tick: float) -> None:
+        """Another tick (s) at a distance (m)."""
+        self.stood += tick
+        if distance < self.best - self.step:
+            self.best, self.stood = distance, 0.0
+
 
 MOST_CANDIDATES = 8
 """Nodes tried in one image: a route may put any number of them into one place."""

@@ -8,8 +8,22 @@ from pathlib import Path
 from mapweave.agent.drive_geometry import check_mount
 from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.incomplete import CameraAndLens, CameraGiven
-from mapweave.agent.recordings.settings import RecordingSettings
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
+
+
+@dataclass(frozen=True)
+class RecordingSettings:
+    """Which topics of a bag are the robot's; other recordings have none. The command line overrides it.
+
+    Attributes:
+        image_topic: images; empty takes the topic with most.
+        odometry_topic: odometry; empty takes the most likely topic, by its type and name.
+        camera_info_topic: calibration of the camera; empty takes the topic beside the images.
+    """
+
+    image_topic: str = ""
+    odometry_topic: str = ""
+    camera_info_topic: str = ""
 
 
 @dataclass(frozen=True)

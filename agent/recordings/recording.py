@@ -11,8 +11,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from mapweave.agent.recordings.heading_check import contradiction
-from mapweave.agent.recordings.odometry_jumps import bridged
+from mapweave.agent.recordings.odometry_checks import bridged, contradiction
 from mapweave.agent.recordings.wheel_data import WheelModel
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.agent.arrays import among
-from mapweave.agent.vision.rejection_counter import RejectionCounter
+from mapweave.agent.vision.track_quality import RejectionCounter
 from mapweave.agent.vision.tracker import Tracker
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens

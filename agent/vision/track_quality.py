@@ -1,4 +1,4 @@
-"""What the tracks are worth just now, for people and for benchmarks."""
+"""What the tracks are worth just now, for people and for benchmarks; which are given up."""
 
 from __future__ import annotations
 
@@ -10,6 +10,31 @@ from numpy.typing import NDArray
 from mapweave.agent.arrays import median
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array
+
+
+class RejectionCounter:
+    """Counts how often in a row a filter refused each track: it is on something that moves, or has slid."""
+
+    def __init__(self, most: int) -> None:
+        """Set how many refusals in a row a track may have before it is given up."""
+        self._most = most
+        self._counts: dict[int, int] = {}
+
+    def judge(self, ids: NDArray[np.int64], accepted: NDArray[np.bool_]) -> NDArray[np.int64]:
+        """Count (N,) tracks accepted or refused; returns those to give up, whose count begins again."""
+        given_up = []
+        for track, good in zip(ids.tolist(), accepted.tolist(), strict=True):
+            strikes = 0 if good else self._counts.get(track, 0) + 1
+            if strikes >= self._most:
+                given_up.append(track)
+                strikes = 0
+            self._counts[track] = strikes
+        return np.array(given_up, np.int64)
+
+    def forget(self) -> None:
+        """Reset all counters."""
+        self._counts = {}
+
 
 CELLS = 4
 """The image is cut into CELLS x CELLS cells, as where features are chosen (vision/sift.py)."""

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from benchmarks.servo.planner import shortest_length
 from benchmarks.servo.world import CAMERA as PLANNER_CAMERA
 from benchmarks.servo.world import Task
-from mapweave.agent.exploration.phase import Phase
+from mapweave.agent.exploration.behaviours import Phase
 from mapweave.agent.mission import Explore, Question, ServerAnswer, WhereAmI, WhichWay
 from mapweave.agent.pipeline import Pipeline
 from mapweave.hybridmap.change import NodePut

@@ -8,7 +8,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from mapweave.agent.navigation.onboard_router import onboard_route
+from mapweave.agent.navigation.route_source import onboard_route
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import EdgeKind, Node

@@ -421,7 +421,7 @@ def test_closing_twice_is_no_error(hub: MemoryHub) -> None:
 def test_a_trouble_is_in_the_status_only_while_it_holds(
     hub: MemoryHub, other: MemoryBus, caplog: pytest.LogCaptureFixture
 ) -> None:
-    caplog.set_level("INFO", "mapweave.agent.troubles")
+    caplog.set_level("INFO", "mapweave.agent.fleet_client")
     bus, missions = MemoryBus(hub), MissionControl("r0")
     link = FleetClient(bus, KEYS, MAP, missions, answer_timeout=0.1)
 

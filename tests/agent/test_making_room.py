@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import pytest
 
-from mapweave.agent.exploration.phase import Phase
+from mapweave.agent.exploration.behaviours import Phase
 from mapweave.agent.mission import Explore, GoTo, Idle, Mission
-from mapweave.agent.navigation.stage import NavigationStage
+from mapweave.agent.navigation.navigator import NavigationStage
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.settings import AgentSettings, NavigatorSettings
 from mapweave.hybridmap.ids import NodeId

@@ -15,9 +15,9 @@ from mapweave.agent.exploration.behaviours import (
     LEAST_TURN,
     STUCK_PAUSE,
     ExplorationBehaviours,
+    Phase,
 )
 from mapweave.agent.exploration.explorer import Explorer
-from mapweave.agent.exploration.phase import Phase
 from mapweave.agent.mapping.episode import Move
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.settings import ExplorerSettings

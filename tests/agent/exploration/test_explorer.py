@@ -8,8 +8,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mapweave.agent.exploration.behaviours import Phase
 from mapweave.agent.exploration.explorer import Explorer
-from mapweave.agent.exploration.phase import Phase
 from mapweave.agent.exploration.viewpoint_selection import REACH
 from mapweave.agent.mission import Explore, ServerAnswer, WhatIsKnown
 from mapweave.agent.observation import Observation, Odometry, RobotDescription

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from mapweave.agent.mapping.prediction_offset import PredictionOffset
+from mapweave.agent.mapping.tracking import PredictionOffset
 
 
 def test_recorded_observations_come_back_in_any_order():

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from mapweave.agent.motion_primitives import NO_ANSWER
-from mapweave.agent.navigation.stage import NavigationStage
+from mapweave.agent.navigation.navigator import NavigationStage
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2

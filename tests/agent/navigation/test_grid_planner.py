@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt
 
-from mapweave.agent.navigation.grid_planner import GridPlanner
+from mapweave.agent.navigation.local_planner import GridPlanner
 
 LEAST, WISHED = 0.2, 0.4
 

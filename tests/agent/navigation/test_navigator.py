@@ -12,9 +12,8 @@ from mapweave.agent.mission import ServerAnswer, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER
 from mapweave.agent.navigation import positioning, route_follower
 from mapweave.agent.navigation.blocks import Blocks
-from mapweave.agent.navigation.navigator import Navigator
-from mapweave.agent.navigation.onboard_router import onboard_route
-from mapweave.agent.navigation.stage import NavigationStage
+from mapweave.agent.navigation.navigator import NavigationStage, Navigator
+from mapweave.agent.navigation.route_source import onboard_route
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.hybrid_map import HybridMap

@@ -9,7 +9,7 @@ import pytest
 
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.navigation.obstruction import MARGIN, NO_PROGRESS, Obstruction, obstruction
-from mapweave.agent.navigation.onboard_router import onboard_route
+from mapweave.agent.navigation.route_source import onboard_route
 from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.hybridmap.change import EdgePut, NodePut

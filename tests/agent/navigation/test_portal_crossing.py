@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from mapweave.agent.mission import WhereAmI, WhichWay
-from mapweave.agent.navigation.onboard_router import onboard_route
+from mapweave.agent.navigation.navigator import NavigationStage
 from mapweave.agent.navigation.portal_crossing import PortalCrossing
-from mapweave.agent.navigation.stage import NavigationStage
+from mapweave.agent.navigation.route_source import onboard_route
 from mapweave.agent.observation import Command
 from mapweave.agent.settings import NavigatorSettings
 from mapweave.hybridmap.hybrid_map import HybridMap

@@ -13,8 +13,8 @@ from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mission import MayIDrive, Question, ServerAnswer, WhichWay
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.navigation.goal_patience import YIELDED
+from mapweave.agent.navigation.navigator import NavigationStage
 from mapweave.agent.navigation.right_of_way import Passage, RightOfWay
-from mapweave.agent.navigation.stage import NavigationStage
 from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.hybridmap.ids import NodeId

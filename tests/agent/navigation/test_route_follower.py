@@ -8,10 +8,10 @@ from hypothesis import strategies as st
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.navigation.local_planner import LocalPlanner
-from mapweave.agent.navigation.progress_monitor import ProgressMonitor
 from mapweave.agent.navigation.route_follower import (
     MOST_CANDIDATES,
     STALLED_PARKING,
+    ProgressMonitor,
     RouteFollower,
     RouteProgress,
 )

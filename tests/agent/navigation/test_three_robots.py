@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import pytest
 
-from mapweave.agent.navigation.stage import NavigationStage
+from mapweave.agent.navigation.navigator import NavigationStage
 from mapweave.mapserver.nearby import Nearby
 from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.routes import Router

@@ -31,8 +31,7 @@ from mapweave.agent.recordings.camera_info_check import doubts
 from mapweave.agent.recordings.incomplete import Incomplete
 from mapweave.agent.recordings.mcap_writer import FLUSH_S, McapWriter
 from mapweave.agent.recordings.opening import open_recording
-from mapweave.agent.recordings.options import RecordingOptions
-from mapweave.agent.recordings.settings import RecordingSettings
+from mapweave.agent.recordings.options import RecordingOptions, RecordingSettings
 from mapweave.agent.ros_messages.values import Mount
 from mapweave.cli import main
 from mapweave.exit_status import FAILED

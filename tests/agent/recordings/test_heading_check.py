@@ -9,7 +9,7 @@ import pytest
 
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.observation import Odometry
-from mapweave.agent.recordings.heading_check import contradiction
+from mapweave.agent.recordings.odometry_checks import contradiction
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array, Pose2
 

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from mapweave.agent.drivers.replay import Replay
-from mapweave.agent.recordings.odometry_jumps import bridged
+from mapweave.agent.recordings.odometry_checks import bridged
 from mapweave.hybridmap.pose import Array
 from tests.agent.conftest import CAMERA
 

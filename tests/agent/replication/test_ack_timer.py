@@ -6,7 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapweave.agent.replication.ack_timer import AckTimer
+from mapweave.agent.replication.beacon_timer import AckTimer
 
 LEAST, MOST = 0.5, 10.0
 

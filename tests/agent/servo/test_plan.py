@@ -15,8 +15,7 @@ from mapweave.agent.observation import RobotDescription
 from mapweave.agent.servo.field_of_view import FieldOfView
 from mapweave.agent.servo.lattice_planner import FARTHEST, lattice_plan
 from mapweave.agent.servo.plan import ServoPlan, Surroundings
-from mapweave.agent.servo.planner import thorough_plan
-from mapweave.agent.servo.two_leg_planner import two_leg_plan
+from mapweave.agent.servo.planner import thorough_plan, two_leg_plan
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2
 
