@@ -12,11 +12,7 @@ from mapweave.hybridmap.node import Edge, EdgeKind, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.wire.codec import decode_change
 from synthetic.world import take_map
-from tests.mapserver.test_set_apart import (
-    TOUR,
-    WORLD,
-    sound_logs,
-)
+from tests.mapserver.test_set_apart import TOUR, WORLD, sound_logs
 
 FIRST, LAST = MapId("a", 1), MapId("z", 1)
 """Maps are sorted by name: one that lies is before or behind the others."""

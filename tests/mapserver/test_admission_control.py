@@ -232,8 +232,7 @@ def test_questions_that_waited_too_long_are_refused(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.parametrize(
-    ("name", "value"),
-    [("workers", -1), ("workers", 65), ("in_time", 0.0), ("in_time", float("nan"))],
+    ("name", "value"), [("workers", -1), ("workers", 65), ("in_time", 0.0), ("in_time", float("nan"))]
 )
 def test_settings_that_cannot_work(name: str, value: float) -> None:
     with pytest.raises(SettingsError, match=f"^file: {name}:? .*{value}"):

@@ -32,9 +32,7 @@ KEYS = Keys("demo")
 
 
 def test_what_is_closed_from_the_shell_holds_for_all(
-    mapped_room: Callable[[], MappedRoom],
-    capsys: pytest.CaptureFixture[str],
-    monkeypatch: pytest.MonkeyPatch,
+    mapped_room: Callable[[], MappedRoom], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     endpoint, mapped = f"tcp/127.0.0.1:{free_port()}", mapped_room()
     first, second, last = sorted(mapped.truth)[0], sorted(mapped.truth)[1], sorted(mapped.truth)[-1]

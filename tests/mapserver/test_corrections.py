@@ -276,10 +276,7 @@ def test_of_two_links_before_a_merge_the_second_must_fit_the_first(
 
 
 def test_who_waits_for_a_merge_hears_what_for(
-    path: Path,
-    merging: threading.Event,
-    monkeypatch: pytest.MonkeyPatch,
-    capfd: pytest.CaptureFixture[str],
+    path: Path, merging: threading.Event, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.setattr(map_constraint, "PATIENT", 0.05)
     with serving(path) as asking:

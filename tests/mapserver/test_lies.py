@@ -30,7 +30,9 @@ from mapweave.merge.pose_graph.staged_optimization import ALONE, BORNE_OUT
 from mapweave.wire.codec import decode_change
 from mapweave.wire.log_messages import Head
 from mapweave.wire.messages import encode
+from synthetic.maps import changes_of
 from synthetic.world import room, take_map
+from tests.mapserver.driven_maps import take_in
 from tests.mapserver.false_maps import FIRST, LAST, STEP, copies, driven, views
 from tests.mapserver.test_set_apart import (
     KEYS,
@@ -48,18 +50,51 @@ from tests.quick import first_quick
 from tests.waiting import eventually
 
 
+def sound_merger() -> Merger:
+    """With what the two sound robots have sent."""
+    merger = Merger()
+    for log in sound_logs().values():
+        for message in log:
+            merger.on_change(decode_change(message))
+    return merger
+
+
+def certainties(merger: Merger, merged: MergedMap) -> list[Certainty]:
+    """Of the answers to lost robots."""
+    relocalizer = Answers.of(merger, merged, merger.node).relocalizer
+    return [relocalizer.answer(view).certainty for view in lost()]
+
+
+def most_moved(before: MergedMap, after: MergedMap) -> float:
+    """The farthest that another map has moved a node, seen from the first one of its component, m."""
+    return max(
+        (before.pose(first).inverse() @ before.pose(node)).distance(
+            after.pose(first).inverse() @ after.pose(node)
+        )
+        for component in before.components
+        for first in [min(component)]
+        for node in component
+    )
+
+
+def backwards(bodies: list[ChangeBody], clock: str = "utc") -> list[ChangeBody]:
+    """Of a robot whose clock runs backwards."""
+    return [
+        NodePut(replace(body.node, stamp_ns=10**12 - body.node.stamp_ns, clock=clock))
+        if isinstance(body, NodePut)
+        else body
+        for body in bodies
+    ]
+
+
 def lies(map_id: MapId) -> dict[str, tuple[list[ChangeBody], str]]:
     """What is sent, and what is said against it."""
     vague, true = (views(map_id, Pose2(), spread) for spread in (9e3 * np.eye(3), STEP))
-    backwards: list[ChangeBody] = [
-        NodePut(replace(body.node, stamp_ns=10**12 - body.node.stamp_ns, clock="utc"))
-        for body in true
-        if isinstance(body, NodePut)
-    ]
+    nodes = backwards([body for body in true if isinstance(body, NodePut)])
     return {
         "copies": (copies(map_id), f"map {map_id} is set apart: "),
         "vague edges": (vague, f"map {map_id} is implausible: change 3 is refused (edge "),
-        "a clock": (backwards, f"map {map_id} is implausible: its clock utc runs backwards"),
+        "a clock": (nodes, f"map {map_id} is implausible: its clock utc runs backwards"),
     }
 
 
@@ -68,13 +103,7 @@ def said(fleet: Fleet, words: str) -> list[MapEventKind]:
 
 
 @pytest.mark.parametrize(
-    ("name", "map_id"),
-    [
-        ("copies", FIRST),
-        ("copies", LAST),
-        ("vague edges", LAST),
-        ("a clock", FIRST),
-    ],
+    ("name", "map_id"), [("copies", FIRST), ("copies", LAST), ("vague edges", LAST), ("a clock", FIRST)]
 )
 def test_the_others_keep_their_map_and_their_answers(name: str, map_id: MapId, tmp_path: Path) -> None:
     path = tmp_path / "s0.sqlite"
@@ -126,29 +155,16 @@ def test_no_log_is_as_long_as_the_greatest_number(tmp_path: Path, caplog: pytest
 @pytest.mark.parametrize("clock", ["", "utc"])
 def test_a_map_with_a_clock_that_runs_backwards_is_joined_and_moves_no_other(clock: str) -> None:
     """Its times contradict each other; its views are true, and those of an honest robot move the others."""
-    alone, beside = Merger(), Merger()
-    for log in sound_logs().values():
-        for message in log:
-            alone.on_change(decode_change(message))
-            beside.on_change(decode_change(message))
+    alone, beside = sound_merger(), sound_merger()
     steps = [a.inverse() @ b @ Pose2(0.01, -0.01, 0.005) for a, b in pairwise(TOUR)]
     nodes = take_map(WORLD, LAST, TOUR, np.random.default_rng(8))[0]
-    for number, body in enumerate(driven(LAST, nodes, steps), start=1):
-        if isinstance(body, NodePut) and clock:
-            body = NodePut(replace(body.node, stamp_ns=10**12 - body.node.stamp_ns, clock=clock))
-        beside.on_change(Change(LAST, number, 0, body))
+    log = driven(LAST, nodes, steps)
+    take_in(beside, LAST, backwards(log, clock) if clock else log)
     before, after = alone.merged(), beside.merged()
     first, second = before.maps
     assert after.joined(first, LAST) and after.joined(first, second)
     assert (LAST in after.implausible) is bool(clock)
-    moved = max(
-        (before.pose(first_node).inverse() @ before.pose(node)).distance(
-            after.pose(first_node).inverse() @ after.pose(node)
-        )
-        for component in before.components
-        for first_node in [min(component)]
-        for node in component
-    )
+    moved = most_moved(before, after)
     assert moved < 1e-6 if clock else moved > 1e-3
 
 
@@ -160,11 +176,9 @@ def test_an_implausible_map_does_not_join_what_nothing_else_joins(lies: bool) ->
     tours = {MapId("b", 1): TOUR, MapId("r", 1): [other @ pose for pose in TOUR[:3]]}
     alone, beside = Merger(), Merger()
     for number, (map_id, tour) in enumerate(tours.items()):
-        nodes, edges = take_map(world, map_id, tour, np.random.default_rng(number))
-        contents: list[ChangeBody] = [*map(NodePut, nodes), *map(EdgePut, edges)]
-        for k, body in enumerate(contents, start=1):
-            alone.on_change(Change(map_id, k, 0, body))
-            beside.on_change(Change(map_id, k, 0, body))
+        contents = changes_of(*take_map(world, map_id, tour, np.random.default_rng(number)))
+        for merger in (alone, beside):
+            take_in(merger, map_id, contents)
     before = alone.merged()
     assert len(before.components) == 2
     way = [*tours[MapId("b", 1)], *tours[MapId("r", 1)]]
@@ -173,10 +187,8 @@ def test_an_implausible_map_does_not_join_what_nothing_else_joins(lies: bool) ->
     end = next(iter(before.components[0]))
     last = NodeId(*LAST, 2 * len(nodes) - 1)
     drive = Edge(NodeId(*LAST, 900), last, end, PoseGaussian(Pose2(), STEP), EdgeKind.DRIVEN)
-    for number, body in enumerate([*log, EdgePut(drive)], start=1):
-        if isinstance(body, NodePut) and lies:
-            body = NodePut(replace(body.node, stamp_ns=10**12 - body.node.stamp_ns, clock="utc"))
-        beside.on_change(Change(LAST, number, 0, body))
+    log.append(EdgePut(drive))
+    take_in(beside, LAST, backwards(log) if lies else log)
     after = beside.merged()
     first, second = tours
     assert after.joined(first, second) is not lies
@@ -216,18 +228,15 @@ def test_an_implausible_map_bears_out_no_links_of_others(lies: bool) -> None:
         if map_id.agent == "r":
             nodes[-1] = replace(nodes[-1], landmarks=nodes[-1].landmarks.take(np.arange(40)))
             edges[-1] = replace(edges[-1], shared=edges[-1].shared[:0])
-        for k, body in enumerate([*map(NodePut, nodes), *map(EdgePut, edges)], start=1):
-            merger.on_change(Change(map_id, k, 0, body))
+        take_in(merger, map_id, changes_of(nodes, edges))
     before, (first, second) = merger.merged(), tours
     assert not before.joined(first, second)
     few = {one.pair for one in before.refused if one.reason.startswith("no 2 links that share no node agree")}
     assert few and all({end.map for end in pair} == {first, second} for pair in few)
     way = [*TOUR, *there]
     nodes = take_map(world, LAST, way, np.random.default_rng(8))[0]
-    for k, body in enumerate(driven(LAST, nodes, [a.inverse() @ b for a, b in pairwise(way)]), start=1):
-        if isinstance(body, NodePut) and lies:
-            body = NodePut(replace(body.node, stamp_ns=10**12 - body.node.stamp_ns, clock="utc"))
-        merger.on_change(Change(LAST, k, 0, body))
+    log = driven(LAST, nodes, [a.inverse() @ b for a, b in pairwise(way)])
+    take_in(merger, LAST, backwards(log) if lies else log)
     after = merger.merged()
     assert after.joined(first, second) is not lies
     if not lies:
@@ -248,10 +257,7 @@ def test_an_implausible_map_bears_out_no_links_of_others(lies: bool) -> None:
 
 def test_a_map_of_which_a_change_was_refused_moves_no_other() -> None:
     """No robot sends such a change. What else it sends may be true: it is placed behind others."""
-    merger = Merger()
-    for log in sound_logs().values():
-        for message in log:
-            merger.on_change(decode_change(message))
+    merger = sound_merger()
     first, second = merger.maps
     assert merger.merged().joined(first, second)
     alone = Merger()
@@ -287,20 +293,14 @@ def test_edges_that_no_robot_measures() -> None:
 @pytest.mark.slow
 def test_fragments_make_no_answer_ambiguous() -> None:
     """A robot begins map after map, each with two views of the room and a wrong way between them."""
-    merger = Merger()
-    for log in sound_logs().values():
-        for message in log:
-            merger.on_change(decode_change(message))
-    first = Answers.of(merger, merger.merged(), merger.node).relocalizer
-    assert [first.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
+    merger = sound_merger()
+    assert certainties(merger, merger.merged()) == [Certainty.FOUND] * 2
     for epoch in range(1, MOST_FRAGMENTS + 2):
         map_id = MapId(LAST.agent, epoch)
-        for number, body in enumerate(views(map_id, Pose2(1.0, 2.0, 0.5), STEP)[:3], start=1):
-            merger.on_change(Change(map_id, number, 0, body))
+        take_in(merger, map_id, views(map_id, Pose2(1.0, 2.0, 0.5), STEP)[:3])
     merged = merger.merged()
     assert list(merged.implausible) == [MapId(LAST.agent, epoch) for epoch in range(1, MOST_FRAGMENTS + 2)]
-    relocalizer = Answers.of(merger, merged, merger.node).relocalizer
-    assert [relocalizer.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
+    assert certainties(merger, merged) == [Certainty.FOUND] * 2
 
 
 def test_many_bad_maps_speak_against_a_robot_unless_most_of_its_nodes_are_sound() -> None:
@@ -320,21 +320,6 @@ def test_many_bad_maps_speak_against_a_robot_unless_most_of_its_nodes_are_sound(
     assert unreliable_robots(small | large, [*large]) == {"z": {*small, *large}}
 
 
-def sound_merger() -> Merger:
-    """With what the two sound robots have sent."""
-    merger = Merger()
-    for log in sound_logs().values():
-        for message in log:
-            merger.on_change(decode_change(message))
-    return merger
-
-
-def certainties(merger: Merger, merged: MergedMap) -> list[Certainty]:
-    """Of the answers to lost robots."""
-    relocalizer = Answers.of(merger, merged, merger.node).relocalizer
-    return [relocalizer.answer(view).certainty for view in lost()]
-
-
 @pytest.mark.parametrize("wrong", [0, 3, 4])
 def test_a_map_that_contradicts_itself_is_named(wrong: int) -> None:
     """Its own loops do; what a server recognises may be a place that looks the same."""
@@ -351,8 +336,7 @@ def test_a_map_that_contradicts_itself_is_named(wrong: int) -> None:
             NodeId(*LAST, 100 + k), NodeId(*LAST, 2 * i + 1), NodeId(*LAST, 2 * j + 1), pose, EdgeKind.LOOP
         )
         log.append(EdgePut(edge))
-    for number, body in enumerate(log, start=1):
-        merger.on_change(Change(LAST, number, 0, body))
+    take_in(merger, LAST, log)
     found = merger.merged().implausible
     assert list(found) == ([LAST] if wrong > 3 else [])
     assert not found or found[LAST].startswith("it contradicts itself: 4 of its 6 loops")
@@ -366,8 +350,7 @@ def test_many_maps_of_one_robot_that_contradict_each_other_make_no_answer_ambigu
     for epoch in range(1, count + 1):
         map_id = MapId(LAST.agent, epoch)
         steps = [Pose2.from_vector(rng.uniform(-3.0, 3.0, 3)) for _ in nodes[1:]]
-        for number, body in enumerate(driven(map_id, nodes, steps), start=1):
-            merger.on_change(Change(map_id, number, 0, body))
+        take_in(merger, map_id, driven(map_id, nodes, steps))
     merged = merger.merged()
     assert len(merged.implausible) == (count if count > MOST_FRAGMENTS else 0)
     if merged.implausible:
@@ -376,10 +359,7 @@ def test_many_maps_of_one_robot_that_contradict_each_other_make_no_answer_ambigu
 
 def test_a_view_that_comes_again_in_many_fragments_moves_no_nodes_of_others() -> None:
     """It is true, and would count as often as it comes."""
-    merger, rng = Merger(), np.random.default_rng(3)
-    for log in sound_logs().values():
-        for message in log:
-            merger.on_change(decode_change(message))
+    merger, rng = sound_merger(), np.random.default_rng(3)
     before = merger.merged()
     beside = Pose2(0.1, 0.1, 0.2)
     nodes = take_map(WORLD, LAST, [TOUR[3], TOUR[3] @ beside, TOUR[0]], np.random.default_rng(8))[0]
@@ -387,27 +367,18 @@ def test_a_view_that_comes_again_in_many_fragments_moves_no_nodes_of_others() ->
     nodes[2] = replace(nodes[2], landmarks=nodes[2].landmarks.take(np.arange(0, 90, 2)))
     for epoch in range(1, MOST_FRAGMENTS + 2):
         steps = [beside, Pose2.from_vector(rng.uniform(-3.0, 3.0, 3))]
-        for number, body in enumerate(driven(MapId(LAST.agent, epoch), nodes, steps), start=1):
-            merger.on_change(Change(MapId(LAST.agent, epoch), number, 0, body))
+        take_in(merger, MapId(LAST.agent, epoch), driven(MapId(LAST.agent, epoch), nodes, steps))
     after = merger.merged()
     maps = {MapId(LAST.agent, epoch) for epoch in range(1, MOST_FRAGMENTS + 2)}
     assert {end.map for link in after.links for end in link.pair} & maps, "some are joined"
-    first = min(before.poses)
-    moved = [
-        (before.pose(first).inverse() @ before.pose(node)).distance(
-            after.pose(first).inverse() @ after.pose(node)
-        )
-        for node in before.poses
-    ]
-    assert max(moved) < 1e-6
+    assert most_moved(before, after) < 1e-6
     assert after.implausible.keys() == maps
 
 
 def test_places_of_an_implausible_map_answer_only_where_no_other_map_does() -> None:
     """Alone it may know a place; beside others it is no second place, linked with them or not."""
     merger = sound_merger()
-    for number, body in enumerate(views(LAST, Pose2(1.0, 2.0, 0.5), STEP), start=1):
-        merger.on_change(Change(LAST, number, 0, body))
+    take_in(merger, LAST, views(LAST, Pose2(1.0, 2.0, 0.5), STEP))
     merged = merger.merged()
     # As if its nodes had been compared with no others: none is known to be misplaced.
     unlinked = replace(merged, refused=(), wrong={})
@@ -421,10 +392,7 @@ def test_places_of_an_implausible_map_answer_only_where_no_other_map_does() -> N
 
 def test_a_joined_fragment_makes_no_answer_ambiguous_and_a_robot_alone_in_twin_rooms_does() -> None:
     """The fragment has two views where they are, and a third one elsewhere."""
-    merger = Merger()
-    for log in sound_logs().values():
-        for message in log:
-            merger.on_change(decode_change(message))
+    merger = sound_merger()
     beside = Pose2(0.1, 0.1, 0.2)
     tour = [TOUR[3], TOUR[3] @ beside, TOUR[0]]
     # The newest map of a robot is no fragment. Of the third view less is seen: else nothing would be joined.
@@ -432,19 +400,15 @@ def test_a_joined_fragment_makes_no_answer_ambiguous_and_a_robot_alone_in_twin_r
         map_id = MapId(LAST.agent, epoch)
         nodes = take_map(WORLD, map_id, tour[:count], np.random.default_rng(8))[0]
         nodes[2:] = [replace(one, landmarks=one.landmarks.take(np.arange(0, 90, 2))) for one in nodes[2:]]
-        for number, body in enumerate(driven(map_id, nodes, [beside, Pose2(1.0, 2.0, 0.5)]), start=1):
-            merger.on_change(Change(map_id, number, 0, body))
+        take_in(merger, map_id, driven(map_id, nodes, [beside, Pose2(1.0, 2.0, 0.5)]))
     assert {MapId(LAST.agent, 1)} <= {node.map for node in merger.merged().components[0]}
-    relocalizer = Answers.of(merger, merger.merged(), merger.node).relocalizer
-    assert [relocalizer.answer(view).certainty for view in lost()] == [Certainty.FOUND] * 2
+    assert certainties(merger, merger.merged()) == [Certainty.FOUND] * 2
     # Alone, and in one map: no other robot says that the second room is there.
     steps = [a.inverse() @ b for a, b in pairwise(TOUR)]
     nodes = take_map(WORLD, FIRST, [*TOUR, *TOUR], np.random.default_rng(5))[0]
-    for number, body in enumerate(driven(FIRST, nodes, [*steps, Pose2(20.0), *steps]), start=1):
-        merger.on_change(Change(FIRST, number, 0, body))
+    take_in(merger, FIRST, driven(FIRST, nodes, [*steps, Pose2(20.0), *steps]))
     assert not merger.merged().wrong
-    relocalizer = Answers.of(merger, merger.merged(), merger.node).relocalizer
-    assert [relocalizer.answer(view).certainty for view in lost()] == [Certainty.AMBIGUOUS] * 2
+    assert certainties(merger, merger.merged()) == [Certainty.AMBIGUOUS] * 2
 
 
 def test_nothing_is_concluded_from_a_clock_that_runs_backwards() -> None:
@@ -465,10 +429,7 @@ def test_maps_that_may_not_be_right_supersede_no_nodes_of_others() -> None:
     true = [body.node for body in views(LAST, Pose2(), STEP) if isinstance(body, NodePut)]
     superseded: dict[str, dict[NodeId, NodeId]] = {}
     for lie in ("", "clock", "fragments", "silence"):
-        merger = Merger()
-        for log in sound_logs().values():
-            for message in log:
-                merger.on_change(decode_change(message))
+        merger = sound_merger()
         nodes = true * (MOST_FRAGMENTS if lie == "fragments" else lie != "silence")
         for k, node in enumerate(nodes, start=1):
             # Later than all others; the clock runs backwards, if there is one.

@@ -12,12 +12,14 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.nearby import NearbyRequest
 from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Obstacle, ReserveRequest, RouteAnswer, RouteRequest
+from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.nearby import Nearby
 from mapweave.mapserver.obstacles import Disc, Discs, placed
 from mapweave.mapserver.parked_robots import route_past_parked
 from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.routes import Router
-from tests.mapserver.test_reservations import CORRIDOR, HALL, NICHE, node, router  # noqa: F401 - a fixture
+from tests.mapserver.driven_maps import driven_map, place_node, take_in
+from tests.mapserver.test_reservations import CORRIDOR, HALL, MAP, NICHE, node, router  # noqa: F401 - a fixture
 
 PLACES = [*CORRIDOR, NICHE, *HALL]
 RADIUS = 0.16
@@ -111,22 +113,10 @@ class Fleet:
 @pytest.fixture
 def ring() -> Router:
     """Two ways from node 0 to node 4: 4 m by the corridor, 8 m by the hall."""
-    from mapweave.hybridmap.change import Change, EdgePut, NodePut
-    from mapweave.hybridmap.ids import EdgeId
-    from mapweave.hybridmap.node import Edge, EdgeKind
-    from mapweave.hybridmap.pose import PoseGaussian
-    from mapweave.mapserver.merging.merger import Merger
-    from tests.mapserver.test_reservations import MAP, place_node
-
     places = [(0.0, 0.0), (1.0, 0.0), (2.0, 0.0), (3.0, 0.0), (4.0, 0.0), (4.0, 2.0), (2.0, 2.0), (0.0, 2.0)]
     nodes = [place_node(node(k), place) for k, place in enumerate(places)]
-    merger, bodies = Merger(), [NodePut(one) for one in nodes]
-    for k in range(8):
-        a, b = nodes[k], nodes[(k + 1) % 8]
-        relative = PoseGaussian(a.map_from_robot.mean.inverse() @ b.map_from_robot.mean, 1e-4 * np.eye(3))
-        bodies.append(EdgePut(Edge(EdgeId(*MAP, k + 1), a.id, b.id, relative, EdgeKind.DRIVEN)))
-    for number, body in enumerate(bodies, start=1):
-        merger.on_change(Change(MAP, number, 0, body))
+    merger = Merger()
+    take_in(merger, MAP, driven_map(MAP, nodes, [(k, (k + 1) % 8) for k in range(8)]))
     return Router(merger.merged())
 
 

@@ -359,10 +359,7 @@ def test_places_of_a_map_file_from_the_shell(
     status, out, _ = run("map", "route", "kitchen", "r0.1.9", "--json")
     assert status == 0 and json.loads(out)["start"] == "r0.1.3"
     assert "r0.1.3" in run("map", "explain", "kitchen", "r0.1.9")[1]
-    for where, what in (
-        ("kitchen", "node r0.1.3 is retired"),
-        ("hall", "the area of 16 corners at r0.1.3"),
-    ):
+    for where, what in (("kitchen", "node r0.1.3 is retired"), ("hall", "the area of 16 corners at r0.1.3")):
         status, out, _ = run("map", "retire", where, "--check")
         assert status == 0 and out.startswith(f"only checked, nothing is changed: {what}"), out
     assert run("map", "retire", "hall", "kitchen", "--check")[0] == USAGE

@@ -171,9 +171,7 @@ def test_plans_over_http(house: House) -> None:
         assert ask(served, "POST", "/plans", b"a page")[0] == 400
 
 
-def test_answers_and_goals_in_coordinates_of_a_plan(
-    house: House,
-) -> None:
+def test_answers_and_goals_in_coordinates_of_a_plan(house: House) -> None:
     """Of robots and photographs, over HTTP and in Python; what is no plan is refused, and not passed over."""
     fleet = house.person
     fleet.put_plan_image(PNG.png)

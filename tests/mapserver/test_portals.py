@@ -13,14 +13,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Body, Closure, Floor, Preference
-from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import RetiredNodes
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
-from mapweave.hybridmap.node import Edge, EdgeKind
+from mapweave.hybridmap.node import EdgeKind
 from mapweave.hybridmap.portal import Portal, PortalMeans, PortalStop
-from mapweave.hybridmap.pose import PoseGaussian
 from mapweave.hybridmap.query import RouteAnswer
 from mapweave.hybridmap.route import RouteSettings, edge_cost
 from mapweave.mapserver.annotator import check_annotation
@@ -29,7 +27,7 @@ from mapweave.mapserver.portals import Portals
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
 from mapweave.wire.messages import decode, encode
-from tests.mapserver.test_reservations import place_node
+from tests.mapserver.driven_maps import driven_map, place_node, take_in
 
 MAPS = [MapId(name, 1) for name in "abc"]
 SIZE = 3
@@ -39,19 +37,12 @@ CROSSING = RouteSettings().per_portal
 @pytest.fixture(scope="module")
 def house() -> Router:
     """Three floors, each a square of corridors that its own robot has mapped, around the same origin."""
-    merger, exact = Merger(), np.diag([1e-4, 1e-4, 1e-4])
+    merger = Merger()
+    joints = [(n, n + 1) for n in range(SIZE * SIZE) if n % SIZE < SIZE - 1]
+    joints += [(n, n + SIZE) for n in range(SIZE * (SIZE - 1))]
     for k, which in enumerate(MAPS):
         nodes = [place_node(at(k, n), (float(n % SIZE), float(n // SIZE))) for n in range(SIZE * SIZE)]
-        joints = [(n, n + 1) for n in range(SIZE * SIZE) if n % SIZE < SIZE - 1]
-        joints += [(n, n + SIZE) for n in range(SIZE * (SIZE - 1))]
-        bodies: list[NodePut | EdgePut] = [NodePut(node) for node in nodes]
-        for number, (a, b) in enumerate(joints, start=1):
-            between = nodes[a].map_from_robot.mean.inverse() @ nodes[b].map_from_robot.mean
-            pose = PoseGaussian(between, exact)
-            edge = Edge(EdgeId(*which, number), nodes[a].id, nodes[b].id, pose, EdgeKind.DRIVEN)
-            bodies.append(EdgePut(edge))
-        for number, body in enumerate(bodies, start=1):
-            merger.on_change(Change(which, number, 0, body))
+        take_in(merger, which, driven_map(which, nodes, joints))
     return Router(merger.merged())
 
 
@@ -189,20 +180,10 @@ def test_portals_and_labels_that_contradict_each_other_are_refused(house, body: 
 
 def test_a_door_is_refused_where_the_map_has_its_sides_far_apart() -> None:
     """A corridor of 12 m: within one component the map says how far two nodes are from each other."""
-    merger, which, sigma = Merger(), MapId("a", 1), 0.1
+    merger, which = Merger(), MapId("a", 1)
     nodes = [place_node(at(0, n), (float(n), 0.0)) for n in range(13)]
-    for number, node in enumerate(nodes, start=1):
-        merger.on_change(Change(which, number, 0, NodePut(node)))
-    for number, (a, b) in enumerate(pairwise(nodes), start=1):
-        pose = PoseGaussian.from_sigmas(a.map_from_robot.mean.inverse() @ b.map_from_robot.mean, sigma, 1e-3)
-        merger.on_change(
-            Change(
-                which,
-                20 + number,
-                0,
-                EdgePut(Edge(EdgeId(*which, number), a.id, b.id, pose, EdgeKind.MAPPED)),
-            )
-        )
+    spread = np.diag([0.1, 0.1, 1e-3]) ** 2
+    take_in(merger, which, driven_map(which, nodes, pairwise(range(13)), EdgeKind.MAPPED, spread))
     merged = merger.merged()
 
     def check(far: int, means: PortalMeans = PortalMeans.DOOR) -> None:

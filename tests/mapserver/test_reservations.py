@@ -4,25 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.constraint_subject import Linked
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.nearby import NearbyRequest
-from mapweave.hybridmap.node import Edge, EdgeKind, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.node import EdgeKind
+from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveAnswer, ReserveRequest
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.nearby import Nearby
 from mapweave.mapserver.reservations import AHEAD, LEASE, Reservations
 from mapweave.mapserver.routes import Router
-from tests.agent.scripted_fleet import bare
+from tests.mapserver.driven_maps import driven_map, place_node, take_in
 
 MAP = MapId("a", 1)
 CORRIDOR = [(float(x), 0.0) for x in range(9)]
@@ -36,22 +34,10 @@ def router() -> Router:
     """A corridor of nine nodes 1 m apart with a niche beside the fifth, and a hall beside it."""
     places = [*CORRIDOR, NICHE, *HALL]
     joints = [*((k, k + 1) for k in range(8)), (4, 9), *((k, k + 1) for k in range(10, 18)), (8, 18)]
-    merger, exact = Merger(), np.diag([1e-4, 1e-4, 1e-4])
+    merger = Merger()
     nodes = [place_node(NodeId(*MAP, k + 1), place) for k, place in enumerate(places)]
-    bodies: list[NodePut | EdgePut] = [NodePut(node) for node in nodes]
-    for number, (a, b) in enumerate(joints, start=1):
-        relative = nodes[a].map_from_robot.mean.inverse() @ nodes[b].map_from_robot.mean
-        edge = Edge(
-            EdgeId(*MAP, number), nodes[a].id, nodes[b].id, PoseGaussian(relative, exact), EdgeKind.DRIVEN
-        )
-        bodies.append(EdgePut(edge))
-    for number, body in enumerate(bodies, start=1):
-        merger.on_change(Change(MAP, number, 0, body))
+    take_in(merger, MAP, driven_map(MAP, nodes, joints))
     return Router(merger.merged())
-
-
-def place_node(node_id: NodeId, place: tuple[float, float]) -> Node:
-    return replace(bare(node_id), map_from_robot=PoseGaussian(Pose2(*place), np.diag([1e-6, 1e-6, 1e-6])))
 
 
 def node(number: int) -> NodeId:
@@ -128,15 +114,11 @@ OWN, OTHERS = ("r0", 0, 0.3), ("r9", 2, 5.0)
 
 
 def two_robots(joined: bool) -> Router:
-    merger, exact = Merger(), np.diag([1e-4, 1e-4, 1e-4])
+    merger = Merger()
     for robot, first, radius in (OWN, OTHERS):
-        nodes = [
-            replace(place_node(NodeId(robot, 1, k), (float(first + k), 0.0)), radius=radius) for k in (0, 1)
-        ]
-        step = PoseGaussian(Pose2(1.0), exact)
-        edge = Edge(EdgeId(robot, 1, 2), nodes[0].id, nodes[1].id, step, EdgeKind.MAPPED)
-        for number, body in enumerate((*map(NodePut, nodes), EdgePut(edge)), start=1):
-            merger.on_change(Change(MapId(robot, 1), number, 0, body))
+        places = [(float(first + k), 0.0) for k in (0, 1)]
+        nodes = [replace(place_node(NodeId(robot, 1, k), at), radius=radius) for k, at in enumerate(places)]
+        take_in(merger, MapId(robot, 1), driven_map(MapId(robot, 1), nodes, [(0, 1)], EdgeKind.MAPPED))
     if joined:
         link = Linked(NodeId("r0", 1, 1), NodeId("r9", 1, 0), Pose2(1.0), (1e-4, 0.0, 0.0, 1e-4, 0.0, 1e-4))
         merger.constrain(ManualConstraints((ManualConstraint(link, True, "anna", 1),)))

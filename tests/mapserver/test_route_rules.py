@@ -6,19 +6,16 @@ from dataclasses import replace
 from itertools import pairwise
 
 import networkx as nx
-import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.annotation import Annotation, Annotations, Closure, Preference
 from mapweave.hybridmap.area import Area
-from mapweave.hybridmap.change import Change, EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind
+from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.portal import Portal, PortalMeans
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.route import edge_cost
 from mapweave.mapserver.annotator import check_edge
 from mapweave.mapserver.goals import node_of_goal
@@ -26,7 +23,7 @@ from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.places import PlaceResolver
 from mapweave.mapserver.route_explaining import explain_route
 from mapweave.mapserver.routes import Router
-from tests.mapserver.test_reservations import place_node
+from tests.mapserver.driven_maps import driven_map, place_node, take_in
 
 MAP = MapId("a", 1)
 SIZE = 5
@@ -36,19 +33,11 @@ HOUR = 3600 * 10**9
 @pytest.fixture(scope="module")
 def grid() -> Router:
     """Nodes 1 m apart in a square; each row and column is a corridor."""
-    merger, exact = Merger(), np.diag([1e-4, 1e-4, 1e-4])
+    merger = Merger()
     nodes = [place_node(at(x, y), (float(x), float(y))) for y in range(SIZE) for x in range(SIZE)]
-    joints = [(at(x, y), at(x + 1, y)) for y in range(SIZE) for x in range(SIZE - 1)]
-    joints += [(at(x, y), at(x, y + 1)) for y in range(SIZE - 1) for x in range(SIZE)]
-    bodies: list[NodePut | EdgePut] = [NodePut(node) for node in nodes]
-    by_id = {node.id: node for node in nodes}
-    for number, (a, b) in enumerate(joints, start=1):
-        between = by_id[a].map_from_robot.mean.inverse() @ by_id[b].map_from_robot.mean
-        bodies.append(
-            EdgePut(Edge(EdgeId(*MAP, number), a, b, PoseGaussian(between, exact), EdgeKind.DRIVEN))
-        )
-    for number, body in enumerate(bodies, start=1):
-        merger.on_change(Change(MAP, number, 0, body))
+    joints = [(n, n + 1) for n in range(SIZE * SIZE) if n % SIZE < SIZE - 1]
+    joints += [(n, n + SIZE) for n in range(SIZE * (SIZE - 1))]
+    take_in(merger, MAP, driven_map(MAP, nodes, joints))
     return Router(merger.merged())
 
 

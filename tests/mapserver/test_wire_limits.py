@@ -40,9 +40,7 @@ def place(number: int, node_from_robot: PoseGaussian, merged_from_robot: PoseGau
     ],
 )
 def test_values_out_of_range_are_left_out(
-    certainty: Certainty,
-    places: list[tuple[PoseGaussian, PoseGaussian]],
-    left: tuple[Certainty, list[int]],
+    certainty: Certainty, places: list[tuple[PoseGaussian, PoseGaussian]], left: tuple[Certainty, list[int]]
 ) -> None:
     candidates = tuple(place(k, *poses) for k, poses in enumerate(places, start=1))
     answer = within_range(RelocalizeAnswer(certainty, candidates, "words"))

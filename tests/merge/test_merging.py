@@ -138,10 +138,7 @@ def test_a_room_that_is_just_like_another_is_not_taken_for_it() -> None:
         rng = np.random.default_rng(seed)
         left, middle = room(0, 0, 5, 4, 600, rng), room(5, 0, 5, 4, 900, rng)
         world = left + middle + left.moved(Pose2(10, 0, 0))
-        tours = {
-            A: tour(0, 0, 4, rng) + tour(5, 0, 9, rng),
-            B: tour(5, 0, 9, rng) + tour(10, 0, 4, rng),
-        }
+        tours = {A: tour(0, 0, 4, rng) + tour(5, 0, 9, rng), B: tour(5, 0, 9, rng) + tour(10, 0, 4, rng)}
         fleet = Fleet(world, tours, rng)
         merged = fleet.merge()
         assert fleet.false_links(merged) == 0

@@ -114,16 +114,20 @@ def test_what_robots_have_made_is_not_written_over_with_something_else(
     assert path.read_bytes() == there and list(tmp_path.iterdir()) == [path]
 
 
-def test_a_newer_map_takes_the_place_of_a_map_and_of_no_database(tmp_path: Path) -> None:
+def test_a_newer_map_takes_the_place_of_a_map_and_of_no_other_file(tmp_path: Path) -> None:
     path, newer = tmp_path / "x", MAP_FILE + b"\x02"
     path.write_bytes(MAP_FILE + b"\x01")
     write_whole(path, newer)
     write_whole(path, memoryview(newer))
     assert path.read_bytes() == newer
-    path.write_bytes(SQLITE)
-    with pytest.raises(InvalidFile, match="store"):
-        write_whole(path, newer)
-    assert path.read_bytes() == SQLITE
+    for there, words in ((SQLITE, "store"), (b"a photograph", "a file that is no map is there; give")):
+        path.write_bytes(there)
+        with pytest.raises(InvalidFile, match=words):
+            write_whole(path, newer)
+        assert path.read_bytes() == there
+    path.write_bytes(b"")
+    write_whole(path, newer)
+    assert path.read_bytes() == newer
 
 
 def test_a_disk_that_is_read_only_is_named_with_the_file_itself(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from contextlib import closing
 from types import SimpleNamespace
 
 import numpy as np
@@ -20,7 +21,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.ranges import Ranges
 from mapweave.hybridmap.trajectory_segment import FURTHEST, LONGEST, MOST, TrajectorySegment
 from synthetic.world import random_vectors
-from tests.wire.fleets import Fleet, MemoryFleet, ZenohFleet
+from tests.wire.fleets import Fleet, MemoryFleet, Routers, ZenohFleet
 
 # Examples run on machines that are busy with other things.
 settings.register_profile("mapweave", deadline=None)
@@ -186,6 +187,17 @@ def some() -> SimpleNamespace:
 @pytest.fixture(params=[MemoryFleet, ZenohFleet])
 def fleet(request: pytest.FixtureRequest) -> Iterator[Fleet]:
     """Of either kind."""
-    fleet = request.param()
-    yield fleet
-    fleet.close()
+    with closing(request.param()) as fleet:
+        yield fleet
+
+
+@pytest.fixture
+def zenoh_fleet() -> Iterator[ZenohFleet]:
+    with closing(ZenohFleet()) as fleet:
+        yield fleet
+
+
+@pytest.fixture
+def routers() -> Iterator[Routers]:
+    with closing(Routers()) as routers:
+        yield routers

@@ -68,6 +68,34 @@ class ZenohFleet:
         self.router.close()
 
 
+def endpoint(port: int) -> str:
+    return f"tcp/127.0.0.1:{port}"
+
+
+class Routers:
+    """Routers on ports of this machine, and clients of them."""
+
+    def __init__(self) -> None:
+        self.open: list[ZenohBus] = []
+
+    def router(self, port: int, *joined: int) -> ZenohBus:
+        return self._opened(
+            BusSettings(mode="router", listen=(endpoint(port),), routers=tuple(map(endpoint, joined)))
+        )
+
+    def client(self, *ports: int) -> ZenohBus:
+        return self._opened(BusSettings(endpoints=tuple(map(endpoint, ports))))
+
+    def close(self) -> None:
+        """The newest first."""
+        while self.open:
+            self.open.pop().close()
+
+    def _opened(self, settings: BusSettings) -> ZenohBus:
+        self.open.append(ZenohBus(settings))
+        return self.open[-1]
+
+
 def settle(asker: Bus, key: str, servers: int = 1) -> list[Reply]:
     """Ask until so many servers are seen: a declaration needs a moment to get about."""
     replies: list[Reply] = []

@@ -39,8 +39,7 @@ def test_without_faults_all_arrives_in_order() -> None:
     assert run(MessageFaults()) == list(range(300))
 
 
-def test_one_bus_can_be_disturbed_alone() -> None:
-    hub = MemoryHub()
+def test_one_bus_can_be_disturbed_alone(hub: MemoryHub) -> None:
     bad, good, receiver = MemoryBus(hub), MemoryBus(hub), MemoryBus(hub)
     got: list[bytes] = []
     receiver.subscribe("n", lambda sample: got.append(sample.payload))
@@ -52,8 +51,6 @@ def test_one_bus_can_be_disturbed_alone() -> None:
     bad.publish("n", b"end")
     eventually(lambda: b"end" in got)
     assert got == [b"good"] * 20 + [b"end"]
-    for bus in (bad, good, receiver):
-        bus.close()
 
 
 def test_dropped_messages_are_gone_and_the_others_in_order() -> None:
@@ -82,8 +79,7 @@ def test_the_same_seed_makes_the_same_faults() -> None:
     assert run(faults, seed=3) != run(faults, seed=4)
 
 
-def test_a_cut_bus_is_dead_to_the_others_and_they_to_it() -> None:
-    hub = MemoryHub()
+def test_a_cut_bus_is_dead_to_the_others_and_they_to_it(hub: MemoryHub) -> None:
     first, second = MemoryBus(hub), MemoryBus(hub)
     news: list[tuple[str, str, bool]] = []
     first.announce("one")
@@ -97,12 +93,9 @@ def test_a_cut_bus_is_dead_to_the_others_and_they_to_it() -> None:
     assert ("two sees", "one", False) in news
     hub.restore(second)
     eventually(lambda: len(news) == 10)
-    first.close()
-    second.close()
 
 
-def test_an_answer_from_a_bus_that_was_cut_meanwhile_is_lost() -> None:
-    hub = MemoryHub()
+def test_an_answer_from_a_bus_that_was_cut_meanwhile_is_lost(hub: MemoryHub) -> None:
     asker, server = MemoryBus(hub), MemoryBus(hub)
     kept: list[Request] = []
     server.serve("q", kept.append)
@@ -114,8 +107,6 @@ def test_an_answer_from_a_bus_that_was_cut_meanwhile_is_lost() -> None:
     kept[0].reply(b"into the void")
     thread.join()
     assert answers == [[]]
-    asker.close()
-    server.close()
 
 
 class _Question:
@@ -191,8 +182,8 @@ def test_what_a_robot_sends_wrong_fills_no_log() -> None:
     assert [counted.count(keys.server_status("s0")) for _ in range(3)] == [""] * 3, "a defect of its own"
 
 
-def test_a_flood_of_wrong_messages_is_one_line(caplog: pytest.LogCaptureFixture) -> None:
-    hub, keys = MemoryHub(), Keys("demo")
+def test_a_flood_of_wrong_messages_is_one_line(hub: MemoryHub, caplog: pytest.LogCaptureFixture) -> None:
+    keys = Keys("demo")
     robot, server = MemoryBus(hub), MemoryBus(hub)
     heard: list[int] = []
 
@@ -206,5 +197,3 @@ def test_a_flood_of_wrong_messages_is_one_line(caplog: pytest.LogCaptureFixture)
             robot.publish(keys.agent_status("r17"), b"x")
         eventually(lambda: len(heard) == 1000)
     assert len([record for record in caplog.records if "no map of fields" in record.getMessage()]) == 1
-    robot.close()
-    server.close()

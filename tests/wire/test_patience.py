@@ -28,20 +28,16 @@ def busy_twice(asked: list[float], answer: bytes) -> Callable[[Request], None]:
     return handle
 
 
-def test_a_busy_server_is_asked_again_at_its_time() -> None:
-    hub = MemoryHub()
+def test_a_busy_server_is_asked_again_at_its_time(hub: MemoryHub) -> None:
     server, person = MemoryBus(hub), MemoryBus(hub)
     asked: list[float] = []
-    closing = server.serve("why", busy_twice(asked, b"because"))
+    server.serve("why", busy_twice(asked, b"because"))
     assert ask_patiently(person, "why", b"", 20.0) == [Reply(b"because")]
     assert len(asked) == 3 and asked[1] - asked[0] >= 0.1
     # Not beyond the time that the person gives.
     asked.clear()
     (reply,) = ask_patiently(person, "why", b"", 0.05)
     assert reply.error == "busy" and len(asked) == 1
-    closing.close()
-    server.close()
-    person.close()
 
 
 @pytest.fixture
@@ -55,7 +51,6 @@ def silent(hub: MemoryHub) -> Iterator[MemoryBus]:
     bus.serve("where", hold)
     yield bus
     end.set()
-    bus.close()
 
 
 def answered(reply: Reply) -> bool:
@@ -72,8 +67,6 @@ def test_a_busy_server_is_asked_again_while_another_says_nothing(hub: MemoryHub,
     assert time.monotonic() - began < 5.0
     assert [one.error or one.payload for one in replies] == ["busy", "busy", b"here"]
     assert len(asked) == 3 and all(b - a >= 0.1 for a, b in pairwise(asked))
-    server.close()
-    robot.close()
 
 
 def test_a_busy_server_alone_is_not_asked_again(hub: MemoryHub) -> None:
@@ -88,8 +81,6 @@ def test_a_busy_server_alone_is_not_asked_again(hub: MemoryHub) -> None:
     server.serve("where", refuse)
     assert BusyServers(robot, "where", b"", answered).ask(20.0) == [Reply(error="busy", retry_after=ANY)]
     assert len(asked) == 1
-    server.close()
-    robot.close()
 
 
 def test_a_slow_answer_counts_after_the_busy_one_was_asked_again(hub: MemoryHub) -> None:
@@ -108,8 +99,6 @@ def test_a_slow_answer_counts_after_the_busy_one_was_asked_again(hub: MemoryHub)
     began = time.monotonic()
     assert Reply(b"here") in BusyServers(robot, "where", b"", answered).ask(20.0)
     assert time.monotonic() - began < 5.0
-    for bus in (slow, busy, robot):
-        bus.close()
 
 
 @pytest.mark.parametrize("timeout", [0.05, 0.3])
@@ -120,8 +109,6 @@ def test_the_wait_ends_with_its_time(hub: MemoryHub, silent: MemoryBus, timeout:
     replies = BusyServers(robot, "where", b"", answered).ask(timeout)
     assert timeout <= time.monotonic() - began < timeout + 2.0
     assert replies and all(one.error == "busy" for one in replies)
-    server.close()
-    robot.close()
 
 
 def test_a_server_that_is_always_busy_for_a_moment_is_asked_seldom(hub: MemoryHub, silent: MemoryBus) -> None:
@@ -136,8 +123,6 @@ def test_a_server_that_is_always_busy_for_a_moment_is_asked_seldom(hub: MemoryHu
     liar.serve("where", refuse)
     BusyServers(robot, "where", b"", answered).ask(1.0)
     assert 2 <= len(asked) <= MOST_OPEN
-    liar.close()
-    robot.close()
 
 
 class Endless(MemoryBus):
@@ -161,4 +146,3 @@ def test_replies_without_end_are_enough_at_some_time(hub: MemoryHub, size: int, 
     """A robot's memory grew by 1 GB within its patience."""
     robot = Endless(hub, bytes(size))
     assert len(BusyServers(robot, "where", b"", lambda reply: False).ask(5.0)) == most
-    robot.close()

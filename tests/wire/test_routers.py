@@ -8,7 +8,6 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -19,37 +18,7 @@ from mapweave.wire.bus_settings import NEXT_ENDPOINT, BusSettings
 from mapweave.wire.zenoh_bus import ZenohBus
 from mapweave.wire.zenoh_config import LARGEST, LARGEST_MESSAGE, router_file
 from tests.waiting import eventually, free_port
-
-
-def endpoint(port: int) -> str:
-    return f"tcp/127.0.0.1:{port}"
-
-
-class Routers:
-    """Routers on ports of this machine, and clients of them."""
-
-    def __init__(self) -> None:
-        self.open: list[ZenohBus] = []
-
-    def router(self, port: int, *joined: int) -> ZenohBus:
-        return self._opened(
-            BusSettings(mode="router", listen=(endpoint(port),), routers=tuple(map(endpoint, joined)))
-        )
-
-    def client(self, *ports: int) -> ZenohBus:
-        return self._opened(BusSettings(endpoints=tuple(map(endpoint, ports))))
-
-    def _opened(self, settings: BusSettings) -> ZenohBus:
-        self.open.append(ZenohBus(settings))
-        return self.open[-1]
-
-
-@pytest.fixture
-def routers() -> Iterator[Routers]:
-    routers = Routers()
-    yield routers
-    for bus in reversed(routers.open):
-        bus.close()
+from tests.wire.fleets import Routers, endpoint
 
 
 def answers(server: ZenohBus, word: bytes) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-
 import pytest
 
 from mapweave.hybridmap.errors import InvalidMessage
@@ -13,12 +11,8 @@ from tests.waiting import eventually
 
 
 @pytest.fixture
-def pair() -> Iterator[tuple[MemoryHub, TrafficMeter, MemoryBus]]:
-    hub = MemoryHub()
-    inner, other = MemoryBus(hub), MemoryBus(hub)
-    yield hub, TrafficMeter(inner), other
-    inner.close()
-    other.close()
+def pair(hub: MemoryHub) -> tuple[MemoryHub, TrafficMeter, MemoryBus]:
+    return hub, TrafficMeter(MemoryBus(hub)), MemoryBus(hub)
 
 
 def test_published_messages_are_received(pair) -> None:

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from contextlib import ExitStack, closing
 from typing import Any
 
 import pytest
@@ -18,34 +18,29 @@ from mapweave.hybridmap.errors import NotConnected
 from mapweave.wire import zenoh_bus, zenoh_config
 from mapweave.wire.bus import Sample
 from mapweave.wire.bus_settings import BusSettings
-from mapweave.wire.zenoh_bus import ZenohBus
 from mapweave.wire.zenoh_entities import Subscription
 from tests.waiting import eventually, free_port
-from tests.wire.fleets import ZenohFleet
+from tests.wire.fleets import Routers, ZenohFleet
 
 
-def test_a_client_may_come_before_its_router() -> None:
-    endpoints = (f"tcp/127.0.0.1:{free_port()}",)
+def test_a_client_may_come_before_its_router(routers: Routers) -> None:
+    port = free_port()
     begin = time.monotonic()
-    client = ZenohBus(BusSettings(endpoints=endpoints))
+    client = routers.client(port)
     got: list[Sample] = []
     client.subscribe("a", got.append)
     client.publish("a", b"lost")
     assert client.ask("a", b"", 60.0) == []
     assert not client.wait_connected(0.05)
     assert time.monotonic() - begin < 20
-    router = ZenohBus(BusSettings(mode="router", listen=endpoints))
-    try:
-        assert client.wait_connected(30)
-        eventually(lambda: router.publish("a", b"found") or got)
-        assert {s.payload for s in got} == {b"found"}
-    finally:
-        client.close()
-        router.close()
+    router = routers.router(port)
+    assert client.wait_connected(30)
+    eventually(lambda: router.publish("a", b"found") or got)
+    assert {s.payload for s in got} == {b"found"}
 
 
 def test_a_client_whose_session_breaks_while_it_declares_connects_again(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    routers: Routers, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     declare, broken = Subscription._declare_in, iter([True])
 
@@ -55,73 +50,48 @@ def test_a_client_whose_session_breaks_while_it_declares_connects_again(
         return declare(subscription, session)
 
     monkeypatch.setattr(Subscription, "_declare_in", declare_in)
-    endpoints = (f"tcp/127.0.0.1:{free_port()}",)
-    client = ZenohBus(BusSettings(endpoints=endpoints))
-    got: list[Sample] = []
-    client.subscribe("a", got.append)
-    router = ZenohBus(BusSettings(mode="router", listen=endpoints))
-    try:
-        eventually(lambda: router.publish("a", b"found") or got)
-        assert "the transport is closed; trying again" in caplog.text
-    finally:
-        client.close()
-        router.close()
+    port, got = free_port(), list[Sample]()
+    routers.client(port).subscribe("a", got.append)
+    router = routers.router(port)
+    eventually(lambda: router.publish("a", b"found") or got)
+    assert "the transport is closed; trying again" in caplog.text
 
 
-def test_all_questions_to_a_robot_are_one_declaration() -> None:
+def test_all_questions_to_a_robot_are_one_declaration(zenoh_fleet: ZenohFleet) -> None:
     """Eight made a third of what it cost a robot to connect beside 400 others."""
-    endpoints = (f"tcp/127.0.0.1:{free_port()}",)
-    router = ZenohBus(BusSettings(mode="router", listen=endpoints))
-    client = ZenohBus(BusSettings(endpoints=endpoints))
-    try:
-        assert client.wait_connected(30)
-        before = threading.active_count()
-        for what in ("mission", "mission/*", "drive", "portal", "portal/*", "status", "log/*", "view"):
-            client.serve(f"mapweave/1/fleet/agent/r1/{what}", lambda request: request.reply(b""))
-        # Zenoh has a thread for each that takes calls.
-        assert threading.active_count() == before + 1
-    finally:
-        client.close()
-        router.close()
+    client = zenoh_fleet.join()
+    before = threading.active_count()
+    for what in ("mission", "mission/*", "drive", "portal", "portal/*", "status", "log/*", "view"):
+        client.serve(f"mapweave/1/fleet/agent/r1/{what}", lambda request: request.reply(b""))
+    # Zenoh has a thread for each that takes calls.
+    assert threading.active_count() == before + 1
 
 
-def test_a_client_that_never_connects_closes_at_once() -> None:
-    client = ZenohBus(BusSettings(endpoints=(f"tcp/127.0.0.1:{free_port()}",)))
+def test_a_client_that_never_connects_closes_at_once(routers: Routers) -> None:
+    client = routers.client(free_port())
     begin = time.monotonic()
     client.close()
     assert time.monotonic() - begin < 5
 
 
-def test_a_taken_port_is_reported_in_one_line() -> None:
-    endpoints = (f"tcp/127.0.0.1:{free_port()}",)
-    first = ZenohBus(BusSettings(mode="router", listen=endpoints))
-    try:
-        with pytest.raises(NotConnected, match="the port is taken; stop the other server") as error:
-            ZenohBus(BusSettings(mode="router", listen=endpoints))
-        assert "\n" not in str(error.value)
-        assert endpoints[0] in str(error.value)
-    finally:
-        first.close()
+def test_a_taken_port_is_reported_in_one_line(zenoh_fleet: ZenohFleet) -> None:
+    with pytest.raises(NotConnected, match="the port is taken; stop the other server") as error:
+        zenoh_fleet.open_router()
+    assert "\n" not in str(error.value)
+    assert zenoh_fleet.endpoints[0] in str(error.value)
 
 
 @pytest.mark.slow
 @pytest.mark.waits
-def test_idle_connections_block_no_other() -> None:
+def test_idle_connections_block_no_other(routers: Routers) -> None:
     port = free_port()
-    endpoints = (f"tcp/127.0.0.1:{port}",)
-    router = ZenohBus(BusSettings(mode="router", listen=endpoints))
-    idle = [socket.create_connection(("127.0.0.1", port)) for _ in range(150)]
-    client = ZenohBus(BusSettings(endpoints=endpoints))
-    try:
+    routers.router(port)
+    with ExitStack() as stack:
+        idle = [stack.enter_context(socket.create_connection(("127.0.0.1", port))) for _ in range(150)]
         # With Zenoh's own limits it takes 10 s.
-        assert client.wait_connected(5.0)
+        assert routers.client(port).wait_connected(5.0)
         # Who says nothing is dropped.
         eventually(lambda: all(_is_closed(item) for item in idle))
-    finally:
-        client.close()
-        for item in idle:
-            item.close()
-        router.close()
 
 
 def _is_closed(connection: socket.socket) -> bool:
@@ -170,18 +140,11 @@ if {closes}:
     assert (finished.returncode, finished.stderr) == (0, "")
 
 
-@pytest.fixture
-def router_fleet() -> Iterator[ZenohFleet]:
-    fleet = ZenohFleet()
-    yield fleet
-    fleet.close()
-
-
 @pytest.mark.parametrize(("limit", "most"), [("MOST_REPLIES", 20), ("MOST_REPLY_BYTES", 20_000)])
 def test_replies_without_end_fill_no_memory(
     limit: str,
     most: int,
-    router_fleet: ZenohFleet,
+    zenoh_fleet: ZenohFleet,
     monkeypatch: pytest.MonkeyPatch,
     caplog: pytest.LogCaptureFixture,
 ) -> None:
@@ -193,7 +156,7 @@ def test_replies_without_end_fill_no_memory(
         request.abandon()
 
     monkeypatch.setattr(zenoh_bus, limit, most)
-    server, client = router_fleet.join(), router_fleet.join()
+    server, client = zenoh_fleet.join(), zenoh_fleet.join()
     log = f"mapweave/1/demo/agent/{limit.lower()}/log/1"
     server.serve(log, answer)
     server.serve("b", lambda request: request.reply(b"b"))
@@ -205,9 +168,9 @@ def test_replies_without_end_fill_no_memory(
     assert [reply.payload for reply in client.ask("b", b"", 5.0)] == [b"b"]
 
 
-def test_a_router_drops_what_is_too_large(router_fleet: ZenohFleet) -> None:
+def test_a_router_drops_what_is_too_large(zenoh_fleet: ZenohFleet) -> None:
     """From clients; the server's own answers, a whole map for example, are as large as they are."""
-    fleet = router_fleet
+    fleet = zenoh_fleet
     client, other = fleet.join(), fleet.join()
     got: list[int] = []
     fleet.router.subscribe("mapweave/x", lambda sample: got.append(len(sample.payload)))
@@ -233,15 +196,12 @@ def test_a_router_drops_what_is_too_large(router_fleet: ZenohFleet) -> None:
 def test_a_router_puts_no_message_together_that_is_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
     """What it drops for its kind it has first put together of its fragments, whatever they came to."""
     monkeypatch.setattr(zenoh_config, "LARGEST_MESSAGE", 2**19)
-    fleet = ZenohFleet()
-    try:
+    with closing(ZenohFleet()) as fleet:
         client = fleet.join()
         fleet.router.serve("mapweave/size", lambda request: request.reply(b"%d" % len(request.payload)))
         eventually(lambda: client.ask("mapweave/size", bytes(2**18), 5.0))
         assert client.ask("mapweave/size", bytes(zenoh_config.LARGEST["query"] - 1024), 1.0) == []
         eventually(lambda: client.ask("mapweave/size", bytes(2**18), 5.0))
-    finally:
-        fleet.close()
 
 
 FROZEN = """
@@ -255,9 +215,9 @@ bus.ask("mapweave/map", b"", 60.0)
 
 
 @pytest.mark.slow
-def test_a_client_that_stops_reading_does_not_hold_up_new_keys(router_fleet: ZenohFleet) -> None:
+def test_a_client_that_stops_reading_does_not_hold_up_new_keys(zenoh_fleet: ZenohFleet) -> None:
     """With 30 MB on their way to it, the router was closed for 16 s, and no one was answered for 17."""
-    fleet, asked = router_fleet, threading.Event()
+    fleet, asked = zenoh_fleet, threading.Event()
     live = fleet.join()
     process = subprocess.Popen([sys.executable, "-c", FROZEN, fleet.endpoints[0]])
 

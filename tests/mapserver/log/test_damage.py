@@ -26,15 +26,7 @@ from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store
 from mapweave.storage.map_file import read_map_file
 from mapweave.wire.codec import encode_body, encode_change
-from tests.mapserver.log.acknowledged_fleet import (
-    ROBOTS,
-    Fleet,
-    bodies_in,
-    flip,
-    journal_bodies,
-    life,
-    truth,
-)
+from tests.mapserver.log.acknowledged_fleet import ROBOTS, Fleet, bodies_in, flip, journal_bodies, life, truth
 from tests.quick import first_quick
 from tests.waiting import eventually, free_port
 

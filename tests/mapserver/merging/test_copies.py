@@ -23,11 +23,7 @@ from mapweave.scenarios.liar.lies import altered
 from mapweave.wire.codec import decode_change
 from synthetic.world import take_map
 from tests.mapserver.false_maps import FIRST, LAST, copies, driven
-from tests.mapserver.test_set_apart import (
-    TOUR,
-    WORLD,
-    sound_logs,
-)
+from tests.mapserver.test_set_apart import TOUR, WORLD, sound_logs
 
 
 def test_who_shares_landmarks_with_most_has_copied_them_if_nothing_else_tells() -> None:

@@ -204,12 +204,7 @@ def test_nodes_that_cannot_change_the_answer_are_not_examined(
 
     monkeypatch.setattr("mapweave.mapserver.relocalization.view_registration.examine_matches", counted)
     # No single candidate is enough: then every similar node is examined.
-    thorough = Relocalizer(
-        merger.places,
-        merger.node,
-        merger.merged(),
-        RelocalizationSettings(faint=0.0),
-    )
+    thorough = Relocalizer(merger.places, merger.node, merger.merged(), RelocalizationSettings(faint=0.0))
     quick, rng, counts = relocalizer(merger), np.random.default_rng(11), np.zeros(2, int)
     for stop in list(scene.truth.values())[::4]:
         view, _ = take_view(scene.world, stop @ Pose2(0.1, -0.1, 0.05), rng)

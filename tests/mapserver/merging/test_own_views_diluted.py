@@ -27,8 +27,7 @@ DRIVE, DECOYS, EDGES = 24, 100, 13
 
 
 @pytest.mark.parametrize(
-    ("seed", "landmarks"),
-    first_quick(product([5, 6, 7, 11, 12, 13], [LEAST_LANDMARKS - 1, 1]), 1),
+    ("seed", "landmarks"), first_quick(product([5, 6, 7, 11, 12, 13], [LEAST_LANDMARKS - 1, 1]), 1)
 )
 def test_nodes_with_few_landmarks_hide_no_wrong_depths(seed: int, landmarks: int) -> None:
     """With two of three keys of a store the map was not named any more."""
@@ -72,8 +71,7 @@ def _some(node: Node, count: int) -> Node:
 def _deeper(node: Node, by: float) -> Node:
     marks, factor = node.landmarks, np.float32(by)
     return replace(
-        node,
-        landmarks=replace(marks, depths=factor * marks.depths, depth_sigmas=factor * marks.depth_sigmas),
+        node, landmarks=replace(marks, depths=factor * marks.depths, depth_sigmas=factor * marks.depth_sigmas)
     )
 
 

@@ -175,12 +175,7 @@ def constrained(seed: int) -> ManualConstraints:
     said=st.integers(0, 7),
 )
 def test_a_follower_has_the_leaders_map_and_goes_on_from_it(
-    seed: int,
-    steps: list[int],
-    seen: list[bool],
-    late: list[int],
-    full: int,
-    said: int,
+    seed: int, steps: list[int], seen: list[bool], late: list[int], full: int, said: int
 ) -> None:
     """It misses merges, hears changes early, and takes over at last; beside it a leader that goes on."""
     results, changes = Results(), numbered(drives(seed))
@@ -219,9 +214,7 @@ def test_a_follower_has_the_leaders_map_and_goes_on_from_it(
 
 
 @pytest.fixture(scope="module")
-def handed_over(
-    tmp_path_factory: pytest.TempPathFactory,
-) -> tuple[Results, list[Change]]:
+def handed_over(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, list[Change]]:
     """A merge of the first changes, to be looked at only."""
     results, changes = Results(), numbered(drives(1))[:24]
     leader = Leader(results, tmp_path_factory.mktemp("leader") / "s0")

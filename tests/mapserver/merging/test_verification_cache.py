@@ -172,7 +172,7 @@ def test_a_damaged_index_is_built_again(
     path.write_bytes(bytes(data))
     settings = {
         # What large islands had decided was decided by other rules.
-        "merging": MergeSettings(exclusion=ExclusionSettings(doubt=0.01)),
+        "merging": MergeSettings(exclusion=ExclusionSettings(doubt=0.01))
     }
     if damage == "version":
         # Another version may compare by other rules.

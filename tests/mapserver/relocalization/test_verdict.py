@@ -91,9 +91,7 @@ def test_retrieval_is_not_asked_about_a_view_that_cannot_be_registered() -> None
     assert retrieve(VIEW, index, LEAST).ranked == [(NODE.id, 2.0)] and index.asked == 1
 
 
-def test_an_unknown_view_looks_like_places_with_a_turn_to_each(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_an_unknown_view_looks_like_places_with_a_turn_to_each(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(verdict, "ALONE", 1000)
     # Turned away by so much that some of the node's landmarks are still in the image.
     aside = take_view(WORLD, AT @ Pose2(0.05, 0.0, -0.35), np.random.default_rng(4))[0]

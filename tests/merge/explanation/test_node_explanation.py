@@ -390,11 +390,7 @@ def test_a_split_by_a_retired_map_names_the_person() -> None:
     [
         (NodeId("a", 1, 1), NodeId("a", 1, 1), "give two nodes"),
         (NodeId("z", 1, 1), NodeId("a", 1, 1), "there is no map z.1; known are: a.1, b.1, c.1"),
-        (
-            NodeId("a", 1, 99),
-            NodeId("a", 1, 1),
-            "of its 12 nodes the nearest are 17, 19, 21, 23",
-        ),
+        (NodeId("a", 1, 99), NodeId("a", 1, 1), "of its 12 nodes the nearest are 17, 19, 21, 23"),
     ],
 )
 def test_missing_nodes_cannot_be_explained(merged: MergedMap, a: NodeId, b: NodeId, words: str) -> None:

@@ -79,10 +79,7 @@ def test_odds_against_rays_marched_step_by_step() -> None:
                     ended |= length <= last + margin
             weight, odd = (rules.MISSED, (1 - rules.SCENERY) / rules.MISSED) if went_on else (1.0, 1.0)
             if ended and not went_on:
-                weight, odd = (
-                    (1 - rules.MISSED) / rules.SCENERY,
-                    rules.SCENERY / (1 - rules.MISSED),
-                )
+                weight, odd = ((1 - rules.MISSED) / rules.SCENERY, rules.SCENERY / (1 - rules.MISSED))
             numerator, denominator = numerator + weight * odd, denominator + weight
         # A draw on an edge may fall on either side of it.
         assert np.isclose(odds(seen)[0], numerator / denominator if denominator else 1.0, rtol=0.15)

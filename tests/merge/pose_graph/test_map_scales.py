@@ -18,14 +18,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
 from mapweave.merge.pose_graph.links import Link
-from mapweave.merge.pose_graph.map_scales import (
-    TAILS,
-    WHEELS,
-    LengthRatio,
-    MapScale,
-    MapScales,
-    combined,
-)
+from mapweave.merge.pose_graph.map_scales import TAILS, WHEELS, LengthRatio, MapScale, MapScales, combined
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.verification import verify
 from mapweave.merge.settings import ConsistencySettings
