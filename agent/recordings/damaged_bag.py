@@ -4,8 +4,6 @@ MCAP by its specification (https://mcap.dev/spec), ROS 1 by http://wiki.ros.org/
 SQLite files of ROS 2 by their rows in the order in which they were written.
 """
 
-from __future__ import annotations
-
 import io
 import sqlite3
 import struct
@@ -16,6 +14,7 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 from mapweave.agent.recordings.bounded_decompression import MOST_BYTES, limit_rosbags
+from mapweave.agent.ros_messages.values import TF_TYPE
 from mapweave.hybridmap.errors import DeviceError
 
 Item = tuple[int, str, str] | tuple[int, int, bytes]
@@ -31,11 +30,16 @@ ROS1_MESSAGE, ROS1_CHUNK, ROS1_CONNECTION = 0x02, 0x05, 0x07
 @cache
 def standard_messages(ros1: bool) -> Any:
     """The messages as ROS 1 or ROS 2 defines them; a type is compiled once, when it is first read."""
-    from rosbags.typesys import Stores, get_typestore
+    from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
     from mapweave.wire.ros2.messages import typestore
 
-    return get_typestore(Stores.ROS1_NOETIC) if ros1 else typestore()
+    if not ros1:
+        return typestore()
+    store = get_typestore(Stores.ROS1_NOETIC)
+    # The one type that is read here and missing in this store.
+    store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF_TYPE))
+    return store
 
 
 def full_type(kind: str) -> str:

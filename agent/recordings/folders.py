@@ -1,7 +1,5 @@
 """Folders as benchmarks publish them: KITTI odometry, EuRoC, TUM RGB-D, 4Seasons. No ground truth is read."""
 
-from __future__ import annotations
-
 import csv
 import re
 from collections.abc import Sequence
@@ -238,9 +236,11 @@ def _numbered_seconds(path: Path, images: Sequence[Path]) -> Stamps:
 
 
 def _yaml_list(folder: Path, text: str, name: str, count: int) -> list[float]:
-    """A list of numbers in a flat YAML file."""
-    path, found = folder / "sensor.yaml", re.search(rf"^{name}:\s*\[([^\]]*)\]", text, re.M)
-    values = [] if found is None else _numbers(path, found[1].replace(",", " ").split())
+    """A list of numbers in a flat YAML file, in brackets or with a line each."""
+    path = folder / "sensor.yaml"
+    found = re.search(rf"^{name}:\s*(?:\[([^\]]*)\]|((?:\n\s*-[^\n]*)+))", text, re.M)
+    words = [] if found is None else re.sub(r"^\s*-\s|,", " ", found[1] or found[2], flags=re.M).split()
+    values = _numbers(path, words)
     if len(values) != count:
         raise DeviceError(f"{path}: {name} must have {count} numbers")
     return values

@@ -1,7 +1,5 @@
 """The files of a folder of images: images/, times.txt, odometry.csv."""
 
-from __future__ import annotations
-
 import csv
 import math
 import re
@@ -12,12 +10,14 @@ from typing import Any
 
 import numpy as np
 
+from mapweave.agent.recordings.pose_files import CSV_COLUMNS
 from mapweave.agent.recordings.table_file import read_text, rows_of
 from mapweave.agent.recordings.toml_file import number
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.limits import MAX_STAMP_NS
 
 INCREMENT_COLUMNS = ("forward_m", "turn_rad")
+OR_POSES = f", or as poses {', '.join(CSV_COLUMNS)}"
 IMAGE_SUFFIXES = {".png", ".jpg", ".jpeg", ".pgm", ".bmp"}
 
 
@@ -126,7 +126,7 @@ def read_increments(path: Path, count: int) -> tuple[np.ndarray[Any, np.dtype[np
     text, damage = read_text(path)
     rows: list[tuple[float, float]] = []
     if text:
-        reader = rows_of(path, text.splitlines(), INCREMENT_COLUMNS)
+        reader = rows_of(path, text.splitlines(), INCREMENT_COLUMNS, OR_POSES)
         try:
             for row in reader:
                 values = number(row, "forward_m"), number(row, "turn_rad")

@@ -79,13 +79,14 @@ class TableRows(_Rows):
         return row
 
 
-def rows_of(path: Path, lines: Sequence[str], columns: Sequence[str]) -> TableRows:
+def rows_of(path: Path, lines: Sequence[str], columns: Sequence[str], otherwise: str = "") -> TableRows:
     """The rows of a table.
 
     Args:
         path: of the file, for the error.
         lines: of it.
         columns: that it must have; others are not read.
+        otherwise: what else such a file may have, for the error.
 
     Raises:
         DeviceError: it lacks a column or has one twice, or something else separates the columns.
@@ -106,4 +107,4 @@ def rows_of(path: Path, lines: Sequence[str], columns: Sequence[str]) -> TableRo
             f"{path}: columns are separated by {found!r}; separate them by commas, and write numbers with "
             "a point"
         )
-    raise DeviceError(f"{path}: no column {lacking[0]!r}; it must have {', '.join(columns)}")
+    raise DeviceError(f"{path}: no column {lacking[0]!r}; it must have {', '.join(columns)}{otherwise}")

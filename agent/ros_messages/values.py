@@ -1,7 +1,5 @@
 """Poses, cameras and mounts that ROS messages tell."""
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 
@@ -96,7 +94,9 @@ def camera_of(message: Any, rectified: bool = False) -> tuple[Camera, LensModel,
     if rectified:
         k, d, model = np.delete(p, [3, 7, 11]), d[:0], LensModel.RADIAL_TANGENTIAL
     if len(d) > 5 and np.any(d[5:]):
-        raise DeviceError(f"a lens of {len(d)} coefficients is not supported")
+        raise DeviceError(
+            f"a lens of {len(d)} coefficients is not supported; measure five: mapweave calibrate camera"
+        )
     count = 4 if model is LensModel.EQUIDISTANT else 5
     try:
         camera = Camera(int(message.width), int(message.height), k[0], k[4], k[2], k[5], 0.0)

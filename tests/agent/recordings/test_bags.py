@@ -28,11 +28,11 @@ from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.recordings import bag
 from mapweave.agent.recordings.camera_info_check import doubts
-from mapweave.agent.recordings.incomplete import Incomplete
+from mapweave.agent.recordings.incomplete import Incomplete, NoOdometry
 from mapweave.agent.recordings.mcap_writer import FLUSH_S, McapWriter
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions, RecordingSettings
-from mapweave.agent.ros_messages.values import Mount
+from mapweave.agent.ros_messages.values import Mount, camera_of
 from mapweave.cli import main
 from mapweave.exit_status import FAILED
 from mapweave.hybridmap.errors import DeviceError
@@ -43,6 +43,8 @@ STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
 KIDNAP = "irobot_create_msgs/msg/KidnapStatus"
 STORE.register(get_types_from_msg("std_msgs/Header header\nbool is_kidnapped", KIDNAP))
+TF = "tf2_msgs/msg/TFMessage"
+STORE1.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TF))
 
 
 def make(store: Any, name: str, **fields: Any) -> Any:
@@ -277,6 +279,33 @@ def test_the_longer_a_cut_bag_is_the_more_images_it_has(
         counts.append(check_prefix(path, drive))
     assert counts == sorted(counts) and counts[0] == 0
     assert counts[2] >= 0.5 * 0.6 * COUNT and counts[3] >= 0.6 * COUNT
+
+
+def test_a_cut_bag_of_ros1_still_says_where_the_camera_is(drive: Drive, tmp_path: Path) -> None:
+    """Without its index it is read by ROS 1's standard types, of which rosbags lacks that of tf."""
+    path = tmp_path / "drive.bag"
+    across = make(STORE1, "geometry_msgs/msg/Vector3", x=0.1, y=0.0, z=0.3)
+    ahead = make(STORE1, "geometry_msgs/msg/Quaternion", x=-0.5, y=0.5, z=-0.5, w=0.5)
+    held = make(
+        STORE1, "geometry_msgs/msg/TransformStamped", header=header(STORE1, BEGUN_NS, "base_link"),
+        child_frame_id="camera",
+        transform=make(STORE1, "geometry_msgs/msg/Transform", translation=across, rotation=ahead),
+    )  # fmt: skip
+    images = [image(STORE1, *each, "mono8") for each in zip(drive.stamps_ns, drive.images, strict=True)]
+    with Writer1(path) as writer:
+        for topic, kind, messages in (
+            ("/tf_static", TF, [make(STORE1, TF, transforms=[held])]),
+            ("/cam/camera_info", "sensor_msgs/msg/CameraInfo", [camera_info(STORE1, BEGUN_NS, drive)]),
+            ("/cam/image_raw", "sensor_msgs/msg/Image", images),
+        ):
+            opened = writer.add_connection(topic, kind, typestore=STORE1)
+            for message in messages:
+                writer.write(opened, BEGUN_NS, STORE1.serialize_ros1(message, kind))
+    path.write_bytes(path.read_bytes()[:-600])
+    with pytest.raises(NoOdometry) as found:
+        open_recording(path)
+    camera = found.value.recording.camera
+    assert (camera.mount_height, camera.mount_forward) == pytest.approx((0.3, 0.1))
 
 
 def test_poses_that_go_back_in_time_are_left_out_and_said(
@@ -530,3 +559,12 @@ def test_three_coefficients_of_distortion_are_named(
 def test_a_camera_that_does_not_look_ahead_is_named(mount: Mount | None, words: str) -> None:
     lines = doubts(SimpleNamespace(d=[0.0] * 3), mount)
     assert len(lines) == bool(words) and words in "".join(lines)
+
+
+def test_a_lens_of_eight_coefficients_is_refused_with_what_to_do(drive: Drive) -> None:
+    message = camera_info(STORE, BEGUN_NS, drive)
+    message.d, message.distortion_model = np.full(8, 0.1), "rational_polynomial"
+    with pytest.raises(
+        DeviceError, match="of 8 coefficients is not supported; measure five: mapweave calibrate"
+    ):
+        camera_of(message)

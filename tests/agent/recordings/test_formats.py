@@ -230,6 +230,32 @@ def test_a_fisheye_of_euroc_becomes_an_ideal_camera(drive: Drive, poses_file: Pa
         open_recording(tmp_path, options)
 
 
+def test_lists_of_sensor_yaml_may_have_a_line_each(drive: Drive, poses_file: Path, tmp_path):
+    euroc(drive, tmp_path)
+    sensor, options = (
+        tmp_path / "mav0" / "cam0" / "sensor.yaml",
+        RecordingOptions(odometry=poses_file, camera_height=0.3),
+    )
+    brackets = open_recording(tmp_path, options)
+    c = drive.camera
+    sensor.write_text(
+        f"intrinsics:\n- {c.fx}\n- {c.fy}\n- {c.cx}\n- {c.cy}\ndistortion_model: radial-tangential\n"
+        "distortion_coefficients:\n  - 0.0\n  - -1.0e-9\n  - 0.0\n  - 0.0\nresolution:\n- 320\n- 240\n"
+    )
+    lines = open_recording(tmp_path, options)
+    assert lines.camera == brackets.camera
+    assert lines.distortion == (0.0, -1e-9, 0.0, 0.0, 0.0)
+
+
+def test_a_table_of_other_columns_names_both_kinds_that_are_read(drive: Drive, tmp_path):
+    folder_with_poses(drive, tmp_path)
+    (tmp_path / "odometry.csv").write_text("timestamp,x,y,theta\n0.0,0.0,0.0,0.0\n")
+    with pytest.raises(
+        DeviceError, match="must have forward_m, turn_rad, or as poses stamp_s, x_m, y_m, head"
+    ):
+        open_recording(tmp_path)
+
+
 def test_without_odometry_nothing_is_guessed(drive: Drive, tmp_path):
     euroc(drive, tmp_path)
     with pytest.raises(DeviceError, match="EuRoC, 9 images, but no odometry: give --odometry FILE"):
