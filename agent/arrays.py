@@ -1,7 +1,5 @@
 """Small arrays, of which a tick handles hundreds: NumPy's own functions take most of their time to begin."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

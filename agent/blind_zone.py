@@ -7,8 +7,6 @@ nothing is remembered, the thing is not where the robot itself has just been. A 
 believes what it remembers until its sensors look through it, or until it is noticed: see `forget`.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ Space carving: a ray of light between the camera and a landmark meets nothing. L
 camera's height show that the floor before them is free at the height of the robot; higher ones show nothing.
 """
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -1,7 +1,5 @@
 """Driving without proximity sensors: slowly, and back from where something was touched."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How far the footprint may move, by the present ranger readings."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

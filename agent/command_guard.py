@@ -1,7 +1,5 @@
 """The guard over all behaviours: what of a command is safe by rangers, camera and bumper."""
 
-from __future__ import annotations
-
 import math
 
 from mapweave.agent.camera_occupancy import CameraOccupancyGrid

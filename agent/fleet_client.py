@@ -1,7 +1,5 @@
 """A robot's link to its fleet: status out, missions in, questions asked without waiting."""
 
-from __future__ import annotations
-
 import logging
 import math
 import queue

@@ -3,8 +3,6 @@
 `navigation/navigator.py` is what it does whose mission is a goal.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

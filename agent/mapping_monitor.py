@@ -4,8 +4,6 @@ Much of it the pipeline says itself (`Status.detail`). The rest is found here, f
 alone: images that show nothing, wheels and image of which only one moves, wheels that do not obey.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import replace
 from typing import NamedTuple

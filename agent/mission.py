@@ -1,7 +1,5 @@
 """Missions from an operator, and the pipeline's questions to the fleet: plain values."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from mapweave.agent.observation import Command

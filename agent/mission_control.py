@@ -5,8 +5,6 @@ stamps are too far apart; what is over stays over. All of it is on the disk befo
 robot that was switched off goes on.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Iterable, Sequence

@@ -1,7 +1,5 @@
 """Motion primitives: stand, turn, drive on, ask. Each is a generator that yields a command a tick."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator
 

@@ -9,8 +9,6 @@ r"""One robot's whole pipeline: observation in, command and map changes out. Rea
 It knows no network, no disk and no clock: live robots, recordings, simulation and tests run this very code.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Whether promised proximity sensors are read, and live: without them free room is unknown."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

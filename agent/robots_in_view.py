@@ -4,8 +4,6 @@ The fleet is asked where they are, and the robot does not wait for answers. With
 maps are not joined, nothing is known of them, and the whole image is used.
 """
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections.abc import Callable, Sequence

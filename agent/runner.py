@@ -1,7 +1,5 @@
 """The robot's loop: sense, plan, act. Connects the driver, the pipeline and the fleet."""
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

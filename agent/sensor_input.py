@@ -1,7 +1,5 @@
 """What a robot senses as its pipeline uses it: of a pinhole, calibrated, without what failed sensors say."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

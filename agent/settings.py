@@ -1,7 +1,5 @@
 """What a person sets of a robot's program: the part `[agent]` of a settings file."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated

@@ -5,8 +5,6 @@ the first. Within a few metres the drift is small: what the rangers see on such 
 piece that is fixed to a node (Hess, Kohler, Rapp, Andor: Real-time loop closure in 2D lidar SLAM, ICRA 2016).
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace

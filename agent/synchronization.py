@@ -1,7 +1,5 @@
 """What a robot's loop waits for between ticks: nothing on a robot, everything in a repeatable simulation."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Teleoperation, the robot's side: a person's newest velocity command, and what it is worth now."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What people say about a map, one typed method for each kind; the same for a fleet and for a file."""
 
-from __future__ import annotations
-
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping, Sequence

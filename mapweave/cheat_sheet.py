@@ -1,7 +1,5 @@
 """The page docs/cheat-sheet.md: `python -m mapweave.cheat_sheet > docs/cheat-sheet.md`; a test compares."""
 
-from __future__ import annotations
-
 import argparse
 
 from mapweave.cli import parser

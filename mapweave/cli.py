@@ -1,7 +1,5 @@
 """The command line: `mapweave COMMAND`."""
 
-from __future__ import annotations
-
 import argparse
 import logging
 import os

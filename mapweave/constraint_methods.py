@@ -1,7 +1,5 @@
 """Manual constraints from Python, of a file and of a fleet: links by hand, links undone, what is retired."""
 
-from __future__ import annotations
-
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Exit statuses: the same of every command. docs/cheat-sheet.md lists them."""
 
-from __future__ import annotations
-
 DONE = 0
 FAILED = 1
 USAGE = 2

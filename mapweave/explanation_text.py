@@ -1,7 +1,5 @@
 """Explanations as words for people, and as plain values for programs."""
 
-from __future__ import annotations
-
 import math
 import textwrap
 from collections.abc import Mapping, Sequence

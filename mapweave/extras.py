@@ -1,7 +1,5 @@
 """The extras of the package: libraries that a plain installation leaves out, and who needs them."""
 
-from __future__ import annotations
-
 import shlex
 import shutil
 import sys

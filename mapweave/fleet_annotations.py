@@ -1,7 +1,5 @@
 """Annotations from Python: what people say about the map, floor plans among it, and nodes for words."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable
 

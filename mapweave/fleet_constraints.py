@@ -1,7 +1,5 @@
 """Manual constraints of a running fleet, from Python."""
 
-from __future__ import annotations
-
 from mapweave.constraint_methods import ConstraintMethods
 from mapweave.fleet_annotations import ANSWER, FleetAnnotations
 from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint

@@ -1,7 +1,5 @@
 """What happens in a fleet, one event after the other, as it happens."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time

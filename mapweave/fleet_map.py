@@ -1,7 +1,5 @@
 """The merged map of a running fleet: fetched, asked about, and what becomes of it."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

@@ -1,7 +1,5 @@
 """Asking a fleet's servers and robots."""
 
-from __future__ import annotations
-
 from mapweave.connection import ANSWERED, no_server, router_gone, server_statuses
 from mapweave.hybridmap.errors import InvalidValue, NotConnected, Refused
 from mapweave.wire.bus import Bus, Reply

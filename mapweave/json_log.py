@@ -1,7 +1,5 @@
 """The log as one JSON object a line, for programs that collect logs. The standard library alone."""
 
-from __future__ import annotations
-
 import json
 import logging
 from datetime import UTC, datetime

@@ -1,7 +1,5 @@
 """Who corrects and annotates, for records."""
 
-from __future__ import annotations
-
 import getpass
 
 

@@ -4,8 +4,6 @@ A process learns that its terminal is gone by a signal, which a thread that prin
 does not come to a job that its shell has disowned or that ignores it: such a job goes on.
 """
 
-from __future__ import annotations
-
 import errno
 import io
 import logging

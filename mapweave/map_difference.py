@@ -1,7 +1,5 @@
 """What is different between two maps, for example before and after a merge."""
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """Annotations of a map without a server: by the shell (`--map`) and from Python the same."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 

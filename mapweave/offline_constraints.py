@@ -1,7 +1,5 @@
 """Manual constraints of a map without a server: by the shell (`--map`) and from Python the same."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

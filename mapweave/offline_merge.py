@@ -1,7 +1,5 @@
 """Merging map files without a server: the same merge on the same bytes."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field

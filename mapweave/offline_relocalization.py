@@ -1,7 +1,5 @@
 """Where an image was taken, by a map file alone: no server, no network."""
 
-from __future__ import annotations
-
 import faiss  # noqa: F401, where it is missing this says so before a map is read
 
 from mapweave.mapserver.active_nodes import ActiveNodes

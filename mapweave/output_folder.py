@@ -1,7 +1,5 @@
 """The folder that results go to: whether it can be made is known before minutes are spent on them."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

@@ -6,8 +6,6 @@ states, so each depth, and each way between nodes, carries the uncertainty of th
 drives along finds the scale by its wheels.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Sequence

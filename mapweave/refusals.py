@@ -1,7 +1,5 @@
 """What a map says to what is asked of it without a server: the same errors as a server's."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar

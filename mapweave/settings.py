@@ -1,7 +1,5 @@
 """Settings: a TOML file into the parts' own dataclasses. Defaults work; errors in one line."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

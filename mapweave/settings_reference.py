@@ -1,7 +1,5 @@
 """All settings with their defaults, units and ranges: as a TOML file, and as the page `docs/settings.md`."""
 
-from __future__ import annotations
-
 import dataclasses
 import inspect
 import json

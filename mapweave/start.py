@@ -3,8 +3,6 @@
 Ctrl-C is one line, and so is an output that cannot be written.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 

@@ -1,7 +1,5 @@
 """The features of an image, with which a robot or a person asks. The base installation has all for it."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

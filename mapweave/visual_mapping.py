@@ -6,8 +6,6 @@ two windows share, so that one scale goes through. Where keyframes show nothing 
 has no depth (a turn on the spot, a blank wall, a cut), a map ends and the next one begins.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field

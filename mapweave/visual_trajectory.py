@@ -6,8 +6,6 @@ keyframes are, and set upright. An image in which too few of them are left lies 
 neighbours.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """People and boxes that move about: solid to robots and their rangers, textured to their cameras."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Setup of a robot's camera: intrinsics, lens, shutter, noise; and some named cameras."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Annotated, Any

@@ -1,7 +1,5 @@
 """Executes events on a stage and its robots."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Events of a simulated world and its robots, made from tables of a scenario file."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any

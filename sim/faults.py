@@ -1,7 +1,5 @@
 """Sensors that fail for a while: what they then return instead of the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Placement of furniture such that robots reach every place and get stuck nowhere."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace

@@ -3,8 +3,6 @@
 The questions of `mapweave.sim.ground_truth_messages`, as methods.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from typing import Any, TypeVar
 

@@ -3,8 +3,6 @@
 A question is a MessagePack map with the operation in `op`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated, Any
 

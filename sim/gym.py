@@ -6,8 +6,6 @@
 Gymnasium is an extra: `pip install 'mapweave[gym]'`.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Noise fields: the grain of plaster and wood, and clouds."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -1,7 +1,5 @@
 """Images of a robot's camera: the ideal picture, distorted, blurred, exposed, and noisy."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Keys of the simulator; `wire` has those of robots and servers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from mapweave.hybridmap.ids import check_name

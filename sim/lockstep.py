@@ -4,8 +4,6 @@ A robot is *active* from its first step on, until its agent is gone or it keeps 
 long. A tick is due when every active robot has asked for one.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, field

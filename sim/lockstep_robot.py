@@ -1,7 +1,5 @@
 """A robot of the simulation whose agent can wait for the other robots: what repeatable runs need."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

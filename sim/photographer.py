@@ -1,7 +1,5 @@
 """A person walks through a world before the robots start, and takes photographs of the way."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """PyBullet without its global state: one object is one physics, and its calls go there."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import os

@@ -1,7 +1,5 @@
 """Where in a building robots start or can be put, and where a person can walk."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from itertools import pairwise

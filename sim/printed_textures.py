@@ -1,7 +1,5 @@
 """Printed matter: what hangs on walls and is stuck on furniture. Each picture is unlike every other."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Proximity sensors: rays in the physics, of all robots in one question."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

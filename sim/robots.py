@@ -1,7 +1,5 @@
 """Setup of a simulated robot, made from the tables of a scenario file."""
 
-from __future__ import annotations
-
 import dataclasses
 import math
 from collections.abc import Mapping, Sequence

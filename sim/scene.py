@@ -1,7 +1,5 @@
 """All panels of a moment in columns, with what the renderer needs of each."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

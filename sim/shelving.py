@@ -1,7 +1,5 @@
 """Warehouse racks full of cartons: few designs, used again and again."""
 
-from __future__ import annotations
-
 import functools
 import itertools
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Signs, and doors with numbers."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

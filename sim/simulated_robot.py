@@ -1,7 +1,5 @@
 """One simulated robot: its body, its camera, its rangers, and their faults."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """The simulation at one moment, for film and live view."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """What surrounds the robots: solids in the physics, panels in the scene, people that come and go."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

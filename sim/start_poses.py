@@ -1,7 +1,5 @@
 """Where robots start: spread over the rooms, clear of walls and of one another."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

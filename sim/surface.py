@@ -1,7 +1,5 @@
 """Painters of whole surfaces: walls, furniture, floors. `mapweave.sim.worlds.light` shines on them."""
 
-from __future__ import annotations
-
 import itertools
 
 import cv2

@@ -1,7 +1,5 @@
 """A flat texture as it is seen at a slant, filtered for its size there."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

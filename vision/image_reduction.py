@@ -1,7 +1,5 @@
 """Large images are reduced, with their camera: SIFT takes time in proportion to the area."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import NamedTuple

@@ -5,8 +5,6 @@ below which its camera stands sideways. So a camera that looks a little aside or
 lens; its principal point moves by as much as its pixels, so that images stay where they are.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """What the wheels have counted while a robot maps, kept only where image pairs ask for it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What a drive tells of its geometry, and how surely."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 

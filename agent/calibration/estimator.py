@@ -7,8 +7,6 @@ on rails gets a false sigma. Gauss-Newton with pairs weighted by Student's t; th
 the model's and of what blocks of pairs scatter (sandwich), because slip has a memory that the model has not.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

@@ -8,8 +8,6 @@ driven over yet, or lies aside, is seen from the nearest place all the same, and
 unknown (`floor_scale.py`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

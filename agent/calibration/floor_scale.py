@@ -5,8 +5,6 @@ there to where they lie the floor has a slope, one in each pair: of a road ahead
 what lies aside in a curve, of a vehicle that pitches on its springs.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ monocular SFM, 2014) measure the height over the road; tiles leave it to `floor_
 floor.
 """
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -1,7 +1,5 @@
 """Image pairs of a drive: corners followed by Lucas-Kanade until the view has moved enough."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -5,8 +5,6 @@ seconds. No tick does two of these: a solution comes two ticks after the pair th
 drive shows and contradicts the geometry in use is said once, in one line, and used from the next node on.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

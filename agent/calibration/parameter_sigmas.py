@@ -1,7 +1,5 @@
 """What is known of the parameters beforehand, what of them matters, and how well they can be estimated."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -9,8 +9,6 @@ the counted way: whatever the angle, the reading changes by the way alone while 
 Camera and floor cannot tell a wrong scale from a wrong height of the camera; this is a length of its own.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Calibration from a whole drive: image pairs, wheels, and whether the drive is one to learn from."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

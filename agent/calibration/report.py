@@ -1,7 +1,5 @@
 """Estimates in words: a table, and which parameter is likely to be declared wrongly."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

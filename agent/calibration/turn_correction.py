@@ -7,8 +7,6 @@ all tracks, and with the newest estimate of the geometry. How noisy the filter i
 that is estimated from how far the two are apart (expectation maximisation).
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Any two-wheeled robot with a microcontroller and the text protocol of docs/arduino.md."""
 
-from __future__ import annotations
-
 import math
 import re
 import time

@@ -1,7 +1,5 @@
 """Mistakes of a driver's author as errors of one line: what its code raises, and what its base gives."""
 
-from __future__ import annotations
-
 import math
 import traceback
 from numbers import Real

@@ -1,7 +1,5 @@
 """Protocol of a robot base: two wheels and proximity sensors behind a serial or network line."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import NamedTuple, Protocol
 

@@ -3,8 +3,6 @@
 For a Raspberry Pi's own camera see docs/robot.md.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import re

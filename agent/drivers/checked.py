@@ -1,7 +1,5 @@
 """Checks the output of a driver; each mistake is an error of one line at the first observation."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time

@@ -1,7 +1,5 @@
 """One agent per robot: a second agent of the same name, or at the same topic, moves nothing."""
 
-from __future__ import annotations
-
 import secrets
 import threading
 import time

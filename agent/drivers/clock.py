@@ -1,7 +1,5 @@
 """Clock for stamps: nanoseconds since 1970, without steps when the system clock is set."""
 
-from __future__ import annotations
-
 import time
 
 _EPOCH_NS = time.time_ns() - time.monotonic_ns()

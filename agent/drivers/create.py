@@ -1,7 +1,5 @@
 """iRobot Create 2 and Roomba 500 to 900 over the serial Open Interface."""
 
-from __future__ import annotations
-
 import math
 import struct
 import time

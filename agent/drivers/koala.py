@@ -1,7 +1,5 @@
 """K-Team Koala over RS-232. Its two generations share the form of commands, not their letters or units."""
 
-from __future__ import annotations
-
 import math
 import re
 import time

@@ -6,8 +6,6 @@
 A base refuses with a reason. Two reasons are part of the protocol: ENDED and AGAIN.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Annotated

@@ -1,7 +1,5 @@
 """A robot whose observations and commands are written down on the way."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

@@ -7,8 +7,6 @@ entry points:
     rover = "my_package.rover:Rover"
 """
 
-from __future__ import annotations
-
 import difflib
 import importlib
 import importlib.util

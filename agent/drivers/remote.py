@@ -1,7 +1,5 @@
 """A robot whose base is behind the bus: the simulator, or a computer on a real robot."""
 
-from __future__ import annotations
-
 import logging
 import secrets
 import threading

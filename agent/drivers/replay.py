@@ -4,8 +4,6 @@ What formats there are stands in `mapweave.agent.recordings.opening`. `splits.to
 into robots. Ground truth is for scoring and is never read here.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

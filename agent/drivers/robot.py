@@ -3,8 +3,6 @@
 SI units and radians throughout. `docs/drivers.md` explains how to write a driver.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Protocol
 

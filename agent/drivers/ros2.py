@@ -1,7 +1,5 @@
 """Robots that speak ROS 2, over rmw_zenoh or zenoh-bridge-ros2dds; this computer needs no ROS."""
 
-from __future__ import annotations
-
 import logging
 import math
 import time

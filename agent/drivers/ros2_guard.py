@@ -1,7 +1,5 @@
 """The wheel guard of a robot behind ROS 2 topics: a process with a Zenoh session of its own."""
 
-from __future__ import annotations
-
 import json
 import secrets
 import subprocess

@@ -1,7 +1,5 @@
 """The way of the wheels from ROS messages: Odometry, JointState, or the Create 3's WheelTicks."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Free distances around the robot from ROS messages: LaserScan, Range, or the Create 3's infrared sensors."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any

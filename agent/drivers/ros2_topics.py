@@ -1,7 +1,5 @@
 """Topics of a robot: the newest message of each, decoded when it is wanted."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """A base that is asked in lines of text over a serial port: what drivers of such boards share."""
 
-from __future__ import annotations
-
 import contextlib
 import time
 from abc import ABC, abstractmethod

@@ -1,7 +1,5 @@
 """Serial port for drivers: reads with a time limit, errors as one line of text."""
 
-from __future__ import annotations
-
 import contextlib
 import termios
 import time

@@ -1,7 +1,5 @@
 """Writes `[robot.camera]` into a robot's settings file; all else in the file stays as it is."""
 
-from __future__ import annotations
-
 import json
 import re
 import tomllib

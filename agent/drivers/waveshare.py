@@ -1,7 +1,5 @@
 """Waveshare UGV (Rover, Beast, RaspRover): JSON in lines over the serial port, or one at a time over HTTP."""
 
-from __future__ import annotations
-
 import contextlib
 import errno
 import http.client

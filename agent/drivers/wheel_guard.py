@@ -5,8 +5,6 @@ command that moves the robot and `0` for each that does not. It writes the stop 
 output, the port, when nothing was read for a while after a `1`, and when its input ends.
 """
 
-from __future__ import annotations
-
 import contextlib
 import os
 import select

@@ -1,7 +1,5 @@
 """A robot made of a base and a camera, with odometry at the time of each image and no blocking calls."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

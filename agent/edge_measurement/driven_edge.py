@@ -4,8 +4,6 @@ It is kept beside the other edges between the two nodes and replaces none of the
 other means, and can be checked against each other (docs/decisions/driven-edges.md).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Refinement of a node's landmarks: drives past them measure their depths more precisely."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

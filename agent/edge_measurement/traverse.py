@@ -4,8 +4,6 @@ At a hand-over the robot is localized by the landmarks of one node, and a moment
 two poses of the same robot measure the relative pose of the two nodes.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

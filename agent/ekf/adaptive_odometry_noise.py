@@ -1,7 +1,5 @@
 """Odometry noise of the mapping filter: larger for a while after an image has refuted the wheels."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapweave.agent.ekf.motion import WheelNoise

@@ -1,7 +1,5 @@
 """What holds the mapping filter's estimate up, watched from step to step."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 

@@ -5,8 +5,6 @@ of all innovations of an image, W = L^-1 whitens them and serves everything: W^T
 leave-one-out tests, |W r|^2 the NIS, W B the sensitivity to the wheels' errors, and W P_M the update's root.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

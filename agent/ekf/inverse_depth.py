@@ -6,8 +6,6 @@ b is fixed, which the node's image measures: the height of a landmark of uncerta
 slope is known to a pixel (docs/decisions/ekf-localization.md).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The iterated update: linearise again where the first linearisation did not hold."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The localization filter: pose in a node's frame and the node's landmarks, 3 + 2n (paper section 6)."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

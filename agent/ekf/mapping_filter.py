@@ -5,8 +5,6 @@ depth: the image measures a and b directly, and a landmark of unknown depth is a
 sigma of w (docs/decisions/ekf-parametrisation.md).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

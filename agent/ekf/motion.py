@@ -13,8 +13,6 @@ gets, all in closed form and without a pole at w = 0 (a landmark at infinity),
     a' = (sin u2 (1 - tx w) + cos u2 (a + ty w)) / D,   b' = b / D,   w' = w / D.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ the same direction, and precise landmarks then fail each other's gates, or refut
 from wrong landmarks and wheels in one way: no motion in the plane moves everything up.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """How uncertain the slopes of an image are: nominal, or more after images have shown so for a while."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapweave.hybridmap.pose import Array

@@ -1,7 +1,5 @@
 """Landmarks from tracks that no filter carries, given the trajectory that a filter found."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

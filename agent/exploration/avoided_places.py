@@ -1,7 +1,5 @@
 """Places that an exploring robot could not reach, and when it tries each of them again."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The moves of exploration: map the view ahead, turn to the next one, travel along a way."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator, Iterator
 from enum import StrEnum

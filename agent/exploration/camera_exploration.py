@@ -1,7 +1,5 @@
 """Exploration by the camera alone: on floor that was driven over or seen to be free."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Mapping while a person moves the robot: when to make a node."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

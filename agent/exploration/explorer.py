@@ -1,7 +1,5 @@
 """Exploration: map each view around a place by driving back and forth, travel to the next place."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator, Iterator
 

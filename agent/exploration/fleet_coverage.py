@@ -1,7 +1,5 @@
 """What other robots have mapped nearby, by the fleet's map."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapweave.agent.exploration.viewpoint_selection import seen_around

@@ -1,7 +1,5 @@
 """Random exploration, as in the paper."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 

@@ -1,7 +1,5 @@
 """Viewpoints: which places are covered, and where to make the next full turn."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 

@@ -1,7 +1,5 @@
 """Sources of place candidates for a view: the robot's own map, and the fleet's."""
 
-from __future__ import annotations
-
 from collections.abc import Generator
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ a goal and a robot that is to map on use the same search: the first needs one re
 agree; see `SearchPolicy`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator
 from dataclasses import dataclass

@@ -7,8 +7,6 @@ been, two that agree from 1; in offices 36 of 37 places that were recognised by 
 two.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Places of the fleet's map that the robot's own view did not bear out: they are not tried again at once."""
 
-from __future__ import annotations
-
 import math
 
 from mapweave.agent.global_localization.pose_consistency import OTHER_VIEW

@@ -1,7 +1,5 @@
 """Resumption of a map: global localization on the own map alone, tick by tick, for a robot that maps."""
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

@@ -10,8 +10,6 @@ count as one certain answer if
 Both are chi-square tests of the same difference, with the answers' covariances and the wheels'.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

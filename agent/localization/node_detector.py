@@ -1,7 +1,5 @@
 """Detection of nodes whose landmarks should be in view."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Where the robot is with respect to one node: recognised by SIFT, then tracked and filtered."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

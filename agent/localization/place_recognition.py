@@ -1,7 +1,5 @@
 """Recognising places of the robot's own map, without any server."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The anchored keyframe: the node that an episode has made or recognised, and the anchor relative to it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A mapping episode as behaviours see it, and what they may ask for. They never change the map themselves."""
 
-from __future__ import annotations
-
 from enum import Enum, auto
 from typing import Protocol
 

@@ -1,7 +1,5 @@
 """Image acceptance: which images are new, and which are accepted."""
 
-from __future__ import annotations
-
 import copy
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Depths with which tracks come into the mapping filter."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

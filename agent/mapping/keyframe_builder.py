@@ -1,7 +1,5 @@
 """Views become nodes, and what joins them becomes edges."""
 
-from __future__ import annotations
-
 import logging
 from collections import deque
 from collections.abc import Callable, Sequence

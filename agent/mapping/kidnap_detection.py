@@ -6,8 +6,6 @@ points were found again from frame to frame, a third where a person walked past 
 wall faded. After a kidnapping it was at most 8 %, or 30 % where the same wall was still ahead.
 """
 
-from __future__ import annotations
-
 from enum import Enum, auto
 
 import cv2

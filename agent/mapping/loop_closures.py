@@ -1,7 +1,5 @@
 """Loop closures: earlier places of the own map that a new node shows (paper, section 5)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

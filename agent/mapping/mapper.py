@@ -1,7 +1,5 @@
 """Mapping: observations in, nodes and edges out. Who drives, explorer or person, is not its business."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 

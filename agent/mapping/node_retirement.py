@@ -6,8 +6,6 @@ as with a server. A fleet's server marginalises such a node first; only what it 
 retire, so a node that people have named stays, and so does what it measured.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Container
 

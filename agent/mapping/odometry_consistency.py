@@ -7,8 +7,6 @@ the next ones correct it: the contradiction must last. And a camera that stands 
 assumed moves otherwise in turns: that is no dispute while calibration is about to find it out.
 """
 
-from __future__ import annotations
-
 import math
 
 from mapweave.agent.observation import Odometry

@@ -1,7 +1,5 @@
 """Where the nodes of a map lie as seen from one of them, and how far away they are, over its edges."""
 
-from __future__ import annotations
-
 import heapq
 import math
 

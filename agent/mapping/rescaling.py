@@ -7,8 +7,6 @@ each edge (Strasdat et al., Scale drift-aware large scale monocular SLAM, RSS 20
 saw has a scale of its own.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Tracks and the mapping filter together: what ties the robot's motion to what it sees."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

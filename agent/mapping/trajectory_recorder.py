@@ -1,7 +1,5 @@
 """What the robot keeps of its way between two nodes, for those who ask where it was when."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapweave.agent.mapping.way_correction import scaled

@@ -1,7 +1,5 @@
 """Views: images that will become nodes once their landmarks are known."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -6,8 +6,6 @@ between them, on where the goal is bear each other out as well. Several refuted 
 out of all proportion to its route, end the mission: no answer makes a robot drive for ever.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

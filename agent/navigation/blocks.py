@@ -1,7 +1,5 @@
 """Where the robot could not drive, as pairs of nodes and as places; each is forgotten after a while."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from mapweave.agent.settings import NavigatorSettings

@@ -1,7 +1,5 @@
 """When a goal is given up: how long the robot has not got on, and what keeps it from its goal."""
 
-from __future__ import annotations
-
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.hybridmap.ids import NodeId
 

@@ -1,7 +1,5 @@
 """Driving to a position between nodes: around what the rangers have seen on the way."""
 
-from __future__ import annotations
-
 import heapq
 import math
 

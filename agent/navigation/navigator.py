@@ -1,7 +1,5 @@
 """Navigation: localize, get a route, follow it, and again if the robot gets lost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Generator
 from dataclasses import replace
 from enum import StrEnum

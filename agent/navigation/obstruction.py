@@ -1,7 +1,5 @@
 """What keeps a robot from its next node: where it is, and which robot it is."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ It is a kidnapping that is announced: the robot knows on which floor it must be,
 that. Only then does it believe that it was taken through.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from mapweave.agent.settings import PortalSettings

@@ -1,7 +1,5 @@
 """Where a robot with a goal is: it searches on its own map and on the fleet's, and gets a fix on a node."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Generator
 

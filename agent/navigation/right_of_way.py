@@ -3,8 +3,6 @@
 Without an answer the robot drives on: its rangers keep it from touching anything, as without a server.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from enum import StrEnum
 

@@ -1,7 +1,5 @@
 """Following one route: servo to visible nodes, drive to the others, park at the last."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Ways to a goal: the fleet's map is asked; without its answer the own map leads the way."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Generator, Iterator
 from dataclasses import replace

@@ -3,8 +3,6 @@
 A file of 6 kB, packed by bzip2, unpacked to 3 GB, and took 70 s.
 """
 
-from __future__ import annotations
-
 import bz2
 import io
 import os

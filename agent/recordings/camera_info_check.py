@@ -1,7 +1,5 @@
 """What of a camera by ROS, its CameraInfo and its mount by tf, is not used or can hardly be right."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

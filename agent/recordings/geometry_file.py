@@ -3,8 +3,6 @@
 See docs/calibrate-drive.md for the keys.
 """
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Recordings that lack something: what a person can give, and what can be done without it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What a robot has learned of its geometry, in a TOML file that people can read, and delete to forget it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import asdict
 from datetime import date

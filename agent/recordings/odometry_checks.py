@@ -1,7 +1,5 @@
 """What cannot be right in recorded odometry: steps that nothing has driven, headings against the way."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which format a recording has, and the way to open it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

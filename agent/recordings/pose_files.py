@@ -1,7 +1,5 @@
 """Odometry in files: stamped poses as CSV with a header, or lines as TUM's benchmark and evo write them."""
 
-from __future__ import annotations
-
 import csv
 import math
 from pathlib import Path

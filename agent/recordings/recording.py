@@ -1,7 +1,5 @@
 """What every format of a recording is read as: images with stamps, and the wheels' way between them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """splits.toml: the robots into which a recording is cut."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """TOML files of recordings: a camera, a robot's geometry, the robots into which a recording is cut."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Trajectories as TUM's benchmark and evo read them: `stamp x y z qx qy qz qw`, s and m, one pose a line."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager

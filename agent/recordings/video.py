@@ -1,7 +1,5 @@
 """A plain video file, with odometry in a file of its own."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Callable

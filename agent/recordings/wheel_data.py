@@ -1,7 +1,5 @@
 """How a robot's wheels err, in the `custom_data` of a bag's metadata.yaml: no standard message has it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 

@@ -5,8 +5,6 @@ for servers of a large fleet, or behind a slow link: beacons for changes that ar
 later still.
 """
 
-from __future__ import annotations
-
 GAIN, DEVIATION_GAIN = 1 / 8, 1 / 4
 """Weights of the newest measurement in the mean time and in its mean deviation (RFC 6298, 2.3)."""
 DEVIATIONS = 4

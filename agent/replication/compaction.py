@@ -1,7 +1,5 @@
 """What a log need no longer say because nodes or edges were retired."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from mapweave.agent.replication.log_entry import LogEntry

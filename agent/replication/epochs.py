@@ -1,7 +1,5 @@
 """Numbers of maps (epochs): small ones that people can read and type, and none that is taken already."""
 
-from __future__ import annotations
-
 import secrets
 import time
 from collections.abc import Collection

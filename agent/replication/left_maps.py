@@ -5,8 +5,6 @@ rest to other maps: a server that has lost its store could not place the rest wi
 (docs/decisions/pruning.md has the figures).
 """
 
-from __future__ import annotations
-
 import logging
 import queue
 import threading

@@ -1,7 +1,5 @@
 """One change of a log as a journal has kept it."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 from mapweave.hybridmap.change import ChangeBody

@@ -4,8 +4,6 @@ They are kept beside the map and change nothing in it. Messages may be lost; eac
 precede it, and where one is missing all poses are asked for.
 """
 
-from __future__ import annotations
-
 import logging
 import queue
 import threading

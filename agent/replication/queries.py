@@ -1,7 +1,5 @@
 """Questions to the map server and their answers as messages."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace

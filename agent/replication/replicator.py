@@ -6,8 +6,6 @@ beacon, which tells servers how long the log is, and the log itself, which answe
 for every map in the journal: one that was left for a fresh map before a server had it is still handed over.
 """
 
-from __future__ import annotations
-
 import logging
 import queue
 import threading

@@ -1,7 +1,5 @@
 """What can still be read of a journal, also of one that no agent can open any more."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass

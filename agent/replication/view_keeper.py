@@ -4,8 +4,6 @@ One thread does all work with the disk. The robot's loop hands images over and n
 the disk has no time is left out. A missing or damaged file means that the node has no image, nothing more.
 """
 
-from __future__ import annotations
-
 import logging
 import queue
 import threading

@@ -1,7 +1,5 @@
 """Images of ROS messages as grey arrays."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

@@ -1,7 +1,5 @@
 """The agent's values as ROS messages."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

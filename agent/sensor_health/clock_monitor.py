@@ -1,7 +1,5 @@
 """Whether the clock of the observations goes on as time does."""
 
-from __future__ import annotations
-
 STANDS = 0.5
 """s for which stamps may stay the same."""
 AHEAD = 10.0

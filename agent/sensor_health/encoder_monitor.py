@@ -6,8 +6,6 @@ the robot has moved at all (`visual_odometry`). It is looked at only where wheel
 other, or where the image stands while the wheels count.
 """
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from itertools import pairwise

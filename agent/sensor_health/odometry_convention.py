@@ -5,8 +5,6 @@ or a recording and does not change on the way. So it is held against the image o
 agree with one convention.
 """
 
-from __future__ import annotations
-
 import math
 from collections import defaultdict
 from collections.abc import Mapping

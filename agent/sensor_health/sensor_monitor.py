@@ -1,7 +1,5 @@
 """All sensors of a robot: which cannot be believed, and the small turn that shows whether it can again."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from typing import NamedTuple

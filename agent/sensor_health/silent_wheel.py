@@ -4,8 +4,6 @@
 stand: a robot can turn about it. Then the image turns as the wheels say.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -3,8 +3,6 @@
 The unit of the turns does not matter here, only their correlation over pairs of images.
 """
 
-from __future__ import annotations
-
 from collections import deque
 
 import numpy as np

@@ -4,8 +4,6 @@ Fox, Burgard and Thrun, "The dynamic window approach to collision avoidance", 19
 tried against accelerations, as the robot is slow and its stopping distance is counted by the guard.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

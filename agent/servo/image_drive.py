@@ -1,7 +1,5 @@
 """The exploration drive of the paper: forth and back, features kept in view, obstacles kept away."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

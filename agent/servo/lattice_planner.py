@@ -7,8 +7,6 @@ that descends it is then shortened: its points are joined by straight legs where
 constraints.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -9,8 +9,6 @@ equilibrium at the goal pose. In its own chart every law closes the same loop,
 whose two angles know nothing of rho: `rollout.py` lives on that.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

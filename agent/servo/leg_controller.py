@@ -1,7 +1,5 @@
 """Feedback along one leg: turn to its heading on the spot, then drive and stay on the line."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """How much room ways keep to the border of the field of view, and what parts of the servo have in common."""
 
-from __future__ import annotations
-
 MIN_VISIBLE = 4
 """Landmarks that must stay in view."""
 FIELD_MARGIN = 0.05

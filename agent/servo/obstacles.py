@@ -1,7 +1,5 @@
 """What the rangers saw, remembered: a robot that turns does not forget the wall that is now behind it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

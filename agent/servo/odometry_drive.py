@@ -1,7 +1,5 @@
 """Driving without a view: turn to the goal's position, drive straight, turn to its heading."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -5,8 +5,6 @@ spirals; Bhattacharya, Murrieta-Cid and Hutchinson 2007, Salaris et al. 2010) th
 is met by a few legs, and a leg can be tracked and resumed from anywhere.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Finding a plan: two legs in closed form first, the lattice for what they cannot do; wide margins first."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

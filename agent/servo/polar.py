@@ -1,7 +1,5 @@
 """Polar coordinates of the robot about the goal, equation (2) of the paper."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

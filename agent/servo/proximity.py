@@ -1,7 +1,5 @@
 """The last safety layer: no command moves the footprint into something that the rangers see."""
 
-from __future__ import annotations
-
 import math
 from functools import lru_cache
 from typing import Any, NamedTuple

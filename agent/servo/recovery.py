@@ -1,7 +1,5 @@
 """Too few landmarks in view: turn to where more are, else back off along the optical axis."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapweave.agent.observation import Command

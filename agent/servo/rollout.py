@@ -1,7 +1,5 @@
 """The five laws rolled forward to the goal at once, before one of them is trusted with the wheels."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

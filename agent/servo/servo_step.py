@@ -1,7 +1,5 @@
 """What a servo decides in one tick."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Literal
 

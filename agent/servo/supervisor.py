@@ -1,7 +1,5 @@
 """The servo: which law or which leg drives, tick by tick, so that the landmarks stay in view."""
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Which landmarks the servo counts on."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

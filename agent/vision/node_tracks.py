@@ -1,7 +1,5 @@
 """One node's landmarks in the images: tracked from where a recognition has found them."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """Points that were lost while they should still be in view: a person walks past, and they come back."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -4,8 +4,6 @@ From frame to frame, Lucas-Kanade finds a point however it has moved; the patch 
 seen then says where exactly it is (agent/vision/template.py, docs/decisions/tracking.md).
 """
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

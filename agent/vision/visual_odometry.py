@@ -8,8 +8,6 @@ with s = t / Z, the way over the depth, taken as one for the whole image (Longue
 The turn is exact to first order; the sign of s says whether the robot has driven forward.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

@@ -1,7 +1,5 @@
 """What a command answers: lines for people, or one JSON object, the last line on stdout, for scripts."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """`mapweave calibrate WHAT`: measure the robot."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a shell offers for a value beyond choices and files."""
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterable
 from typing import Any

@@ -1,7 +1,5 @@
 """`mapweave completion SHELL`: what makes a shell complete commands and options."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

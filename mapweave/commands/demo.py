@@ -1,7 +1,5 @@
 """`mapweave demo`: everything at once, in simulation."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An example or more of every command, for its --help and the cheat sheet. A test parses each."""
 
-from __future__ import annotations
-
 import argparse
 
 EXAMPLES: dict[str, tuple[str, ...]] = {

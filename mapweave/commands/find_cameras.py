@@ -1,7 +1,5 @@
 """`mapweave find-cameras`: which cameras open, with a frame of each."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`mapweave find-port`: which serial port a robot is at."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

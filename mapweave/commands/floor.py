@@ -1,7 +1,5 @@
 """`mapweave floor`: on which floor a map is."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`mapweave keys`: who belongs to a fleet, and what each may do."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

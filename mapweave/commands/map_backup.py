@@ -1,7 +1,5 @@
 """`mapweave map backup`: a copy of a server's store, also while the server runs."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`mapweave map diff`: what is different between two maps."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from typing import Any

@@ -1,7 +1,5 @@
 """Two nodes or two maps on the command line, and what people hear about words in the place of nodes."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 

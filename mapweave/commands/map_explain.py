@@ -1,7 +1,5 @@
 """`mapweave map explain`: why nodes or maps are linked, or are not."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from typing import Any

@@ -1,7 +1,5 @@
 """`mapweave map export`: a map file for others' tools."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`mapweave map extract`: the robots' own maps of a journal, store or map file as map files."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -1,7 +1,5 @@
 """`mapweave map fetch`: the merged map of a running server into a map file."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

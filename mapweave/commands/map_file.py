@@ -1,7 +1,5 @@
 """`mapweave map ACTION`: show, explain, merge and export maps."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`mapweave map history`: joins, splits and manual constraints, with dates."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from typing import Any

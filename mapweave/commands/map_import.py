@@ -1,7 +1,5 @@
 """`mapweave map import`: a pose graph of others, optimised as the merge optimises."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

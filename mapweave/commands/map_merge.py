@@ -1,7 +1,5 @@
 """`mapweave map merge`: map files become one, without a server."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -1,7 +1,5 @@
 """`mapweave map from-photos`: a map from photographs of a stretch, taken by hand."""
 
-from __future__ import annotations
-
 import argparse
 import json
 import time

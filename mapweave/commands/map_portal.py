@@ -1,7 +1,5 @@
 """`mapweave map portal`: lifts, ramps and doors through which robots ask to be taken."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

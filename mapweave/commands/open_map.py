@@ -1,7 +1,5 @@
 """`mapweave open`: the map server's page for a map file, a store or a journal, without robots."""
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """`mapweave portal done`: a robot that waits at a portal has been taken through."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`mapweave record`: what a robot senses, as MCAP."""
 
-from __future__ import annotations
-
 import argparse
 import threading
 from dataclasses import replace

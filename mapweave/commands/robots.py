@@ -1,7 +1,5 @@
 """`mapweave robots`: list the drivers."""
 
-from __future__ import annotations
-
 import argparse
 import json
 from typing import Any

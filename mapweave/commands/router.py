@@ -1,7 +1,5 @@
 """`mapweave router`: the Zenoh router alone, for robots without a map server."""
 
-from __future__ import annotations
-
 import argparse
 from contextlib import ExitStack
 from typing import Any

@@ -1,7 +1,5 @@
 """`mapweave settings`: what can be set, and how it is set without a file."""
 
-from __future__ import annotations
-
 import argparse
 from typing import Any
 

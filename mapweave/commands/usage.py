@@ -1,7 +1,5 @@
 """Command lines that argparse takes and that mean nothing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 

@@ -4,8 +4,6 @@ argparse itself would print the usage above it, and call a word that is no numbe
 `mapweave.cli.CommandParser` puts before the words here which argument it is.
 """
 
-from __future__ import annotations
-
 import math
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The figures of a demo: `report.json`, and a table for people."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from rich.table import Table

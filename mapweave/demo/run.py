@@ -1,7 +1,5 @@
 """The demo: the scenario `demo` in processes, with a report of its own."""
 
-from __future__ import annotations
-
 import json
 import shutil
 from typing import Any

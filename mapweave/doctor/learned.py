@@ -1,7 +1,5 @@
 """What robots have learned of their geometry on earlier drives, and will use at their next start."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Python, the libraries of the base installation with their versions, and the extras."""
 
-from __future__ import annotations
-
 import importlib
 import platform
 import re

@@ -1,7 +1,5 @@
 """The robot's computer: its clock, and the disk that the map goes to."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The camera's image with what the calibration needs next, for a page."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Pictures of two nodes side by side: their landmarks, and which of them are the same."""
 
-from __future__ import annotations
-
 import io
 import textwrap
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures of maps: nodes, edges and links over a floor plan."""
 
-from __future__ import annotations
-
 import io
 import math
 import re

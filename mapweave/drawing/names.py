@@ -1,7 +1,5 @@
 """Names in a picture where they fit: none covers another one, a mark, or the edge of the picture."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any

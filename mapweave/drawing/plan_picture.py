@@ -1,7 +1,5 @@
 """Pictures of floor plans with the merged map over them."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ Each image of the asking pass is once the first that a robot sees. From there it
 `agent/global_localization` does, until it knows where it is or has driven `REACH`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any

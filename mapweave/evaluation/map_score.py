@@ -1,7 +1,5 @@
 """Scoring a merged map against simulation truth. Nothing here is known to robots or server."""
 
-from __future__ import annotations
-
 import io
 import math
 from collections.abc import Iterable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Merging on a recording: it is cut into robots, each maps its piece as if carried, and these are merged."""
 
-from __future__ import annotations
-
 import csv
 import itertools
 import math

@@ -5,8 +5,6 @@ whose landmarks have none: appearance alone. A candidate is verified by epipolar
 camera free in all six directions.
 """
 
-from __future__ import annotations
-
 import csv
 import math
 import re

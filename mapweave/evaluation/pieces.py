@@ -1,7 +1,5 @@
 """Cutting a recording into robots: by its splits.toml, or into overlapping pieces."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterable
 from pathlib import Path

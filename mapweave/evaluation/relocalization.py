@@ -1,7 +1,5 @@
 """Examine a recording by what it holds: two robots with odometry, or photographs and what each shows."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

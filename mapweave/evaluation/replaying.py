@@ -1,7 +1,5 @@
 """How well a recording is mapped: error of every frame beside the wheels alone, and which were not used."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence

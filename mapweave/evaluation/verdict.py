@@ -1,7 +1,5 @@
 """What became of one question, and the figures of many."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

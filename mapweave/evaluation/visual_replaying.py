@@ -1,7 +1,5 @@
 """How well a recording without odometry is mapped by its images: up to scale, as such a map has none."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence

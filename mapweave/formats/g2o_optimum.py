@@ -1,7 +1,5 @@
 """The optimum of a planar pose graph of others, by the back end of the merge."""
 
-from __future__ import annotations
-
 import networkx as nx
 import numpy as np
 

@@ -1,7 +1,5 @@
 """A part of a merged map that is one, as others' tools want it: numbered places and measurements."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

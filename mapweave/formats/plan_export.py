@@ -1,7 +1,5 @@
 """The transform between a floor plan and the merged map, as Open-RMF, Nav2 and tf want it."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Sequence

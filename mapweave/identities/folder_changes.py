@@ -1,7 +1,5 @@
 """Changes of a folder of keys: by one process at a time, and whole or not at all."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager

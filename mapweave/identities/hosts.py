@@ -1,7 +1,5 @@
 """The names and addresses under which a fleet's routers are reached."""
 
-from __future__ import annotations
-
 import ipaddress
 import re
 from collections.abc import Iterable

@@ -1,7 +1,5 @@
 """The one file that a robot or a person gets: who they are, their key, and where the server is. TOML."""
 
-from __future__ import annotations
-
 import os
 import stat
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A running router takes note when keys come and go."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from mapweave.hybridmap.errors import MapweaveError

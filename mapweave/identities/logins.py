@@ -1,7 +1,5 @@
 """Whose a token is, and whether that still holds. The files are read again whenever they have changed."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """A running client takes note when its own key file is replaced, as before its certificate expires."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from pathlib import Path

@@ -4,8 +4,6 @@ A token is 32 random bytes, so its plain SHA-256 cannot be turned back, and no g
 are changed by `KeyFolder`, with the lock of its folder held.
 """
 
-from __future__ import annotations
-
 import hashlib
 import secrets
 from dataclasses import dataclass

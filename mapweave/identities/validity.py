@@ -1,7 +1,5 @@
 """From when until when a certificate holds, read without the libraries that sign: robots do not have them."""
 
-from __future__ import annotations
-
 import re
 from datetime import UTC, datetime
 

@@ -1,7 +1,5 @@
 """The files that an agent writes beside its journal: one map file a map, and where the robot was."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mapweave.hybridmap.ids import MapId, read_number

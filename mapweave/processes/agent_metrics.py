@@ -4,8 +4,6 @@ The loop counts in plain numbers; everything else is read from the agent's statu
 asked for, on the threads of the HTTP server. `docs/monitoring.md` lists the names.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Callable, Iterator, Mapping

@@ -1,7 +1,5 @@
 """Guidance while a person holds the calibration target before the camera: four bars and what to do next."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

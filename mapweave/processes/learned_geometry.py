@@ -1,7 +1,5 @@
 """What a robot has learned of its geometry is kept beside its journal, and used when it is started again."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from datetime import date

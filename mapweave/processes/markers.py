@@ -1,7 +1,5 @@
 """Markers of ROS (visualization_msgs) of what a robot knows: its map, and its landmarks."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Any
 

@@ -9,8 +9,6 @@
 /cmd_vel, /status           what the wheels do; what the robot does and why, in words
 """
 
-from __future__ import annotations
-
 from functools import partial
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Metrics over HTTP on this machine alone, refused to pages of other sites as the map server's are."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable, Iterable
 from typing import Any

@@ -4,8 +4,6 @@ The parent holds the writing end of a pipe that is the child's stdin, and never 
 killed or not, the system closes it, and the child reads the end of its stdin.
 """
 
-from __future__ import annotations
-
 import os
 import threading
 from collections.abc import Mapping

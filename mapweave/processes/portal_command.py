@@ -1,7 +1,5 @@
 """The command that takes a robot through a portal: run once for each request, beside the robot's loop."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -13,8 +13,6 @@ Below the robot's name, on the time line `stamp`:
     status, now               what it does and why, in words
 """
 
-from __future__ import annotations
-
 import socket
 from pathlib import Path
 from urllib.parse import urlsplit

@@ -9,8 +9,6 @@ map before that.
     mapweave/<agent>/map    MarkerArray: nodes, and edges by their kind
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Says that map servers with stores of their own do not exchange what people decide."""
 
-from __future__ import annotations
-
 import logging
 
 from mapweave.wire.bus import Bus

@@ -4,8 +4,6 @@ Two servers of one name with stores of their own both answer what is asked under
 that the other one does not have.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Says when an agent's map server is missing, and when it is there again."""
 
-from __future__ import annotations
-
 PATIENCE = 20.0
 """s without the map server after which that is reported."""
 

@@ -1,7 +1,5 @@
 """Messages to systemd, which restarts a process whose loop hangs; see sd_notify(3). Nothing without it."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import socket

@@ -1,7 +1,5 @@
 """The simulator as a process: a world, its robots, and the bridge to the bus."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Sequence
 

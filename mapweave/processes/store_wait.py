@@ -1,7 +1,5 @@
 """A map server that starts before its database, as both do after a power cut, waits for it."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """What an agent senses, estimates and decides, tick by tick, for logs that a thread writes."""
 
-from __future__ import annotations
-
 import contextlib
 import logging
 import math

@@ -1,7 +1,5 @@
 """The maps of the recorded fleet."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A robot that drives along what it has recorded: journal, status and missions as an agent has them."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Actions of a scenario on the fleet; those on the world are in `mapweave.sim.events`."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any

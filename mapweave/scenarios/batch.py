@@ -1,7 +1,5 @@
 """Many trials of one scenario, one after the other."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Many trials of one scenario: median and worst of each figure, and the failures by seed."""
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """How much of a building was mapped, and how long the ways were that loops have closed."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 
 import numpy as np

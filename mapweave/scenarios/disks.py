@@ -1,7 +1,5 @@
 """What is on the disks after a trial: robots' journals and the server's store, compared byte by byte."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterable
 from dataclasses import dataclass

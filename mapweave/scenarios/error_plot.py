@@ -1,7 +1,5 @@
 """How far each robot's belief was from the truth, over time."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Expectations: what a scenario demands of a trial's figures, and what came of it."""
 
-from __future__ import annotations
-
 import difflib
 import math
 from collections.abc import Mapping, Sequence

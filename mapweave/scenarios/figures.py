@@ -1,7 +1,5 @@
 """The figures of a trial: what it measured, flat and ready for JSON."""
 
-from __future__ import annotations
-
 import math
 import typing
 from collections.abc import Mapping

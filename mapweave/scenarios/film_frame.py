@@ -1,7 +1,5 @@
 """A trial as pictures: the building from above next to the robots' camera images."""
 
-from __future__ import annotations
-
 import math
 from collections import deque
 from collections.abc import Iterable, Mapping, Sequence

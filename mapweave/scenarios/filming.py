@@ -1,7 +1,5 @@
 """Film and live view of a trial: a frame whenever simulated time stops for long enough."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass

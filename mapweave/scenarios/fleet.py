@@ -1,7 +1,5 @@
 """What a trial needs of a fleet, whether its robots live in one process or in many."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol

@@ -1,7 +1,5 @@
 """Robots that are carried away, and robots that are sent somewhere. Truth sets the stage, no more."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 from mapweave.hybridmap.agent_status import AgentStatus

@@ -1,7 +1,5 @@
 """Plans a kidnapping: which robot, where to put it down, where to send it. Uses the ground truth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

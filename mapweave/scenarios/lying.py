@@ -1,7 +1,5 @@
 """The event `lie` of a scenario: what would become of the others if a robot had lied about its map."""
 
-from __future__ import annotations
-
 import logging
 import tempfile
 from collections.abc import Callable, Iterator, Mapping

@@ -4,8 +4,6 @@ TCP loses no single bytes. What is seen of a lossy radio are delays, stalls, lit
 connections: that is what this does.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 import socket

@@ -1,7 +1,5 @@
 """A person maps a stretch by photographs alone, before a robot drives along it."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

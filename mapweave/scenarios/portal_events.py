@@ -1,7 +1,5 @@
 """Floors with lifts between them, and robots that are taken through: truth sets the stage, no more."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 from mapweave.fleet import Fleet as Person

@@ -1,7 +1,5 @@
 """A fleet of processes over Zenoh, as on real robots: each may be killed, each network may be cut."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Recording of a trial for scoring: ground truth and the messages of robots and server."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """A trial's folder: figures, page, pictures, trajectories, the merged map."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A trial's report as a page that can be read anywhere: Markdown."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from mapweave.hybridmap.ids import MapId

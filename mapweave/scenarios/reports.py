@@ -1,7 +1,5 @@
 """Status of agents and server during a trial: asked between ticks, and received as messages."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """One trial from beginning to end: fleet, runner, recording, figures, folder."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from contextlib import ExitStack

@@ -27,8 +27,6 @@ components = 1
 merged_ate_m = 0.1                # at most
 """
 
-from __future__ import annotations
-
 import tomllib
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field

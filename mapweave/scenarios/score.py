@@ -1,7 +1,5 @@
 """From what a trial left behind to its figures."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Iterable, Mapping

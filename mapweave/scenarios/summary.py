@@ -1,7 +1,5 @@
 """What came of a trial, for people."""
 
-from __future__ import annotations
-
 from rich.table import Table
 from rich.text import Text
 

@@ -4,8 +4,6 @@ Only evo's core is imported, and late: its command line writes settings into the
 does not.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -1,7 +1,5 @@
 """What a person who drives sees: the robot's state in a few lines that are written over."""
 
-from __future__ import annotations
-
 import math
 import shutil
 import sys

@@ -4,8 +4,6 @@ https://docs.kernel.org/input/joydev/joystick-api.html: each event is a `js_even
 (u32), value (s16), type (u8: 1 button, 2 axis, with 0x80 for the state at the opening), number (u8).
 """
 
-from __future__ import annotations
-
 import os
 import struct
 from pathlib import Path

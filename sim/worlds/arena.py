@@ -1,7 +1,5 @@
 """An arena: one hall with prints all around, to park in."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

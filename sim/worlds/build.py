@@ -1,7 +1,5 @@
 """Builds a world from its design: blocks, panels, textures in the light of lamps."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from collections.abc import Iterator

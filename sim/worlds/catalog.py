@@ -1,7 +1,5 @@
 """The kinds of world there are, by name."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A corridor that leads back to where it began: a long loop, bare plaster between few prints and doors."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Annotated

@@ -4,8 +4,6 @@ The kinds of world write a design, a world's file holds one, and `mapweave.sim.w
 sizes are in m, in world; x to the east, y to the north.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

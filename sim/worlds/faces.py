@@ -1,7 +1,5 @@
 """Faces of walls: where they are cut into pieces, and which of them is nearest to a point."""
 
-from __future__ import annotations
-
 import itertools
 import math
 

@@ -34,8 +34,6 @@ All fields are those of the dataclasses in `mapweave.sim.worlds.design`; what is
 `docs/worlds.md` lists them together with all textures.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 from pathlib import Path

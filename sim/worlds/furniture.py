@@ -1,7 +1,5 @@
 """The furniture of made worlds: what there is, and where pieces are put in a room."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

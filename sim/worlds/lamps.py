@@ -1,7 +1,5 @@
 """Where lamps hang, and into which rooms they shine."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapweave.hybridmap.pose import Array

@@ -1,7 +1,5 @@
 """Where the parts of a design are: what they cover on the floor, and to which precision."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The light of lamps under the ceiling, painted onto what they shine on."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

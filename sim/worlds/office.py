@@ -1,7 +1,5 @@
 """An office: rooms along one corridor, each with a doorway, furniture and prints."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

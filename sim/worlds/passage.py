@@ -1,7 +1,5 @@
 """A straight corridor, too narrow for two robots to pass each other, with one niche in the middle."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Two rooms that look exactly the same: every view of one is also a view of the other."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 from typing import Annotated

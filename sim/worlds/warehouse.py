@@ -1,7 +1,5 @@
 """A warehouse: rows of mostly equal racks, and signs at the ends of the aisles."""
 
-from __future__ import annotations
-
 import string
 from dataclasses import dataclass
 from typing import Annotated

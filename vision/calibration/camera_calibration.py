@@ -1,7 +1,5 @@
 """A camera from views of a target: which lens, how sure, how well it explains other views, what lacks."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

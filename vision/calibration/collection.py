@@ -1,7 +1,5 @@
 """Which frames of a moving camera or board become views, and what to show next."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the views cover, and what to show next: four bars, as ROS' camera_calibration has them."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

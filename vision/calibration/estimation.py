@@ -3,8 +3,6 @@
 Zhang (2000) with the poses eliminated (Schur complement), as each view has its own pose.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

@@ -1,7 +1,5 @@
 """How lens models project the corners of a target, with derivatives."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import cv2

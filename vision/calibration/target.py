@@ -1,7 +1,5 @@
 """The printed target: a chessboard, or a ChArUco board, of which a view may show a part."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from enum import StrEnum

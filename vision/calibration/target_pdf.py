@@ -1,7 +1,5 @@
 """The target as a vector PDF in its true size, with rulers that show whether it was printed so."""
 
-from __future__ import annotations
-
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.vision.calibration.target import CalibrationTarget
 

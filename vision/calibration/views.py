@@ -1,7 +1,5 @@
 """Views of the target: its corners found in an image, and how the board is held in it."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 What no encoder writes is packed by hand: a robot that is taken over need not use ours.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace

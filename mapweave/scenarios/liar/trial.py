@@ -1,7 +1,5 @@
 """Three honest robots and one that lies: what becomes of the three."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable, Mapping, Sequence
