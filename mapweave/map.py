@@ -373,10 +373,10 @@ class Map(ABC):
         return write(MapPart(merged, *self._frame(component, plan)), out)
 
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the map into a map file, all or nothing.
+        """Write the map into a map file, all or nothing. It replaces a map file, and no other file.
 
         Raises:
-            InvalidFile: the disk does not take it.
+            InvalidFile: the disk does not take it, or a file that is no map is there.
         """
         write_map_file(Path(path), self.content)
 

@@ -22,7 +22,7 @@ from mapweave.mapserver.constraint_history import with_constraints
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import MergeSettings
 from mapweave.opened_map import MapSource, OpenedMap
-from mapweave.storage.atomic_file import check_place
+from mapweave.storage.atomic_file import check_map_place
 from mapweave.storage.map_file import MapFile
 
 if TYPE_CHECKING:
@@ -131,7 +131,7 @@ class OfflineRecord(FileMap):
             raise InvalidValue(
                 f"{self._opened.path} is {self._opened.source.words}, which is not written: give -o"
             )
-        check_place(self._out)
+        check_map_place(self._out)
 
     def _say(self, annotation: Annotation, check: bool) -> str:
         words = super()._say(annotation, check)

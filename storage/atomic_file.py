@@ -22,12 +22,15 @@ def write_whole(path: Path, data: bytes | memoryview) -> None:
     """Write a temporary file in the same folder, then rename it.
 
     Raises:
-        InvalidFile: the disk does not take it, or a database is there, or a map file and this is none; what
-            was there is as before.
+        InvalidFile: the disk does not take it, or a database is there, or of a map file and another file one
+            is there and this is the other; what was there is as before.
     """
-    check_place(path)
-    if _begins(path, MAP_FILE) and data[: len(MAP_FILE)] != MAP_FILE:
-        raise unwritable(path, "a map file is there; give another name")
+    if data[: len(MAP_FILE)] == MAP_FILE:
+        check_map_place(path)
+    else:
+        check_place(path)
+        if _begins(path, MAP_FILE):
+            raise unwritable(path, "a map file is there; give another name")
     if path.exists() and not path.is_file():
         # A pipe, a terminal, /dev/null: nothing to keep, and nothing to put in its place.
         path.write_bytes(data)
@@ -122,6 +125,17 @@ def check_place(path: Path) -> None:
         raise unwritable(path, READ_ONLY if read_only else no_permission())
     if _begins(path, SQLITE):
         raise unwritable(path, "a server's store or an agent's journal is there; give another name")
+
+
+def check_map_place(path: Path) -> None:
+    """Refuse a place where no map file can be: a photograph or a program has no copy, and a map one.
+
+    Raises:
+        InvalidFile: see `check_place`; or a file is there that is neither a map nor empty.
+    """
+    check_place(path)
+    if path.is_file() and path.stat().st_size and not _begins(path, MAP_FILE):
+        raise unwritable(path, "a file that is no map is there; give another name")
 
 
 def _remove(path: Path) -> None:

@@ -122,11 +122,11 @@ class MapFile:
 
 
 def write_map_file(path: str | PathLike[str], content: MapFile) -> None:
-    """Write a map file, all or nothing.
+    """Write a map file, all or nothing. It replaces a map file, and no other file.
 
     Raises:
         InvalidValue: the content cannot be encoded.
-        InvalidFile: the disk does not take it.
+        InvalidFile: the disk does not take it, or a file that is no map is there.
     """
     write_whole(Path(path), pack_map_file(content))
 

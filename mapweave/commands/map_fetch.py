@@ -26,10 +26,10 @@ def add_to(actions: Any) -> None:
 
 def run(arguments: argparse.Namespace) -> int:
     """Fetch and write."""
-    from mapweave.storage.atomic_file import check_place, write_whole
+    from mapweave.storage.atomic_file import check_map_place, write_whole
     from mapweave.terminal import working
 
-    check_place(arguments.out)
+    check_map_place(arguments.out)
     # A server takes seconds to pack 1000 nodes.
     with fleet_of(arguments) as fleet, working("fetching the map"):
         content, data = fleet.map_and_bytes()

@@ -34,10 +34,10 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.merge.explanation.component_changes import joinings
     from mapweave.merge.explanation.map_explanation import explain_fleet
     from mapweave.offline_merge import parts_of
-    from mapweave.storage.atomic_file import check_place
+    from mapweave.storage.atomic_file import check_map_place
     from mapweave.storage.map_file import write_map_file
 
-    check_place(arguments.out)
+    check_map_place(arguments.out)
     settings = settings_of(arguments).merge
     parts = parts_of({one.path: one.content for one in map(opened, arguments.files)})
     with merge_progress() as report:

@@ -46,10 +46,10 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.hybridmap.change import NodePut
     from mapweave.hybridmap.ids import MapId, check_name
     from mapweave.photographs import map_of_photographs, send_map
-    from mapweave.storage.atomic_file import check_place
+    from mapweave.storage.atomic_file import check_map_place
     from mapweave.storage.map_file import MapFile, write_map_file
 
-    check_place(arguments.out)
+    check_map_place(arguments.out)
     map_id = MapId(check_name(arguments.name or arguments.out.stem), int(time.time()))
     camera, distortion = read_camera(arguments.camera or arguments.folder / "camera.toml")
     images = images_in(arguments.folder)

@@ -33,6 +33,7 @@ def test_map_files(tmp_path, capfd):
     assert "is neither a map file" in complaint(capfd, "map", "show", path)
     path.write_text("{}")
     assert "is neither a map file" in complaint(capfd, "map", "show", path)
+    path.unlink()
     write_map_file(path, MapFile("agent", "r0.1", ()))
     whole = path.read_bytes()
     path.write_bytes(whole[:-1])

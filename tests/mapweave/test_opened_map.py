@@ -173,10 +173,11 @@ def test_commands_that_change_a_map_refuse_stores_and_journals(folder: Path, tmp
         copy.unlink()
 
 
-def test_no_command_writes_over_a_store_a_journal_or_a_map(folder: Path, tmp_path, capfd):
+def test_no_command_writes_over_a_store_a_journal_a_map_or_notes(folder: Path, tmp_path, capfd):
     """With `-o` the file that is read, or another one, was replaced without a word."""
     for name in ("store", "journal", "merged"):
         shutil.copyfile(folder / name, tmp_path / name)
+    (tmp_path / "notes").write_text("of a year")
     before = state(tmp_path)
     commands = [
         ("merge", "merged", "-o"), ("unmerge", "r0.1", "r1.1", "--map", "store", "-o"),
@@ -187,6 +188,9 @@ def test_no_command_writes_over_a_store_a_journal_or_a_map(folder: Path, tmp_pat
         for name in ("store", "journal"):
             words = complaint(capfd, "map", *given, tmp_path / name)
             assert words.endswith("(a server's store or an agent's journal is there; give another name)")
+        if command[0] != "export":
+            words = complaint(capfd, "map", *given, tmp_path / "notes")
+            assert words.endswith("(a file that is no map is there; give another name)")
     words = complaint(capfd, "map", *given, tmp_path / "merged")
     assert words.endswith("(a map file is there; give another name)")
     assert state(tmp_path) == before
