@@ -13,6 +13,9 @@ from collections.abc import Iterator
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 # FAISS searches with all cores otherwise, which costs more than it gains where each core has a worker.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+# `mapweave` says so before it imports cv2, and here cv2 is imported first.
+os.environ.setdefault("OPENCV_LOG_LEVEL", "SILENT")
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
 
 import cv2
 import pytest
