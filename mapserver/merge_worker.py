@@ -347,7 +347,7 @@ class MergeWorker:
         """Lead or follow, as the store says."""
         if self._adoption is None or self._handover is None or self._sharing is None:
             return
-        if self._sharing.leads:
+        if self._sharing.store.leads:
             self._handover.lead()
             if self._following:
                 self._adopt()

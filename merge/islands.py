@@ -70,6 +70,7 @@ class Islands:
         self._without_hand: Islands | None = None
         self._some: Islands | None = None
         self._asked, self._untold = False, set[MapId]()
+        self._is_reference = False
         self._marginals: Sequence[Link] = ()
         self._standing: Set[Pair] = frozenset()
         self._fused: dict[Pair, tuple[Link, Link, Link | None]] = {}
@@ -206,6 +207,8 @@ class Islands:
         constraints: ManualConstraints,
     ) -> dict[NodeId, ManualConstraint]:
         """Where a retired area lies the merge without retired areas says, so that it does not say itself."""
+        if self._is_reference:
+            return dict(constraints.nodes)
         if not any(isinstance(c.about, RetiredArea) for c in constraints.in_force):
             self._without_areas = None
             return retired_nodes(maps, constraints, ())
@@ -225,7 +228,7 @@ class Islands:
     ) -> dict[Pair, str]:
         """Links by hand that what robots have measured contradicts, and how."""
         links = constraints.links
-        if not links:
+        if self._is_reference or not links:
             self._without_hand = None
             return {}
         self._without_hand = self._without_hand or self._reference()
@@ -245,7 +248,9 @@ class Islands:
         return out
 
     def _reference(self) -> Islands:
-        reference = _Reference(self._settings, self._exact)
+        """A merge that this one is compared with."""
+        reference = Islands(self._settings, self._exact)
+        reference._is_reference = True
         reference.replace_marginals(self._marginals, self._standing)
         return reference
 
@@ -266,28 +271,6 @@ class Islands:
             ties.add_edges_from((map_id, neighbour) for neighbour in entry[1])
         parts = (frozenset(part & maps.keys()) for part in nx.connected_components(ties))
         return sorted((island for island in parts if island), key=min)
-
-
-class _Reference(Islands):
-    """A merge that another one is compared with."""
-
-    def _retired_nodes(
-        self,
-        maps: Mapping[MapId, HybridMap],
-        verdicts: Verdicts,
-        touched: set[MapId],
-        constraints: ManualConstraints,
-    ) -> dict[NodeId, ManualConstraint]:
-        return dict(constraints.nodes)
-
-    def _contradicted(
-        self,
-        maps: Mapping[MapId, HybridMap],
-        verdicts: Verdicts,
-        touched: set[MapId],
-        constraints: ManualConstraints,
-    ) -> dict[Pair, str]:
-        return {}
 
 
 def _around(

@@ -106,7 +106,7 @@ class MergeAdoption:
         """
         if waited < LATE:
             return ""
-        leader = self._sharing.leader or "another server"
+        leader = self._sharing.store.leader or "another server"
         try:
             if trouble := self._sharing.trouble:
                 return f"{leader} leads, and says: {trouble}"

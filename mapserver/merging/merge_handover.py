@@ -36,8 +36,8 @@ class MergeHandover:
 
     def lead(self) -> None:
         """This server leads: what others have written before is not gone on with."""
-        if self._term != self._sharing.term:
-            self._term, self._merges = self._sharing.term, -1
+        if self._term != self._sharing.store.term:
+            self._term, self._merges = self._sharing.store.term, -1
             self._sharing.begin()
 
     def write(
@@ -55,7 +55,7 @@ class MergeHandover:
         Returns:
             How long to wait until it is time, s; None: nothing is left to do.
         """
-        if not self._sharing.followed:
+        if not self._sharing.store.followed:
             return None
         self._sharing.tell(trouble or self._trouble)
         merges = merger.counters.merges

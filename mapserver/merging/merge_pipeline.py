@@ -18,9 +18,8 @@ from mapweave.hybridmap.reachability_cache import ReachabilityCache
 from mapweave.mapserver.plausibility import fragments
 from mapweave.merge.islands import Islands
 from mapweave.merge.map_maintenance.landmark_removal import LandmarkRemover
-from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder, Superseding
+from mapweave.merge.map_maintenance.node_superseding import NodeSuperseder
 from mapweave.merge.pose_graph.candidates import Pair
-from mapweave.merge.pose_graph.links import Link
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.pose_graph.pinned_frames import PinnedFrames
 from mapweave.merge.pose_graph.staged_optimization import StagedOptimization
@@ -29,7 +28,12 @@ from mapweave.merge.settings import MergeSettings
 
 
 class MergePipeline:
-    """The merge, implausible maps last, pinned frames, superseding of nodes and removal of landmarks."""
+    """The merge, implausible maps last, pinned frames, superseding of nodes and removal of landmarks.
+
+    Attributes:
+        islands: merge.
+        superseder: knows what is superseded.
+    """
 
     def __init__(
         self, settings: MergeSettings, reaches: ReachabilityCache, pause: Callable[[], None] = lambda: None
@@ -41,24 +45,11 @@ class MergePipeline:
             reaches: where from which nodes can be seen.
             pause: see `Islands`.
         """
-        self._islands = Islands(settings, pause=pause)
+        self.islands = Islands(settings, pause=pause)
         self._staged = StagedOptimization()
         self._frames = PinnedFrames()
-        self._superseder = NodeSuperseder(reaches)
+        self.superseder = NodeSuperseder(reaches)
         self._remover = LandmarkRemover()
-
-    @property
-    def superseding(self) -> Superseding:
-        """What is superseded after the newest merge, and what that was judged from."""
-        return self._superseder.state
-
-    def resume(self, superseding: Superseding) -> None:
-        """See `NodeSuperseder.resume`."""
-        self._superseder.resume(superseding)
-
-    def replace_marginals(self, marginals: Sequence[Link], standing: Set[Pair]) -> None:
-        """See `Islands.replace_marginals`."""
-        self._islands.replace_marginals(marginals, standing)
 
     def merged(
         self,
@@ -84,7 +75,7 @@ class MergePipeline:
         Raises:
             InvalidValue: a node's pose is out of the range of messages.
         """
-        merged = self._islands.merge(maps, verdicts, touched, constraints)
+        merged = self.islands.merge(maps, verdicts, touched, constraints)
         _check_range(merged)
         odd = implausible(merged)
         only_beside_odd = self._only_beside(merged, odd.keys(), maps, verdicts)
@@ -92,7 +83,7 @@ class MergePipeline:
         _check_range(merged)
         merged = replace(merged, implausible=odd, pruned=pruned or PrunedNodes())
         unsure = {*merged.implausible, *fragments(maps, merged.pruned.maps)}
-        return self._remover.fade(self._superseder.renewed(merged, unsure))
+        return self._remover.fade(self.superseder.renewed(merged, unsure))
 
     def _only_beside(
         self,
@@ -106,7 +97,7 @@ class MergePipeline:
         links = {link.key for link in merged.links if beside.issuperset(link.maps)}
         if not links:
             return links
-        return links - self._islands.links_among({m: maps[m] for m in maps if m not in odd}, verdicts)
+        return links - self.islands.links_among({m: maps[m] for m in maps if m not in odd}, verdicts)
 
 
 def _check_range(merged: MergedMap) -> None:

@@ -34,7 +34,11 @@ LEVEL = 1
 
 
 class MergeSharing:
-    """The merges in one store. Only the merging thread may call it."""
+    """The merges in one store. Only the merging thread may call it.
+
+    Attributes:
+        store: that servers share.
+    """
 
     def __init__(self, store: Store, name: str) -> None:
         """Nothing is written or read yet.
@@ -43,7 +47,7 @@ class MergeSharing:
             store: that servers share.
             name: of this server.
         """
-        self._store, self._name = store, name
+        self.store, self._name = store, name
         self._prints: dict[MapId, tuple[HybridMap, bytes]] = {}
         self.begin()
 
@@ -61,7 +65,7 @@ class MergeSharing:
         Raises:
             InvalidFile: the store cannot be read.
         """
-        return self._store.result(MERGE_MARK)
+        return self.store.result(MERGE_MARK)
 
     @property
     def trouble(self) -> str:
@@ -70,27 +74,7 @@ class MergeSharing:
         Raises:
             InvalidFile: the store cannot be read.
         """
-        return (self._store.result(MERGE_TROUBLE) or b"").decode(errors="replace")
-
-    @property
-    def leader(self) -> str:
-        """The server that leads; empty if that is not known."""
-        return self._store.leader
-
-    @property
-    def leads(self) -> bool:
-        """Whether this server leads."""
-        return self._store.leads
-
-    @property
-    def term(self) -> int:
-        """How often it has begun to lead."""
-        return self._store.term
-
-    @property
-    def followed(self) -> bool:
-        """Whether it leads others."""
-        return self._store.followed
+        return (self.store.result(MERGE_TROUBLE) or b"").decode(errors="replace")
 
     def write(self, merger: Merger, last: Mapping[MapId, int], pruning: bytes | None) -> int:
         """Hand over the newest merge, with which nothing has changed since. Returns how many bytes it takes.
@@ -119,7 +103,7 @@ class MergeSharing:
         record = RestartRecord.of(merger.superseding, RecentComparisons(merger.prints()))
         data = zlib.compress(packed(head, record, merged, findings.verdicts.get, words), LEVEL)
         results |= {MERGE: data, MERGE_MARK: _digest(data)}
-        self._store.publish(results)
+        self.store.publish(results)
         return sum(map(len, results.values()))
 
     def tell(self, trouble: str) -> None:
@@ -129,7 +113,7 @@ class MergeSharing:
             trouble: in words; empty: there is none.
         """
         if trouble != self._trouble:
-            self._store.publish({MERGE_TROUBLE: trouble.encode()})
+            self.store.publish({MERGE_TROUBLE: trouble.encode()})
             self._trouble = trouble
 
     def read(self, mark: bytes, words: str) -> SharedMerge:
@@ -142,7 +126,7 @@ class MergeSharing:
         Raises:
             InvalidFile: it is damaged, or of another version or other settings.
         """
-        return SharedMerge.read(_whole(self._store.result(MERGE), mark), words)
+        return SharedMerge.read(_whole(self.store.result(MERGE), mark), words)
 
     def findings(self, marks: tuple[bytes, ...], words: str) -> VerificationCache:
         """What comparisons have found.
@@ -158,7 +142,7 @@ class MergeSharing:
         if marks[:count] != tuple(self._marks) or count == len(marks):
             self.begin()
         for number in range(len(self._marks), len(marks)):
-            data = _whole(self._store.result(PART.format(number)), marks[number])
+            data = _whole(self.store.result(PART.format(number)), marks[number])
             part = self._full.joined(verification_cache_file.load(data, words))
             if number == len(marks) - 1:
                 return part

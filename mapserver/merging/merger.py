@@ -152,7 +152,7 @@ class Merger:
     @property
     def superseding(self) -> Superseding:
         """What is superseded after the newest merge, and what that was judged from."""
-        return self._pipeline.superseding
+        return self._pipeline.superseder.state
 
     @property
     def kept(self) -> Mapping[MapId, HybridMap]:
@@ -438,7 +438,7 @@ class Merger:
         """Go on from the last merge of another process, as far as the nodes are what they were."""
         unchanged = record.unchanged(self._comparisons.prints(self._nodes()))
         self._resumed = record.superseding(unchanged, self.node)
-        self._pipeline.resume(self._resumed)
+        self._pipeline.superseder.resume(self._resumed)
         # Later nodes are not compared with what had left the index before they came.
         self._leave_out(record.superseded.keys() & unchanged)
 
@@ -464,12 +464,12 @@ class Merger:
         self.pruning.take(plan)
         if plan.nodes:
             self.let_go(plan.nodes)
-            self._pipeline.replace_marginals(self.pruning.marginals, self.pruning.standing)
+            self._pipeline.islands.replace_marginals(self.pruning.marginals, self.pruning.standing)
 
     def restore_pruning(self, pruning: Pruning) -> None:
         """Go on with what another process has pruned; what has left since is let go besides."""
         self.pruning = pruning
-        self._pipeline.replace_marginals(pruning.marginals, pruning.standing)
+        self._pipeline.islands.replace_marginals(pruning.marginals, pruning.standing)
         # Nothing else may have changed in the maps that the links join.
         self._touched |= {end.map for link in pruning.marginals for end in link.pair} & self.maps.keys()
         self._dirty = True
@@ -514,7 +514,7 @@ class Merger:
 
     def _new_pipeline(self) -> MergePipeline:
         pipeline = MergePipeline(self.settings, self.reaches, self._pause)
-        pipeline.replace_marginals(self.pruning.marginals, self.pruning.standing)
+        pipeline.islands.replace_marginals(self.pruning.marginals, self.pruning.standing)
         if self._resumed is not None:
-            pipeline.resume(self._resumed)
+            pipeline.superseder.resume(self._resumed)
         return pipeline

@@ -19,7 +19,7 @@ class Followed:
     term, followed, fails = 1, True, False
 
     def __init__(self, clock: Clock) -> None:
-        self._clock = clock
+        self._clock, self.store = clock, self
         self.written, self.said = list[float](), [""]
 
     def begin(self) -> None:
