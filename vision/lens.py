@@ -3,8 +3,6 @@
 OpenCV is loaded when it is first needed: programs that only read settings start sooner.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from enum import StrEnum
 from typing import Annotated, Any
