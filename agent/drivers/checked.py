@@ -33,6 +33,8 @@ TOO_FAST = 10.0
 """So many times as fast as it is described to be, no robot moves: the unit is wrong, or the motion is not the
 one since the observation before. Only the first motions are judged, as the first stamps are: encoders that
 jump later have failed, which the pipeline says (`sensor_health/encoder_monitor.py`)."""
+TOO_FAR = 10.0
+"""So many times as far as it is said to reach, no sensor reads: it is in centimetres or millimetres."""
 SLACK = (0.5, 1.0)
 """m and rad in a tick that are never too much: of a robot that is pushed, or whose observation comes late."""
 
@@ -93,6 +95,8 @@ class CheckedRobot:
         finally:
             self._waiting_since = None
         if seen is None:
+            if not self._closed:
+                log.info("no more observations (the driver's sense() has returned None): the agent ends")
             return None
         if not isinstance(seen, Observation):
             raise mistake("sense()", f"must return an Observation or None, not {kind_of(seen)}")
@@ -101,7 +105,9 @@ class CheckedRobot:
         assert self._given is not None
         _check_image(seen, self._given)
         _check_numbers(seen, description)
-        if before_ns is not None:
+        if before_ns is None:
+            _check_unit_of_proximity(seen, description.ranger_reach)
+        else:
             self._check_motion(seen.odometry, max((seen.stamp_ns - before_ns) * 1e-9, description.tick))
         if seen.image is None or description is self._given:
             return seen
@@ -167,7 +173,9 @@ class CheckedRobot:
             raise mistake("stamp_ns", f"goes backwards, from {before} to {stamp_ns}")
         if stamp_ns - before < SMALLEST_SHARE * tick * 1e9:
             raise mistake(
-                "stamp_ns", f"rises by {stamp_ns - before} in a tick of {tick:g} s; it must be nanoseconds"
+                "stamp_ns",
+                f"rises by {stamp_ns - before} in a tick of {tick:g} s; it must be nanoseconds, and tick of "
+                "describe() seconds",
             )
 
     def _check_motion(self, odometry: Odometry, seconds: float) -> None:
@@ -270,3 +278,12 @@ def _check_numbers(seen: Observation, description: RobotDescription) -> None:
     battery = seen.battery
     if battery is not None and not (isinstance(battery, Real) and 0.0 <= battery <= 1.0):
         raise mistake("battery", f"is {battery!r}; it must be a share from 0 to 1, or None")
+
+
+def _check_unit_of_proximity(seen: Observation, reach: float) -> None:
+    """Check the first readings alone: a sensor that fails later is for the pipeline to say."""
+    far = seen.proximity[np.isfinite(seen.proximity) & (seen.proximity > TOO_FAR * reach)]
+    if far.size:
+        raise mistake(
+            "proximity", f"reads {far[0]:g}, but describe() gives ranger_reach {reach:g} m; both are m"
+        )

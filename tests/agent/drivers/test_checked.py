@@ -91,6 +91,26 @@ def test_five_readings_and_no_bearings():
         robot.sense()
 
 
+def test_readings_in_centimetres_and_what_tells_nothing_of_the_unit():
+    with pytest.raises(DeviceError, match=r"proximity reads 30, but describe.* ranger_reach 2 m; both are m"):
+        checked(good(proximity=np.array([2.0, np.inf, 30.0, 0.1, 0.0]))).sense()
+    robot = checked(
+        good(proximity=np.array([2.0, np.inf, np.nan, 8.0, 0.0])),
+        good(stamp_ns=NOW_NS + 10**8, proximity=np.full(5, 655.35)),
+    )
+    assert robot.sense() and robot.sense()
+
+
+def test_a_driver_that_returns_none_has_ended_the_agent_which_is_said(caplog):
+    """As for "no frame yet": the agent ended with status 0 and without a word."""
+    caplog.set_level("INFO")
+    assert checked(GOOD).sense() and not caplog.messages
+    assert checked(None).sense() is None
+    assert caplog.messages == [
+        "no more observations (the driver's sense() has returned None): the agent ends"
+    ]
+
+
 def test_bearings_in_degrees():
     robot = checked(GOOD, description=replace(DESCRIPTION, ranger_bearings=(0.0, 45.0, 90.0)))
     with pytest.raises(DeviceError, match="ranger_bearings are radians, not degrees: 45"):
