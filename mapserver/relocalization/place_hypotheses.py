@@ -1,4 +1,4 @@
-"""Pose hypotheses: places recognised in one view, their evidence, and averaged estimates."""
+"""Place hypotheses: places recognised in one view, their evidence, and averaged estimates."""
 
 from __future__ import annotations
 
