@@ -1,7 +1,7 @@
 """Mapweave as a library: `mapweave.read_map_file`, `mapweave.HybridMap` and what else is named here.
 
 A name is imported when it is first used, so `import mapweave` loads no library. What is not named here may
-change from one version to the next. Nothing in the project itself imports these names from here.
+change from one version to the next. Tests import these names from here; no module of the package does.
 """
 
 import os

@@ -7,8 +7,7 @@ import cv2
 import numpy as np
 import skimage.data
 
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2
+from mapweave import Camera, Pose2
 
 Wall = tuple[np.ndarray, float, float, float, float]
 """A grey picture, and m in world: x of the wall, y of its left edge, z of its top edge, its width."""

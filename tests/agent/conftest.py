@@ -7,13 +7,8 @@ from functools import cached_property
 import numpy as np
 import pytest
 
+from mapweave import Camera, HybridMap, MapId, Node, Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.node import Node
-from mapweave.hybridmap.pose import Pose2
 from synthetic.world import World
 from tests.agent.scripted_fleet import home_map, home_world
 from tests.described import described_once

@@ -11,14 +11,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapweave import HybridMap, MapId, Node, NodeId, Pose2, PoseGaussian, RobotDescription
 from mapweave.agent.mapping.anchored_keyframe import AnchoredKeyframe
 from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
-from mapweave.agent.observation import RobotDescription
 from mapweave.hybridmap.change import ChangeBody
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.registration.recognition import register
 from mapweave.registration.selection import SelectionSettings
 from synthetic.world import CAMERA, Sensing, World, take_node

@@ -4,11 +4,8 @@ import math
 
 import numpy as np
 
-from mapweave.agent.observation import Observation, Odometry, RobotDescription
+from mapweave import Camera, MapId, Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.pipeline import Pipeline, TickResult
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.codec import encode_body
 
 MAP = MapId("r0", 1)

@@ -2,10 +2,9 @@
 
 from collections.abc import Callable
 
+from mapweave import NodeId, Pose2
 from mapweave.agent.mission import MayIDrive, ServerAnswer, WhichWay
 from mapweave.agent.settings import NavigatorSettings
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import ReserveRequest, RouteAnswer
 from mapweave.mapserver.reservations import Reservations
 from mapweave.mapserver.routes import Router

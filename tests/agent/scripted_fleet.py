@@ -6,16 +6,13 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapweave import HybridMap, Landmarks, MapId, Node, NodeId, Pose2, PoseGaussian
 from mapweave.agent.mission import MayIDrive, Question, ServerAnswer, WhereAmI, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER
 from mapweave.agent.navigation.navigator import Navigator
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.robots_in_view import RobotBeside
 from mapweave.agent.settings import AgentSettings, NavigatorSettings
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteLeg, Whereabouts
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Features

@@ -8,9 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapweave.agent.observation import Observation, Odometry
+from mapweave import Observation, Odometry, Pose2
 from mapweave.agent.sensor_input import BlindZone, _within_turn
-from mapweave.hybridmap.pose import Pose2
 from tests.agent.ranged_body import BEARINGS, BODY, ROOM, rangers
 
 DEPTH = 0.25

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
+from mapweave import MapId, Node
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import InvalidValue, SettingsError
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.node import Node
 from mapweave.storage.settings_file import build
 from mapweave.wire.codec import decode_body, encode_body, encode_change
 

@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapweave import Camera, Landmarks, Node, NodeId, Pose2, PoseGaussian, RobotDescription
 from mapweave.agent.camera_occupancy import (
     BEARINGS,
     DARED,
@@ -16,12 +17,7 @@ from mapweave.agent.camera_occupancy import (
     CameraOccupancyGrid,
     free_sectors,
 )
-from mapweave.agent.observation import RobotDescription
 from mapweave.agent.settings import OccupancyGridSettings
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.node import Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
 HEIGHT = 0.3
 ROBOT = RobotDescription(Camera(320, 240, 277.0, 277.0, 159.5, 119.5, HEIGHT, 0.05))

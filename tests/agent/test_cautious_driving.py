@@ -4,6 +4,7 @@ import math
 
 import pytest
 
+from mapweave import Camera, Command, Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.cautious_driving import (
     ALONG_EDGES,
     BACK_OFF,
@@ -13,9 +14,6 @@ from mapweave.agent.cautious_driving import (
     lacks_rangers,
     speed_for,
 )
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2
 
 BODY = RobotDescription(Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3))
 ROOM = 0.4

@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
+from mapweave import Camera, RobotDescription
 from mapweave.agent.clearance import BEFORE, clearance
-from mapweave.agent.observation import RobotDescription
-from mapweave.hybridmap.camera import Camera
 
 CAMERA = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3)
 BEARINGS = tuple(math.radians(b) for b in range(0, 360, 10))

@@ -12,21 +12,18 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapweave import Command, HybridMap, NodeId, Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission import Idle, WhichWay
 from mapweave.agent.mission_control import MissionControl
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import TickResult
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.runner import Runner
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.agent_status import Status
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
-from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.wire.bus import Bus
 from mapweave.wire.bus_settings import BusSettings

@@ -4,14 +4,12 @@ from dataclasses import replace
 
 import pytest
 
+from mapweave import MapId, Odometry, Pose2
 from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.map_making import MapMaking
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.observation import Odometry
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
 
 
 def test_the_floor_sees_a_node_that_is_put_again_once(walls, description, monkeypatch):

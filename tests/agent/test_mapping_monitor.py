@@ -7,10 +7,9 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import Command, Observation, Odometry, Pose2
 from mapweave.agent.mapping_monitor import AGAIN, PATIENCE, MappingMonitor
-from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.hybridmap.agent_status import Status
-from mapweave.hybridmap.pose import Pose2
 
 STOPPED = Odometry(0.0, 0.0)
 DRIVE = Command(0.1, 0.0)

@@ -6,13 +6,13 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave import NodeId, Pose2
 from mapweave.agent.mission import Carried, Explore, GoTo, Idle
 from mapweave.agent.mission_control import GONE, MissionControl, as_mission
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.settings import WithoutServer
 from mapweave.hybridmap.agent_status import Status
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
-from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.hybridmap.mission_order import (
     MAX_KEPT,
@@ -24,7 +24,6 @@ from mapweave.hybridmap.mission_order import (
     later_stamp,
 )
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
-from mapweave.hybridmap.pose import Pose2
 
 GOAL, HOME, NOWHERE = NodeId("r1", 1, 5), NodeId("r0", 1, 1), NodeId("r0", 1, 999)
 

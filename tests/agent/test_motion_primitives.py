@@ -6,11 +6,9 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from mapweave import Camera, NodeId, Observation, Odometry, RobotDescription
 from mapweave.agent.mission import Question, ServerAnswer, WhichWay
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
-from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.query import RouteAnswer
 
 BODY = RobotDescription(Camera(64, 48, 60, 60, 32, 24, 0.3), tick=0.1)

@@ -5,16 +5,11 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from mapweave import Camera, Command, HybridMap, Landmarks, MapId, Node, NodeId, Pose2, PoseGaussian
 from mapweave.agent.mapping import loop_closures
 from mapweave.agent.mapping.loop_closures import LoopClosures
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.observation import Command
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
 

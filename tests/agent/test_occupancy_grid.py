@@ -10,11 +10,9 @@ from hypothesis import strategies as st
 from scipy.ndimage import distance_transform_edt
 from scipy.spatial import cKDTree
 
-from mapweave.agent.observation import RobotDescription
+from mapweave import Camera, Pose2, RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.settings import OccupancyGridSettings
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2
 from tests.quick import first_quick
 
 BEARINGS = tuple(np.linspace(-math.pi, math.pi, 36, endpoint=False).tolist())

@@ -6,16 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave import Command, Edge, EdgeKind, NodeId, Observation, Odometry, Pose2, PoseGaussian
 from mapweave.agent.global_localization import pose_consistency
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mission import Carried, Driven, Explore, GoTo, Idle, WhereAmI, WhoIsNear
-from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.settings import AgentSettings, NavigatorSettings
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.vision.equidistant import Equidistant
 from mapweave.vision.lens import Lens
 from mapweave.wire.codec import encode_body

@@ -13,6 +13,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapweave import Camera, Command, Observation, Odometry, RobotDescription
 from mapweave.agent.drivers.messages import (
     AGAIN,
     ENDED,
@@ -25,8 +26,6 @@ from mapweave.agent.drivers.messages import (
     encode_step,
 )
 from mapweave.agent.drivers.remote import ASK_TIMEOUT, PATIENCE, RemoteRobot
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidMessage, InvalidValue
 from mapweave.processes import simulator
 from mapweave.sim.robots import robot_setups

@@ -7,13 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapweave import Command, HybridMap, MapId, NodeId
 from mapweave.agent.mission import Explore, GoTo
-from mapweave.agent.observation import Command
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.retained_map import RetainedMap
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World

@@ -8,16 +8,13 @@ import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
+from mapweave import Camera, Landmarks, MapId, NodeId, Pose2, PoseGaussian
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mission import Explore, ServerAnswer, WhoIsNear
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.robots_in_view import EVERY, NUMBER, OLDEST, OVERDUE, SIGMAS, RobotsInView
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.nearby import NearbyAnswer, NearbyRobot
-from mapweave.hybridmap.node import Landmarks
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from tests.agent.conftest import PhotoWalls
 from tests.agent.ranged_body import on, rangers
 

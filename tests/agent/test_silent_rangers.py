@@ -5,15 +5,12 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
+from mapweave import Camera, Command, NodeId, Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.drivers.messages import decode_observation, encode_observation
 from mapweave.agent.mission import Carried, Explore, GoTo, Idle
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.ranger_monitor import RangerMonitor
 from mapweave.agent.settings import AgentSettings, ExplorerSettings
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
 from tests.agent.ranged_body import BODY, MAP, on, rangers

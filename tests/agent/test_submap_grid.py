@@ -6,11 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave import MapId, Node, NodeId, Pose2
 from mapweave.agent.occupancy_grid import DECIDED, OccupancyGrid
 from mapweave.agent.submap_grid import MOST_SUBMAPS, STRETCH, SubmapGrid
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Node
-from mapweave.hybridmap.pose import Pose2
 from synthetic.world import room, take_map
 from tests.agent.test_occupancy_grid import ROBOT, SETTINGS, measure
 

@@ -8,15 +8,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave import Command, MapId
 from mapweave.agent.fleet_client import FleetClient
 from mapweave.agent.mission import Driven
 from mapweave.agent.mission_control import MissionControl
-from mapweave.agent.observation import Command
 from mapweave.agent.teleoperation import Teleoperation
 from mapweave.hybridmap.agent_status import HandDrive
 from mapweave.hybridmap.drive_request import DriveAnswer, DriveRequest
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub

@@ -4,13 +4,12 @@ from dataclasses import replace
 
 import pytest
 
+from mapweave import Command, Observation, Odometry, Pose2
 from mapweave.agent.cautious_driving import CREEP, SLOW
 from mapweave.agent.mission import Carried, Driven, Explore, Mission
-from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.ranger_monitor import announcement
 from mapweave.agent.settings import AgentSettings, ExplorerSettings
-from mapweave.hybridmap.pose import Pose2
 from tests.agent.ranged_body import BODY, on, rangers
 
 BARE = replace(BODY, ranger_bearings=(), ranger_reach=0.0)

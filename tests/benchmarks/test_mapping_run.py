@@ -13,9 +13,8 @@ from benchmarks.images.surface_points import Surfaces
 from benchmarks.mapping_run.benchmark import main, notes
 from benchmarks.mapping_run.scene import MappingDrive, RunTick, drive
 from benchmarks.mapping_run.score import LastKnown, figures, landmark_nees, reprojection_errors, track_errors
+from mapweave import Odometry, Pose2, PoseGaussian
 from mapweave.agent.ekf.landmark_estimates import LandmarkEstimates
-from mapweave.agent.observation import Odometry
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.sim.camera import WEBCAM
 from mapweave.sim.robots import RobotSetup
 from mapweave.sim.world import Panel

@@ -12,8 +12,7 @@ from rich.console import Console
 from benchmarks.merge_sim import benchmark as merge_sim
 from benchmarks.merge_sim.benchmark import Failure, figures, measure, outcome, summary
 from benchmarks.merge_sim.run import MergeRun, false_merges
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.pose import Pose2
+from mapweave import NodeId, Pose2
 
 RUN = MergeRun("office", 3, 60, 3, 1, 0.02, 9, 0, 0, 0.7, 150.0, 90.0)
 

@@ -12,13 +12,11 @@ from benchmarks.navigate.drives import PATIENCE, NavigationOutcome, _reason, dri
 from benchmarks.navigate.floor import FreeFloor
 from benchmarks.navigate.office import Mapped
 from benchmarks.navigate.plots import LEAST_EDGES, Plot, draw_plot
+from mapweave import HybridMap, MapId, MissionKind, NodeId
 from mapweave.evaluation.map_score import crossed
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.drive_statistics import DriveStatistics
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.mission_order import MissionKind
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.sim.floorplan import BuildingPlan, Rectangle
 from mapweave.sim.ground_truth_messages import RobotStatus, SimStatus

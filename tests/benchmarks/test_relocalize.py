@@ -16,13 +16,10 @@ from benchmarks.relocalize.pictures import Photographer, RenderedPicture, ViewDi
 from benchmarks.relocalize.places import TruePlace, placed, spread_out, twin_lookouts
 from benchmarks.relocalize.queries import Query, beside
 from benchmarks.relocalize.score import ScoredAnswer, ask, figures, judged, spent
+from mapweave import MapId, Node, NodeId, Pose2, PoseGaussian, Relocalizer
 from mapweave.hybridmap.descriptor import decode, root_sift
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View, Whereabouts
 from mapweave.mapserver.relocalization.calibration import HypothesisSupport
-from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.retrieval.place_index import PlaceIndex
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.matching import MatchSettings, match_vectors

@@ -23,12 +23,8 @@ from benchmarks.rules.switches import (
     by_rule,
     switched_off,
 )
-from mapweave.agent.observation import RobotDescription
+from mapweave import EdgeKind, MapId, Pose2, PoseGaussian, RobotDescription, View
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.node import EdgeKind
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import View
 from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.merging.merger import Merger
 from synthetic.wrong_geometry import SCENES, OdometryFault, draw_fleet

@@ -9,12 +9,11 @@ from benchmarks.figures.measurements import MEASUREMENTS
 from benchmarks.figures.results import StoredResult, load
 from benchmarks.figures.scale import costs_of, scale_page, site
 from benchmarks.fleet.drives import drive
+from mapweave import MapId, NodeId, Pose2
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.change import Change, EdgePut
 from mapweave.hybridmap.drive_statistics import DriveStatistics
-from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
-from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.wire.codec import encode_change

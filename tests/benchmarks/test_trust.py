@@ -11,10 +11,8 @@ import numpy as np
 import pytest
 
 from benchmarks.trust.lying_server import LIES, LyingServer
+from mapweave import HybridMap, MapId, NodeId, Pose2
 from mapweave.hybridmap.errors import InvalidMessage
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, RouteAnswer, RouteRequest, View
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub

@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.ids import MapId
+from mapweave import MapId, write_map_file
 from mapweave.mapserver.map_files import map_file_of
-from mapweave.storage.map_file import write_map_file
 from synthetic.maps import looked_around, merger_of
 from tests.described import described_once
 from tests.examined import examined_once

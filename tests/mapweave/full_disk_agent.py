@@ -14,10 +14,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any
 
+from mapweave import AgentStatus, HybridMap, MapId
 from mapweave.agent.replication.journal import Journal
-from mapweave.hybridmap.agent_status import AgentStatus
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.log.opening import open_store
 from mapweave.scenarios.children import Children, free_port
 from mapweave.wire.bus_settings import BusSettings

@@ -7,8 +7,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from mapweave.agent.observation import Command, Observation
-from mapweave.hybridmap.pose import Pose2
+from mapweave import Command, Observation, Pose2
 from mapweave.sim.simulation import Simulation
 from tests.agent.drivers.emulators import Koala25, KoalaSilver, LineEmulator, TwoWheels
 from tests.mjpeg_stream import MjpegStream

@@ -13,16 +13,14 @@ import numpy as np
 import pytest
 from prometheus_client.parser import text_string_to_metric_families
 
+from mapweave import Command, MissionKind, Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.mission import WhereAmI
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import TickResult
 from mapweave.agent.replication.replicator import ReplicationStatus
 from mapweave.agent.sensor_health.sensor_monitor import SensorFault
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.errors import NotConnected, SettingsError
-from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import AgentOptions
 from mapweave.processes.agent_metrics import AgentMetrics, AgentSources
 from mapweave.processes.agent_process import run_agent

@@ -4,10 +4,9 @@ import io
 
 from rich.console import Console
 
-from mapweave.agent.observation import Command, Observation, Odometry
+from mapweave import Command, Observation, Odometry, Pose2
 from mapweave.agent.pipeline import TickResult
 from mapweave.hybridmap.agent_status import Status
-from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent_progress import A_SECOND, BURST, AgentProgress
 
 

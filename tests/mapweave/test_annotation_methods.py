@@ -7,12 +7,11 @@ import numpy as np
 import pytest
 
 import mapweave
+from mapweave import MapId, NodeId, Pose2
 from mapweave.hybridmap.annotation import Annotation, Closure, Floor, Place, Preference
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError, Refused
-from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.portal import Portal, PortalMeans
-from mapweave.hybridmap.pose import Pose2
 from mapweave.offline_record import OfflineRecord
 from mapweave.opened_map import open_map
 from mapweave.storage.plan_image import plan_file

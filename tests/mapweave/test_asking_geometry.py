@@ -6,14 +6,12 @@ from typing import cast
 import numpy as np
 import pytest
 
+from mapweave import Camera, Observation, Odometry, Relocalizer, RobotDescription
 from mapweave.agent.drive_geometry import DriveGeometry
 from mapweave.agent.drivers.replay import Replay
-from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.evaluation.drive import DriveMap
 from mapweave.evaluation.truth import Truth
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.query import Certainty, RelocalizeAnswer, View
-from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3, 0.0)
 

@@ -4,11 +4,10 @@ import json
 from pathlib import Path
 from typing import Any
 
+from mapweave import MapId, read_map_file
 from mapweave.cli import main
 from mapweave.exit_status import NO
 from mapweave.hybridmap.annotation import Annotations, Closure
-from mapweave.hybridmap.ids import MapId
-from mapweave.storage.map_file import read_map_file
 from synthetic.maps import looked_around, write_store
 
 

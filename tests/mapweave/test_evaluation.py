@@ -12,13 +12,11 @@ import numpy as np
 import pytest
 import skimage.data
 
+from mapweave import Camera, NodeId, Pose2, PoseGaussian
 from mapweave.cli import main
 from mapweave.evaluation.asking_again import Asked, trial_figures, trials_of
 from mapweave.evaluation.photographs import evidence
 from mapweave.evaluation.verdict import JudgedAnswer, figures
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import NO_COMPONENT, Certainty, RelocalizeAnswer, Whereabouts
 from tests.photo_walls import rendered, two_walls
 

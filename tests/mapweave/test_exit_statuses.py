@@ -8,14 +8,12 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import HybridMap, MapId, write_map_file
 from mapweave.cli import main
 from mapweave.exit_status import FAILED, NO, USAGE
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.offline_merge import merge_parts
-from mapweave.storage.map_file import write_map_file
 from synthetic.maps import looked_around
 from tests.mapweave.command_line import commands, parsers
 

@@ -15,6 +15,7 @@ from evo.tools import file_interface
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mapweave import EdgeKind, MapId, NodeId, Pose2, write_map_file
 from mapweave.cli import main
 from mapweave.exit_status import NO
 from mapweave.formats.export import FORMATS
@@ -22,12 +23,8 @@ from mapweave.formats.g2o import G2oEdge, G2oGraph, read_g2o, write_g2o
 from mapweave.formats.g2o_optimum import optimum_of
 from mapweave.formats.map_part import MapPart
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import EdgeKind
-from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
-from mapweave.storage.map_file import write_map_file
 from synthetic.maps import map_tours, merger_of
 from synthetic.world import room
 

@@ -8,16 +8,14 @@ from pathlib import Path
 import psycopg
 import pytest
 
+from mapweave import HybridMap, MapId, NodeId, read_map_file
 from mapweave.agent.replication import salvage
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
 from mapweave.exit_status import NO
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.sqlite_store import SqliteStore
-from mapweave.storage.map_file import read_map_file
 from synthetic.maps import write_store
 from tests.mapweave.command_line import complaint
 from tests.mapweave.test_cli_files import one_node

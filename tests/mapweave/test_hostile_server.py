@@ -10,10 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.agent_status import AgentStatus
-from mapweave.hybridmap.ids import NodeId
+from mapweave import AgentStatus, NodeId, Pose2
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionState
-from mapweave.hybridmap.pose import Pose2
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.scenarios.children import Children, free_port
 from mapweave.wire.bus import Request

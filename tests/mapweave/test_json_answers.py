@@ -9,11 +9,10 @@ from typing import Any
 
 import pytest
 
+from mapweave import MapId, read_map_file
 from mapweave.cli import main
 from mapweave.doctor import camera
 from mapweave.exit_status import USAGE
-from mapweave.hybridmap.ids import MapId
-from mapweave.storage.map_file import read_map_file
 from synthetic.maps import looked_around, write_store
 from tests.mapweave.command_line import commands, parsers
 from tests.mapweave.test_find_devices import plugged, video  # noqa: F401

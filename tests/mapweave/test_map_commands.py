@@ -13,14 +13,13 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import MapFile, MapId, NodeId, read_map_file, write_map_file
 from mapweave.cli import main
 from mapweave.exit_status import FAILED, NO, USAGE
 from mapweave.hybridmap.change import ChangeBody, NodePut
-from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.map_files import merged_of
 from mapweave.opened_map import OpenedMap
 from mapweave.scenarios.children import Children, free_port
-from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.maps import looking_around, map_tours, write_store

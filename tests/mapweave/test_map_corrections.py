@@ -6,10 +6,9 @@ from pathlib import Path
 import pytest
 
 import mapweave
+from mapweave import EdgeKind, MapFile, read_map_file
 from mapweave.cli import main
 from mapweave.hybridmap.change import EdgePut
-from mapweave.hybridmap.node import EdgeKind
-from mapweave.storage.map_file import MapFile, read_map_file
 
 NAMES = "r0.1", "r1.1"
 

@@ -6,15 +6,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave import MapFile, NodeId, Pose2, PoseGaussian, read_map_file, write_map_file
 from mapweave.cli import main
 from mapweave.exit_status import NO
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.map_difference import difference
 from mapweave.mapserver.map_files import merged_of
 from mapweave.merge.pose_graph.merged_map import MergedMap, Placement
-from mapweave.storage.map_file import MapFile, read_map_file, write_map_file
 from tests.mapweave.test_opened_map import LOGS, R0, R1
 
 

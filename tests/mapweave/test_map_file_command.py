@@ -11,16 +11,12 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import Area, Edge, EdgeKind, MapFile, MapId, NodeId, Pose2, PoseGaussian, write_map_file
 from mapweave.cli import main
 from mapweave.drawing.map_picture import MapPicture
 from mapweave.hybridmap.annotation import Annotation, Place
-from mapweave.hybridmap.area import Area
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.content_hash import content_hash
-from mapweave.storage.map_file import MapFile, write_map_file
 from synthetic.maps import changes_of
 from synthetic.world import room, take_map
 

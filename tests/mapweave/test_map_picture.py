@@ -6,6 +6,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave import Edge, EdgeKind, NodeId, Pose2, PoseGaussian
 from mapweave.drawing import map_picture
 from mapweave.drawing.map_picture import (
     COLOURS,
@@ -17,9 +18,6 @@ from mapweave.drawing.map_picture import (
     outline_of,
 )
 from mapweave.drawing.names import CELL, NamePlacement
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.sim.floorplan import BuildingPlan, Rectangle
 from tests.quick import first_quick
 

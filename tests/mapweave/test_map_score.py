@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.optimize import minimize
 
+from mapweave import Edge, EdgeKind, NodeId, Pose2, PoseGaussian
 from mapweave.evaluation.map_score import (
     FALSE_LINK,
     FALSE_LINK_TURN,
@@ -19,9 +20,6 @@ from mapweave.evaluation.map_score import (
     same_place,
     score_map,
 )  # fmt: skip
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.sim.floorplan import Rectangle, distances_to
 
 poses = st.builds(Pose2, st.floats(-9, 9), st.floats(-9, 9), st.floats(-math.pi, math.pi))

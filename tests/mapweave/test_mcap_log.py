@@ -8,24 +8,19 @@ import pytest
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
+from mapweave import Camera, HybridMap, MapId, Pose2, read_camera, read_map_file
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from mapweave.agent.pipeline import Pipeline
-from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main, parser
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import SettingsError
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.markers import SPHERE, landmark_markers
 from mapweave.processes.mcap_log import McapLog, _floor
 from mapweave.processes.tick_log import ellipsoids
 from mapweave.scenarios.fleet import TrialStage
 from mapweave.scenarios.process_fleet import ProcessFleet
 from mapweave.scenarios.scenario import load_scenario, scenario_path
-from mapweave.storage.map_file import read_map_file
 from tests.mapweave.command_line import complaint
 from tests.mapweave.log_readers import read
 from tests.mapweave.wall_drive import COUNT, STEP, wall_drive

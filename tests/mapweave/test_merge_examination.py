@@ -11,6 +11,7 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import HybridMap, MapId, Pose2, read_map_file
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.global_localization import resumption
 from mapweave.agent.global_localization.resumption import TO_MAP
@@ -18,15 +19,11 @@ from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
 from mapweave.evaluation.merging import changes
 from mapweave.evaluation.pieces import OVERLAP, cut
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.camera import WEBCAM
 from mapweave.sim.renderer import Renderer
 from mapweave.sim.scene import Scene
 from mapweave.sim.world import PanelSet
 from mapweave.sim.worlds.catalog import make_world
-from mapweave.storage.map_file import read_map_file
 
 CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
 

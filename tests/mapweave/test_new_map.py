@@ -5,11 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from mapweave import Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.drive_geometry import DriveGeometry
-from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.merging import changes
-from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.merging.merger import Merger
 from tests.agent.calibration.room_drive import CAMERA, drive, render
 

@@ -12,14 +12,13 @@ from urllib.request import urlopen
 import numpy as np
 import pytest
 
+from mapweave import MapId, NodeId, Pose2
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.merged_poses import MergedPoses
 from mapweave.agent.replication.replicator import Replicator
 from mapweave.cli import main
 from mapweave.exit_status import DONE, NO
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.children import Children
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys

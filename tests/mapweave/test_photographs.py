@@ -8,23 +8,16 @@ import cv2
 import numpy as np
 import pytest
 
-from mapweave.agent.recordings.camera_file import read_camera
+from mapweave import Certainty, HybridMap, MapId, Pose2, read_camera, read_grey, relocalizer_of, view_of
 from mapweave.cli import main
 from mapweave.exit_status import FAILED, USAGE
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import Certainty
-from mapweave.offline_relocalization import relocalizer_of
 from mapweave.photographs import SCALE_SHARE, map_of_photographs
 from mapweave.sim.camera import CAMERAS
 from mapweave.sim.photographer import walk
 from mapweave.sim.worlds.catalog import world_from_table
-from mapweave.storage.image_file import read_grey
 from mapweave.storage.map_file import MapFile, read_map_file
-from mapweave.view_features import view_of
 from mapweave.wire.codec import encode_body
 from tests.mapweave.command_line import complaint
 

@@ -5,14 +5,13 @@ from dataclasses import replace
 
 import pytest
 
+from mapweave import NodeId, Pose2, PoseGaussian
 from mapweave.commands.plan import plan_place
 from mapweave.commands.relocalize import _json, _print
 from mapweave.commands.status import COLUMNS, cells
 from mapweave.hybridmap.agent_status import AgentStatus, RobotEntry, Status
 from mapweave.hybridmap.floor_plan import FloorPlan, PlacedPlan, PlanImage, PlanPair, PlanPart
-from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pin import Pin
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from tests.mapserver.stub_services import ANSWER
 
 PLAN_FROM_MERGED = Pose2(10.0, 5.0, math.pi / 2)

@@ -10,13 +10,12 @@ import pytest
 from numpy.typing import NDArray
 
 import mapweave
+from mapweave import MapId, read_map_file, write_map_file
 from mapweave.cli import main
 from mapweave.exit_status import NO, USAGE
 from mapweave.hybridmap.annotation import Annotations, Closure, Floor, Place
-from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.portal import Portal
 from mapweave.mapserver.map_files import map_file_of
-from mapweave.storage.map_file import read_map_file, write_map_file
 from mapweave.storage.plan_image import plan_file
 from synthetic.maps import changes_of, merger_of
 from synthetic.world import room as room_of

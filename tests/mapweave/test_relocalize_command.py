@@ -11,17 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import Camera, Landmarks, MapId, Node, NodeId, Pose2, PoseGaussian, RelocalizeAnswer, View
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
 from mapweave.drawing.match_picture import AGREES_PX, GREEN, Overlay, draw_matches
 from mapweave.exit_status import NO
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.errors import Busy
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import RelocalizeAnswer, View
 from mapweave.mapserver.server import MapServer
 from mapweave.mapserver.services import Services
 from mapweave.storage.map_file import MapFile, write_map_file

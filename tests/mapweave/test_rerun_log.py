@@ -12,19 +12,14 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
+from mapweave import Camera, HybridMap, MapId, Pose2, read_camera, read_map_file
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.occupancy_grid import FREE, OCCUPIED, OccupancyGrid
 from mapweave.agent.pipeline import Pipeline
-from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.cli import main
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import NotConnected, SettingsError
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
-from mapweave.storage.map_file import read_map_file
 from mapweave.vision.lens import Lens
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.agent.localization.test_node_localizer import located

@@ -9,14 +9,11 @@ from collections.abc import Iterator
 import cv2
 import pytest
 
-from mapweave.agent.observation import Command
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.pose import Pose2
+from mapweave import Command, HybridMap, Pose2, read_map_file
 from mapweave.scenarios.children import Children
 from mapweave.sim.robots import RobotSetup
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
-from mapweave.storage.map_file import read_map_file
 from mapweave.wire.ros2.messages import type_hash
 from tests import ros2_peer as peer
 from tests.mapweave.test_ros2_publisher import KINDS, read_markers, read_pose, read_transforms

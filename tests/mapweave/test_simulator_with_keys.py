@@ -5,10 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from mapweave import Fleet, NotConnected
 from mapweave.cli import main
 from mapweave.exit_status import USAGE
-from mapweave.fleet import Fleet
-from mapweave.hybridmap.errors import NotConnected
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.scenarios.children import Children
 from mapweave.wire.credentials import Role

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from mapweave.hybridmap.camera import Camera
+from mapweave import Camera, View
 from mapweave.hybridmap.descriptor import quantise
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.query import View
 from mapweave.structure_from_motion import CAMERA_FROM_LEVEL, Structure, pose_by_points, reconstruct
 from synthetic.world import random_vectors
 

@@ -8,19 +8,14 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import Certainty, Edge, Node, Pose2, read_map_file, relocalizer_of, view_of
 from mapweave.cli import main
 from mapweave.evaluation.visual_replaying import NO_MAP
 from mapweave.exit_status import USAGE
 from mapweave.hybridmap.change import EdgePut, NodePut
-from mapweave.hybridmap.node import Edge, Node
-from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import Certainty
-from mapweave.offline_relocalization import relocalizer_of
 from mapweave.sim.camera import CAMERAS
 from mapweave.sim.photographer import walk
 from mapweave.sim.worlds.catalog import world_from_table
-from mapweave.storage.map_file import read_map_file
-from mapweave.view_features import view_of
 from tests.mapweave.command_line import complaint
 
 COUNT, SPACING, RATE, PHONE = 30, 0.1, 10.0, CAMERAS["phone"]

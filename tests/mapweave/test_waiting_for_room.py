@@ -10,14 +10,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from mapweave.agent.drivers.robot import Robot
-from mapweave.agent.observation import Command, Observation, RobotDescription
+from mapweave import AgentStatus, Command, MapId, MissionKind, Observation, Pose2, Robot, RobotDescription
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.settings import AgentSettings
-from mapweave.hybridmap.agent_status import AgentStatus
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.pose import Pose2
 from mapweave.processes import agent as agent_module
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.storage.full_disks import FullDisk

@@ -10,14 +10,12 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import Fleet, MapId, write_map_file
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
 from mapweave.exit_status import FAILED, NO, USAGE
-from mapweave.fleet import Fleet
-from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.server import MapServer
-from mapweave.storage.map_file import write_map_file
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from synthetic.maps import looked_around, merger_of, write_store

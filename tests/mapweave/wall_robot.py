@@ -11,8 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.hybridmap.pose import Pose2
+from mapweave import Command, Observation, Odometry, Pose2, RobotDescription
 from tests.agent.conftest import CAMERA, PhotoWalls
 
 TICK = 0.1

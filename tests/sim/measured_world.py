@@ -4,8 +4,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2
+from mapweave import Camera, Pose2
 from mapweave.sim.floorplan import Rectangle
 from mapweave.sim.renderer import Renderer
 from mapweave.sim.world import Block, Panel, PanelSet, World

@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from mapweave import Camera, Command, Observation, Odometry, RobotDescription
 from mapweave.agent.drivers.remote import RemoteRobot
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.sim.bridge import SimBridge

@@ -6,9 +6,8 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from mapweave.agent.observation import Command
+from mapweave import Command, Pose2
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.actors import AHEAD, FIGURES, Actor
 from mapweave.sim.events import Walk
 from mapweave.sim.floorplan import BuildingPlan, distances_to

@@ -5,8 +5,7 @@ import time
 
 import pytest
 
-from mapweave.agent.observation import Command
-from mapweave.hybridmap.pose import Pose2
+from mapweave import Command, Pose2
 from mapweave.sim.bridge import SimBridge
 from mapweave.sim.ground_truth_client import SimControl
 from mapweave.sim.lockstep_robot import LockstepRobot

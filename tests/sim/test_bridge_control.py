@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
+from mapweave import Odometry, Pose2
 from mapweave.agent.drivers.messages import ENDED
-from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
-from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.ground_truth_client import SimControl
 from tests.sim.stage import KEYS, PLAN, TICK_NS, Driver, FakeSimulation, Stage
 from tests.waiting import eventually

@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from mapweave.hybridmap.camera import Camera
+from mapweave import Camera, Pose2
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.camera import CAMERAS, CameraSetup, Exposure, undistorted
 from mapweave.sim.imager import Imager
 from mapweave.sim.renderer import Renderer

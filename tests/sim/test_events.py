@@ -9,9 +9,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapweave.agent.observation import Command
+from mapweave import Command, Pose2
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError
-from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.events import KINDS, Fail, Kidnap, Light, MoveFurniture, Walk, parse_event
 from mapweave.sim.robots import RobotSetup
 from mapweave.sim.simulation import Simulation

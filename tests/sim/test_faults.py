@@ -7,8 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from mapweave.agent.observation import Command, Odometry
-from mapweave.hybridmap.pose import Pose2
+from mapweave import Command, Odometry, Pose2
 from mapweave.sim.events import Fail
 from mapweave.sim.faults import SensorFaults, describe
 from mapweave.sim.simulation import Simulation

@@ -6,8 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2
+from mapweave import Camera, Pose2
 from mapweave.sim.renderer import Renderer
 from mapweave.sim.scene import Scene
 from mapweave.sim.texture import Texture

@@ -11,9 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.errors import MapweaveError
-from mapweave.hybridmap.pose import Pose2
+from mapweave import Camera, MapweaveError, Pose2
 from mapweave.sim import worlds
 from mapweave.sim.renderer import Renderer
 from mapweave.sim.world import PanelSet, World

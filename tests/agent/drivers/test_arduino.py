@@ -4,8 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from mapweave.agent.drivers.robot import Robot
-from mapweave.agent.observation import Command
+from mapweave import Command, Robot
 from tests.agent.drivers.contract import RobotContract, drive, drive_until
 from tests.agent.drivers.emulators import ArduinoSketch
 

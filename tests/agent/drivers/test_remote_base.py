@@ -13,10 +13,9 @@ import numpy as np
 import pytest
 import zenoh
 
+from mapweave import Command, Observation, Robot
 from mapweave.agent.drivers.checked import CheckedRobot
 from mapweave.agent.drivers.remote import RemoteRobot
-from mapweave.agent.drivers.robot import Robot
-from mapweave.agent.observation import Command, Observation
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.agent.drivers.contract import (

@@ -5,18 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave import Camera, Edge, EdgeKind, HybridMap, MapId, NodeId, Pose2, PoseGaussian
 from mapweave.agent.edge_measurement.driven_edge import driven_edge
 from mapweave.agent.edge_measurement.traverse import Traverse
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mission import GoTo, ServerAnswer
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Pipeline
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, EdgePut
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.wire.codec import decode_body, encode_body
 from tests.quick import first_quick

@@ -6,19 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave import Camera, HybridMap, NodeId, Odometry, Pose2, PoseGaussian
 from mapweave.agent.edge_measurement import landmark_refinement
 from mapweave.agent.edge_measurement.landmark_refinement import LandmarkRefinement, refined
 from mapweave.agent.ekf.localization_filter import LocalizationFilter
 from mapweave.agent.ekf.localization_state import LocalizationState
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_localizer import NodeLocalizer
-from mapweave.agent.observation import Odometry
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import CODE_BYTES, Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.wire.codec import decode_body, encode_body
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)

@@ -5,14 +5,11 @@ import math
 import numpy as np
 import pytest
 
+from mapweave import Camera, NodeId, Observation, Odometry, Pose2, PoseGaussian, RobotDescription
 from mapweave.agent.edge_measurement import traverse
 from mapweave.agent.edge_measurement.traverse import Traverse, TraverseRecorder
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_localizer import NodeLocalizer
-from mapweave.agent.observation import Observation, Odometry, RobotDescription
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 
 ROBOT = RobotDescription(Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3))
 A, B, C = (NodeId("r0", 1, number) for number in (1, 2, 3))

@@ -7,12 +7,11 @@ from functools import cache
 import numpy as np
 import pytest
 
+from mapweave import Odometry, Pose2
 from mapweave.agent.ekf import pixel_noise
 from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.ekf.update_report import Health
-from mapweave.agent.observation import Odometry
 from mapweave.agent.settings import FilterSettings
-from mapweave.hybridmap.pose import Pose2
 from synthetic.mapping_run import AXLE, SHAPES, WHEEL_NOISE, MappingRun, draw_run
 from tests.quick import first_quick
 

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 
+from mapweave import Odometry, Pose2
 from mapweave.agent.ekf.adaptive_odometry_noise import DISTRUST, AdaptiveOdometryNoise
 from mapweave.agent.ekf.filter_health import FilterHealth
 from mapweave.agent.ekf.motion import WheelNoise
 from mapweave.agent.ekf.update_report import Health
-from mapweave.agent.observation import Odometry
-from mapweave.hybridmap.pose import Pose2
 
 
 def asked(converged: bool, watch: FilterHealth) -> Health:

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from mapweave import Camera, Odometry
 from mapweave.agent.ekf.innovations import (
     LEAF,
     examine,
@@ -18,8 +19,6 @@ from mapweave.agent.ekf.mapping_state import MappingState, WheelStep
 from mapweave.agent.ekf.measurement_model import ImageMeasurement, Pinhole, slots_of
 from mapweave.agent.ekf.motion import move_pose, move_rays, propagate
 from mapweave.agent.ekf.update_report import Health
-from mapweave.agent.observation import Odometry
-from mapweave.hybridmap.camera import Camera
 
 sizes = st.tuples(st.integers(1, 14), st.integers(0, 2**32 - 1))
 steps = st.tuples(st.floats(-0.3, 0.3), st.floats(-0.8, 0.8), st.floats(-0.2, 0.2))

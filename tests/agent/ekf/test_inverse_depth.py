@@ -4,9 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave import Camera, Pose2
 from mapweave.agent.ekf.inverse_depth import points_of_rays, project_anchored, rays_of_points
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2
 
 seeds = st.integers(0, 2**32 - 1)
 mounts = st.sampled_from([0.0, 0.12, -0.05])

@@ -3,12 +3,10 @@
 import numpy as np
 import pytest
 
+from mapweave import Camera, Odometry, Pose2, PoseGaussian
 from mapweave.agent.ekf.localization_filter import LocalizationFilter
 from mapweave.agent.ekf.localization_state import LocalizationState
-from mapweave.agent.observation import Odometry
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from synthetic.localization_run import try_start
 from synthetic.mapping_run import AXLE, CAMERA, WHEEL_NOISE
 

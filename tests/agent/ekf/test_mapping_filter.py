@@ -3,14 +3,12 @@
 import numpy as np
 import pytest
 
+from mapweave import Camera, Odometry, Pose2
 from mapweave.agent.ekf import motion, pixel_noise
 from mapweave.agent.ekf.mapping_filter import MappingFilter
 from mapweave.agent.ekf.motion import WheelNoise, move_pose, move_rays
-from mapweave.agent.observation import Odometry
 from mapweave.agent.settings import FilterSettings
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.pose import Pose2
 from synthetic.mapping_run import AXLE, CAMERA, WHEEL_NOISE, MappingRun, draw_run
 
 AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_forward=0.1)

@@ -4,9 +4,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave import Odometry, Pose2
 from mapweave.agent.ekf.motion import WheelNoise, move_pose, move_rays
-from mapweave.agent.observation import Odometry
-from mapweave.hybridmap.pose import Pose2
 
 steps = st.builds(Odometry, st.floats(-0.2, 0.2), st.floats(-0.4, 0.4))
 mounts = st.sampled_from([0.0, 0.1, -0.07])

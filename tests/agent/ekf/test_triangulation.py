@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
+from mapweave import Camera, Pose2
 from mapweave.agent.ekf.triangulation import Triangulation, triangulate
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.pose import Pose2
 from synthetic.mapping_run import CAMERA, draw_run
 
 AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_forward=0.1)

@@ -9,6 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mapweave import Command, HybridMap, MapId, NodeId, Observation, Odometry
 from mapweave.agent.exploration.avoided_places import FIRST, MOST
 from mapweave.agent.exploration.behaviours import (
     DRIVE,
@@ -19,10 +20,7 @@ from mapweave.agent.exploration.behaviours import (
 )
 from mapweave.agent.exploration.explorer import Explorer
 from mapweave.agent.mapping.episode import Move
-from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.settings import ExplorerSettings
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from tests.agent.ranged_body import BEARINGS, BODY
 

@@ -5,14 +5,12 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
+from mapweave import Command, MapId, Pose2
 from mapweave.agent.exploration import carried_mapping
 from mapweave.agent.exploration.carried_mapping import CarriedMapping
 from mapweave.agent.mapping.episode import EpisodeRequest
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.observation import Command
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
 
 
 @dataclass

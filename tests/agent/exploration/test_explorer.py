@@ -8,6 +8,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mapweave import Camera, Edge, EdgeKind, HybridMap, MapId, NodeId, Pose2, PoseGaussian
 from mapweave.agent.exploration.behaviours import Phase
 from mapweave.agent.exploration.explorer import Explorer
 from mapweave.agent.exploration.viewpoint_selection import REACH
@@ -15,11 +16,6 @@ from mapweave.agent.mission import Explore, ServerAnswer, WhatIsKnown
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.settings import AgentSettings, ExplorerSettings
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import KnownAnswer
 from synthetic.maps import changes_of
 from tests.agent.exploration.test_behaviours import View

@@ -9,19 +9,14 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from mapweave import Camera, HybridMap, Landmarks, MapId, Node, NodeId, Pose2, PoseGaussian, RobotDescription
 from mapweave.agent.clearance import ASIDE, BEFORE, clearance
 from mapweave.agent.exploration.fleet_coverage import FleetCoverage
 from mapweave.agent.exploration.viewpoint_selection import next_viewpoint, seen_around, views_of
 from mapweave.agent.mission import ServerAnswer, WhatIsKnown
-from mapweave.agent.observation import RobotDescription
 from mapweave.agent.occupancy_grid import OccupancyGrid
 from mapweave.agent.settings import ExplorerSettings, OccupancyGridSettings
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import KnownAnswer
 from tests.agent.test_occupancy_grid import unknown
 

@@ -6,19 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave import Certainty, HybridMap, MapId, Observation, Odometry, Pose2, PoseGaussian, RelocalizeAnswer
 from mapweave.agent.global_localization import candidates
 from mapweave.agent.global_localization.candidates import FleetMapSource, OwnMapSource
 from mapweave.agent.global_localization.global_localization import GlobalLocalization
 from mapweave.agent.global_localization.resumption import TO_NAVIGATE
 from mapweave.agent.mission import ServerAnswer, WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
-from mapweave.agent.observation import Observation, Odometry
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.drive_statistics import DriveStatistics
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import Certainty, RelocalizeAnswer
 from mapweave.registration.recognition import Recognition
 from mapweave.vision.sift import Features
 from synthetic.world import take_map

@@ -7,15 +7,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
+from mapweave import Command, HybridMap, MapId, Observation, Odometry, RobotDescription
 from mapweave.agent.global_localization.candidates import OwnMapSource
 from mapweave.agent.global_localization.global_localization import MOVE, GlobalLocalization
 from mapweave.agent.global_localization.pose_consistency import OTHER_VIEW
 from mapweave.agent.global_localization.resumption import TO_MAP, Resumption, SearchPolicy
 from mapweave.agent.motion_primitives import MotionPrimitives
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.node import CODE_BYTES
 from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.vision.sift import Features

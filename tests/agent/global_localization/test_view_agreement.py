@@ -6,9 +6,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave import NodeId, Pose2, PoseGaussian
 from mapweave.agent.global_localization.view_agreement import MEMORY, ViewAgreement
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import NO_COMPONENT, Certainty, RelocalizeAnswer, Whereabouts
 
 FIRST, SECOND = NodeId("r1", 1, 1), NodeId("r1", 1, 2)

@@ -7,9 +7,8 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import Observation, Odometry, Pose2
 from mapweave.agent.localization.node_localizer import NodeLocalizer
-from mapweave.agent.observation import Observation, Odometry
-from mapweave.hybridmap.pose import Pose2
 from mapweave.registration.recognition import recognise
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift

@@ -7,14 +7,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave import HybridMap, Landmarks, MapId, NodeId, Pose2, View
 from mapweave.agent.localization import place_recognition
 from mapweave.agent.localization.place_recognition import aliased_places, recognise_places
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Landmarks
-from mapweave.hybridmap.pose import Pose2
-from mapweave.hybridmap.query import View
 from synthetic.world import CAMERA, World, room, take_map, take_view
 
 HEADINGS = np.arange(0, 2 * math.pi, math.pi / 4)

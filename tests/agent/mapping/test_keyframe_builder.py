@@ -2,16 +2,13 @@
 
 import numpy as np
 
+from mapweave import Camera, MapId, NodeId, Pose2, PoseGaussian, RobotDescription
 from mapweave.agent.mapping import keyframe_builder, loop_closures
 from mapweave.agent.mapping.anchored_keyframe import AnchoredKeyframe
 from mapweave.agent.mapping.keyframe_builder import KeyframeBuilder
-from mapweave.agent.observation import RobotDescription
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.edge_limits import unmeasurable
-from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.registration.selection import SelectionSettings
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.3)

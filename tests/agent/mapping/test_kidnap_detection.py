@@ -7,13 +7,10 @@ import skimage.data
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapweave import Camera, MapId, Observation, Odometry, Pose2
 from mapweave.agent.mapping import image_acceptance
 from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector, relit, turned
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.observation import Observation, Odometry
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.lens import Lens
 
 HERE = Pose2(0.2, 0.1, 0.05)

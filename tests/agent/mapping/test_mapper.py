@@ -7,13 +7,10 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mapweave import HybridMap, MapId, Odometry, Pose2
 from mapweave.agent.mapping import keyframe_builder
 from mapweave.agent.mapping.mapper import Mapper
-from mapweave.agent.observation import Odometry
 from mapweave.hybridmap.change import EdgePut, NodePut
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.merge.mutual_exclusion.trajectories import runs_backwards
 from mapweave.registration.selection import choose
 from mapweave.vision.lens import Lens

@@ -6,12 +6,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave import Edge, EdgeKind, HybridMap, MapId, NodeId, Pose2, PoseGaussian
 from mapweave.agent.mapping.node_retirement import EVERY, KEPT, NodeRetirement, Released, alone
 from mapweave.hybridmap.change import EdgePut, NodePut, NodeRetired
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.reachability import FARTHEST, WIDEST
 from mapweave.hybridmap.superseding import CROWD
 from mapweave.registration.recognition import register

@@ -5,9 +5,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave import Odometry, Pose2
 from mapweave.agent.mapping.odometry_consistency import LASTING, OdometryConsistency
-from mapweave.agent.observation import Odometry
-from mapweave.hybridmap.pose import Pose2
 
 
 def drive(steps, wheels):

@@ -10,11 +10,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapweave import Edge, EdgeKind, HybridMap, MapId, Node, NodeId, Pose2, PoseGaussian
 from mapweave.agent.mapping.relative_poses import LEVER, relative_poses, way_lengths
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from synthetic.maps import changes_of
 from synthetic.world import room, take_map
 

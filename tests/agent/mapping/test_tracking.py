@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 
+from mapweave import Observation, Odometry, Pose2
 from mapweave.agent.mapping.anchored_keyframe import HERE
 from mapweave.agent.mapping.tracking import Tracking
-from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.settings import AgentSettings, TrackingSettings
-from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.lens import Lens
 from mapweave.vision.sift import Sift
 

@@ -5,11 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave import MapId, Observation, Odometry, Pose2
 from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mapping.trajectory_recorder import TrajectoryRecorder
-from mapweave.agent.observation import Observation, Odometry
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.trajectory_segment import MOST
 
 STILL = Odometry(0.0, 0.0)

@@ -7,12 +7,10 @@ import numpy as np
 import pytest
 from scipy.ndimage import distance_transform_edt, label
 
+from mapweave import Camera, Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.navigation.local_planner import LocalPlanner
-from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.servo.dynamic_window import DynamicWindow
 from mapweave.agent.servo.proximity import guard
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2
 from tests.quick import first_quick
 
 BEARINGS = tuple(k * math.tau / 16 for k in range(16))

@@ -9,15 +9,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave import NodeId, Observation, Odometry, Pose2, PoseGaussian, RelocalizeAnswer
 from mapweave.agent.global_localization.refuted_places import RefutedPlaces
 from mapweave.agent.localization.fix import TURN_SHARE, Fix
 from mapweave.agent.motion_primitives import MotionPrimitives
 from mapweave.agent.navigation.answer_trial import TRIALS, AnswerTrial
-from mapweave.agent.observation import Observation, Odometry
 from mapweave.agent.settings import NavigatorSettings
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.hybridmap.query import RelocalizeAnswer
 from synthetic.world import take_map
 from tests.agent.scripted_fleet import (
     BODY,

@@ -5,6 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from mapweave import Camera, Command, Node, Observation, Odometry, Pose2, PoseGaussian, RobotDescription
 from mapweave.agent.localization.fix import Fix
 from mapweave.agent.localization.node_detector import Expected, NodeDetector
 from mapweave.agent.navigation.local_planner import LocalPlanner
@@ -15,13 +16,9 @@ from mapweave.agent.navigation.route_follower import (
     RouteFollower,
     RouteProgress,
 )
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.servo.servo_step import ServoStep
 from mapweave.agent.servo.supervisor import Servo
 from mapweave.agent.settings import AgentSettings
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.node import Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import RouteLeg
 from mapweave.registration.recognition import recognise
 from mapweave.vision.lens import Lens

@@ -9,8 +9,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2
+from mapweave import Camera, Pose2
 from tests.agent.conftest import CAMERA
 
 COUNT = 9

@@ -24,8 +24,8 @@ from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import StoragePlugin, Writer
 from rosbags.typesys import Stores, get_types_from_msg, get_typestore
 
+from mapweave import Command, Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.drivers.replay import Replay
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.recordings import bag
 from mapweave.agent.recordings.camera_info_check import doubts
 from mapweave.agent.recordings.incomplete import Incomplete, NoOdometry
@@ -36,7 +36,6 @@ from mapweave.agent.ros_messages.values import Mount, camera_of
 from mapweave.cli import main
 from mapweave.exit_status import FAILED
 from mapweave.hybridmap.errors import DeviceError
-from mapweave.hybridmap.pose import Pose2
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive, between
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)

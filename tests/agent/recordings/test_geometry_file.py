@@ -8,11 +8,10 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mapweave import Camera, RobotDescription
 from mapweave.agent.calibration.correction import geometry_of
 from mapweave.agent.drive_geometry import DriveGeometry
-from mapweave.agent.observation import RobotDescription
 from mapweave.agent.recordings.geometry_file import KEYS, LIMITS, read_geometry, write_geometry
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, MapweaveError
 from mapweave.processes.agent import measured
 

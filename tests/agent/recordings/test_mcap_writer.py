@@ -11,19 +11,16 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
+from mapweave import Camera, Command, MapId, Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.drivers.checked import CheckedRobot
 from mapweave.agent.drivers.recorded import RecordedRobot
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.recordings.mcap_writer import PART_S, McapWriter
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.agent.ros_messages import making
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.vision.equidistant import Equidistant
 from mapweave.vision.image_reduction import MOST_PIXELS
 from mapweave.vision.lens import NO_DISTORTION, Distortion, Lens

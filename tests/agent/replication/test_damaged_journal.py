@@ -11,16 +11,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mapweave import Camera, Edge, EdgeKind, Landmarks, MapId, Node, NodeId, Pose2, PoseGaussian
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.agent.replication.salvage import salvage
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import ChangeBody, EdgePut, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.quantization import settle
 from mapweave.wire.codec import encode_body
 

@@ -6,10 +6,9 @@ from collections.abc import Iterator
 
 import pytest
 
+from mapweave import MapId, NodeId, Pose2
 from mapweave.agent.replication import merged_poses
 from mapweave.agent.replication.merged_poses import MergedPoses
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.wire.bus import Request
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub

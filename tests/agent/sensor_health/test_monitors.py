@@ -5,13 +5,11 @@ import math
 import numpy as np
 import pytest
 
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
+from mapweave import Camera, Command, Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.ranger_monitor import RangerMonitor
 from mapweave.agent.sensor_health.clock_monitor import ClockMonitor
 from mapweave.agent.sensor_health.encoder_monitor import EncoderMonitor
 from mapweave.agent.sensor_health.sensor_monitor import CameraMonitor
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2
 
 TICK = 0.1
 STANDS, DRIVES = Odometry(0.0, 0.0), Odometry(0.02, 0.0)

@@ -8,12 +8,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapweave.agent.observation import Observation, Odometry
+from mapweave import Camera, Observation, Odometry, Pose2
 from mapweave.agent.sensor_health import odometry_convention
 from mapweave.agent.sensor_health.odometry_convention import OdometryConvention
 from mapweave.agent.vision.visual_odometry import VisualMotion, visual_motion
-from mapweave.hybridmap.camera import Camera
-from mapweave.hybridmap.pose import Pose2
 from tests.agent.conftest import CAMERA, PhotoWalls
 
 REVERSED, DEGREES = "the other way", "in degrees"

@@ -6,18 +6,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave import Command, HybridMap, MapId, NodeId, Observation, Odometry, Pose2
 from mapweave.agent.mapping_monitor import MappingMonitor
 from mapweave.agent.mission import Explore, GoTo, ServerAnswer
 from mapweave.agent.mission_control import MissionControl
-from mapweave.agent.observation import Command, Observation, Odometry
 from mapweave.agent.pipeline import Pipeline, TickResult
 from mapweave.agent.runner import Runner
 from mapweave.agent.sensor_health.sensor_monitor import FIRST_TRIAL, TRIAL_SIDE, SensorFault
 from mapweave.hybridmap.agent_status import Status
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
-from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.worlds.catalog import make_world
 from tests.agent.ranged_body import BODY, on, rangers

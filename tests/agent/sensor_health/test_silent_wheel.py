@@ -6,12 +6,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from mapweave import MapId, Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.mission import Carried
-from mapweave.agent.observation import Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.sensor_health.silent_wheel import SilentWheel
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 
 ROBOT = replace(DESCRIPTION, axle=0.3)

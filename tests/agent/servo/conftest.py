@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from mapweave.agent.observation import Command, RobotDescription
+from mapweave import Camera, Command, RobotDescription
 from mapweave.agent.servo.servo_step import ServoStep
 from mapweave.agent.servo.supervisor import Servo
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.pose import Array, Pose2
 
 FOCAL = 160.0 / math.tan(math.radians(30.0))

@@ -10,9 +10,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from mapweave.agent.observation import RobotDescription
+from mapweave import Camera, RobotDescription
 from mapweave.agent.servo.field_of_view import FieldOfView
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array, Pose2
 

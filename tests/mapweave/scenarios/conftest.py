@@ -6,11 +6,8 @@ from dataclasses import dataclass, field
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.camera import Camera
+from mapweave import Camera, Edge, EdgeKind, Landmarks, MapFile, MapId, Node, NodeId, Pose2, PoseGaussian
 from mapweave.hybridmap.change import EdgePut, NodePut
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.scenarios.recording import (
     Lost,
     RecordedLocalization,
@@ -20,7 +17,6 @@ from mapweave.scenarios.recording import (
     TrialTrajectory,
 )
 from mapweave.sim.floorplan import BuildingPlan, Rectangle
-from mapweave.storage.map_file import MapFile
 
 TICK_NS = 100_000_000
 span = Rectangle.spanning

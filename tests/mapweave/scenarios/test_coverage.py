@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
+from mapweave import Edge, EdgeKind, NodeId, Pose2, PoseGaussian
 from mapweave.scenarios.coverage import REACH, explored_share, longest_loop
 from mapweave.scenarios.recording import TrialTrajectory
 from mapweave.sim.floorplan import BuildingPlan, Rectangle

@@ -3,12 +3,9 @@
 import numpy as np
 import pytest
 
+from mapweave import Camera, Edge, EdgeKind, Landmarks, MapId, Node, NodeId, Pose2, PoseGaussian
 from mapweave.agent.replication.journal import Journal
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import Change, EdgePut, NodePut, NodeRetired
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import Store

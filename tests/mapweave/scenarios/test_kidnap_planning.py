@@ -6,12 +6,8 @@ from itertools import combinations
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.camera import Camera
+from mapweave import Camera, Edge, EdgeKind, HybridMap, Landmarks, Node, NodeId, Pose2, PoseGaussian
 from mapweave.hybridmap.change import EdgePut, EdgeRetired, NodePut
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.scenarios.kidnap_planning import (
     CLEARANCE,
     LEAST_LANDMARKS,

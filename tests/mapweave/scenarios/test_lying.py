@@ -6,11 +6,9 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
+from mapweave import Edge, EdgeKind, MapId, Pose2, PoseGaussian
 from mapweave.hybridmap.change import EdgePut, NodePut
 from mapweave.hybridmap.errors import SettingsError
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.node import Edge, EdgeKind
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.log.entry import ReceivedChange
 from mapweave.scenarios.actions import TryLies, parse_action
 from mapweave.scenarios.figures import kinds

@@ -13,11 +13,9 @@ from evo.core.trajectory import PoseTrajectory3D
 from evo.main_ape import ape
 from evo.main_rpe import rpe
 
+from mapweave import EdgeKind, NodeId, Pose2
 from mapweave.evaluation.map_score import align, pose_error
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.node import EdgeKind
-from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.recording import Lost, RecordedLocalization, TrialTrajectory
 from mapweave.scenarios.score import fleet_hash, pose_at, score
 from mapweave.scenarios.trajectories import score_trajectory

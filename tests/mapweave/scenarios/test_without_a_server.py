@@ -6,10 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from mapweave import AgentStatus, Pose2
 from mapweave.agent.mission_control import GONE
 from mapweave.agent.settings import AgentSettings, WithoutServer
-from mapweave.hybridmap.agent_status import AgentStatus
-from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.fleet import TrialStage
 from mapweave.scenarios.scenario import load_scenario, scenario_path
 from mapweave.wire.messages import decode
