@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-import asyncio
 from http import HTTPStatus
 
 from starlette.exceptions import HTTPException
 from starlette.requests import Request
 
 from mapweave.hybridmap.errors import InvalidValue
+from mapweave.mapserver.http.places import PLACE, Place
 from mapweave.mapserver.http.reply import WHOLE
 
 MOST_BYTES = 16 * 2**20
@@ -24,7 +24,7 @@ async def read_body(
     """All of it; refused before it is sent if it is too long, or of another kind.
 
     Args:
-        request: with the body.
+        request: with the body. Its place is free for others meanwhile.
         kinds: media types that are taken. None of them but a form is one that a page of another site may send
             without asking first.
         patience: within which it has to be there, s.
@@ -34,6 +34,7 @@ async def read_body(
         HTTPException: 411 without a length, 413 too long, 415 of another kind.
         InvalidValue: it is empty, or cut off.
         TimeoutError: it takes too long.
+        Busy: all places are taken once it is there.
     """
     length = _length(request, kinds, most)
     kind = request.headers.get("Content-Type", "").partition(";")[0].strip().lower()
@@ -42,8 +43,9 @@ async def read_body(
         raise HTTPException(
             HTTPStatus.UNSUPPORTED_MEDIA_TYPE, f"{words}: send Content-Type: {' or '.join(kinds)}"
         )
-    body = bytearray()
-    async with asyncio.timeout(patience):
+    body, place = bytearray(), request.scope[PLACE]
+    assert isinstance(place, Place)
+    async with place.left(patience):
         async for piece in request.stream():
             body += piece
     request.scope[WHOLE] = True

@@ -69,6 +69,7 @@ from mapweave.mapserver.http.live import LiveUpdates
 from mapweave.mapserver.http.login import PERSON, PUBLIC, RequestAuthorization, address_of
 from mapweave.mapserver.http.nodes import node_answers
 from mapweave.mapserver.http.pages import page, static
+from mapweave.mapserver.http.places import PLACE, Place, Places
 from mapweave.mapserver.http.plans import plan_answers
 from mapweave.mapserver.http.rates import LIMITED, Rates
 from mapweave.mapserver.http.reply import PATIENCE, JsonLine, busy, refusal
@@ -81,8 +82,6 @@ from mapweave.wire.each_robot import each_robot
 log = logging.getLogger(__name__)
 
 PAGES = ("/", "/why")
-MOST_AT_ONCE = 32
-"""Questions that are served at once; the next one is refused."""
 MISSION = "/robots/ROBOT/go?goal=GOAL"
 OF_ROBOTS = tuple(f"/robots/ROBOT/{word}" for word in ("explore", "stop", "portal-done"))
 METHODS = {
@@ -211,7 +210,7 @@ class Questions:
         self._access = access = RequestAuthorization(logins, patience)
         self.live = LiveUpdates(server, access, before)
         self._patience = patience
-        self._open, self._rates = 0, rates or Rates()
+        self._places, self._rates = Places(), rates or Rates()
         # The question is the router's word for it, by which roles decide.
         answering: list[tuple[str, str, str, Answer]] = [
             ("GET", "/status", "status", self._status),
@@ -250,12 +249,13 @@ class Questions:
         """Answer a question, or refuse it with a reason."""
 
         async def endpoint(request: Request) -> Response:
-            if self._open >= MOST_AT_ONCE:
-                return busy(Busy(1.0))
-            self._open += 1
+            place = request.scope[PLACE] = Place(self._places)
+            place.sent_by(address_of(request), member=False)
             try:
+                place.take()
                 if question != PUBLIC:
                     request.scope[PERSON] = self._access.check(request, question)
+                    place.sent_by(_asker(request), member=True)
                     if question in LIMITED:
                         self._rates.ask(_asker(request))
                 content = await answer(request)
@@ -277,7 +277,7 @@ class Questions:
                 log.exception("no answer to %s", request.url.path)
                 return refusal(HTTPStatus.INTERNAL_SERVER_ERROR, f"the server failed: {error}")
             finally:
-                self._open -= 1
+                place.leave()
 
         return endpoint
 

@@ -28,7 +28,9 @@ from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.identities.logins import Logins
 from mapweave.identities.tokens import TOKENS
 from mapweave.mapserver.http import sessions
+from mapweave.mapserver.http.places import MOST_AT_ONCE
 from mapweave.mapserver.http.rates import MOST_PEOPLE, QUESTIONS, Rates
+from mapweave.mapserver.http.reply import PATIENCE
 from mapweave.mapserver.http.serving import MAX_WAITING, ConnectionTimeouts
 from mapweave.mapserver.http.tls import load, server_context
 from mapweave.mapserver.http.web import Questions, Web
@@ -63,13 +65,13 @@ TABLE: dict[tuple[str, str], set[str]] = {
 class Keyed:
     """A server with the keys of a fleet."""
 
-    def __init__(self, folder: Path, services: StubServices) -> None:
+    def __init__(self, folder: Path, services: StubServices, patience: float = PATIENCE) -> None:
         self.folder = KeyFolder.create(folder, "demo", Profile.LAB, ["maps.example"], "s0")
         for name, role in NAMES.items():
             if role is not Role.SERVER:
                 self.folder.add(name, role)
         self.tokens = {name: self.folder.token(name, 1.0) for name in NAMES}
-        self.web = Web(("127.0.0.1", 0), services, logins=Logins(folder))
+        self.web = Web(("127.0.0.1", 0), services, patience, logins=Logins(folder))
         self.site = f"127.0.0.1:{self.web.port}"
 
     def ask(self, method: str, path: str, name: str = "", body: bytes | None = None, **headers: str) -> int:
@@ -448,6 +450,30 @@ def test_one_who_asks_without_end_gets_the_time_to_retry_and_no_other_waits(
         now = 0.6
         assert keyed.ask("GET", "/explain", "otto") == 200
         assert keyed.ask("GET", "/explain", "otto") == 429
+
+
+@pytest.mark.parametrize(("path", "name"), [("/login", ""), ("/constraints", "otto")])
+def test_bodies_that_never_arrive_hold_up_no_other(
+    tmp_path: Path, services: StubServices, path: str, name: str
+) -> None:
+    """Neither a stranger's nor a member's: other questions are answered, and other bodies arrive."""
+    keyed = Keyed(tmp_path / "keys", services, patience=600.0)
+    token = f"Authorization: Bearer {keyed.tokens[name]}\r\n" if name else ""
+    head = f"POST {path} HTTP/1.1\r\nHost: {keyed.site}\r\n{token}Content-Type: application/json\r\n"
+    with keyed.web, ExitStack() as opened:
+        slow = [
+            opened.enter_context(socket.create_connection(("127.0.0.1", keyed.web.port), timeout=20))
+            for _ in range(MOST_AT_ONCE + 1)
+        ]
+        for connection in slow:
+            connection.sendall(f"{head}Content-Length: 500\r\n\r\n{{".encode())
+        assert keyed.ask("GET", "/status", "vera") == 200
+        answered = select.select(slow, [], [], 5.0)[0]
+        assert answered == slow[:1], "the oldest makes room for the newest"
+        assert slow[0].recv(65536).startswith(b"HTTP/1.1 408")
+        assert keyed.ask("POST", "/stop", "otto") == 200
+        assert keyed.ask("POST", "/relocalize", "vera", picture()) == 200
+        assert keyed.log_in(keyed.tokens["vera"])[0] == 200
 
 
 def test_a_route_counts_as_many_questions_as_it_has_legs(
