@@ -60,7 +60,6 @@ def test_a_robot_describes_what_was_ordered():
     ({"name": "a", "start": [1, 2]}, "start: expected list of length 3"),
 ])  # fmt: skip
 def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says: str):
-    """One line."""
     with pytest.raises(MapweaveError, match=says) as caught:
         robot_from_table(table)
     assert "\n" not in str(caught.value)
@@ -86,7 +85,6 @@ def test_no_table_crashes(table: dict[str, object]):
 
 
 def test_one_to_sixteen_robots():
-    """No more, no fewer, and no two alike."""
     assert len(robot_setups([f"r{k}" for k in range(16)])) == 16
     for robots in ([], [f"r{k}" for k in range(17)]):
         with pytest.raises(InvalidValue, match="1 to 16"):

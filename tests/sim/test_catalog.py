@@ -23,7 +23,6 @@ from mapweave.sim.worlds.catalog import KINDS, make_world, world_from_table
     ("arena", {"length": -3.0}, "length must be a number, 2 to 60; it is -3.0"),
 ])  # fmt: skip
 def test_wrong_parameters_are_reported_in_one_line(kind: str, parameters: dict[str, object], says: str):
-    """Which parameter, and what it may be."""
     with pytest.raises(MapweaveError, match=says) as caught:
         make_world(kind, 1, **parameters)
     assert "\n" not in str(caught.value)

@@ -18,7 +18,6 @@ from mapweave.sim.world import World
 
 
 def test_tables_become_events():
-    """Each kind, with its defaults."""
     assert parse_event({"do": "kidnap", "robot": "r0", "x": 1, "y": 2.0}) == Kidnap("r0", 1.0, 2.0)
     assert parse_event({"do": "light", "factor": 0.3, "seconds": 2}) == Light(0.3, 2.0)
     walk = parse_event({"do": "walk", "path": [[0, 0], [1, 2]], "speed": 1})
@@ -46,7 +45,6 @@ def test_tables_become_events():
     ({"do": "fail", "robot": "r0", "sensor": "rangers", "how": "spike", "amount": 3}, "amount is 3"),
 ])  # fmt: skip
 def test_wrong_tables_are_reported_with_a_reason(table: dict[str, object], says: str):
-    """One line."""
     with pytest.raises(MapweaveError, match=says) as caught:
         parse_event(table)
     assert "\n" not in str(caught.value)

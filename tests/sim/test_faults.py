@@ -117,7 +117,6 @@ def test_bumpers_stick_and_die(walled: World):
 
 
 def test_faults_are_described():
-    """One line that names robot, sensor and way."""
     assert describe(Fail("r0", "camera", "drop", 3.0)) == "the camera of r0 fails (drop) for 3 s"
     assert describe(Fail("r0", "encoders", "spike")) == "the encoders of r0 jump by 0.3 m"
     assert describe(Fail("r1", "rangers", "spike", 2.0)) == "the rangers of r1 fail (spike, 0.1) for 2 s"

@@ -22,7 +22,6 @@ EXAMPLES = Path(__file__).parents[2] / "examples"
 
 @pytest.mark.parametrize("name", first_quick(["ten_lines", "gym_random"], 1))
 def test_examples_run(name: str, capsys):
-    """As they stand."""
     runpy.run_path(str(EXAMPLES / f"{name}.py"), run_name="__main__")
     assert len(capsys.readouterr().out.splitlines()) >= 3
 
@@ -86,7 +85,6 @@ def test_parking_succeeds_and_pays():
 
 
 def test_the_goal_is_given_in_the_frame_of_the_start():
-    """So that a robot that knows where it started knows where to go."""
     env = MapweaveEnv()
     seen, info = env.reset(seed=4)
     start = Pose2.from_vector(info["world_from_robot"])
@@ -100,7 +98,6 @@ def test_the_goal_is_given_in_the_frame_of_the_start():
 
 
 def test_without_gymnasium_one_line_names_the_package(monkeypatch):
-    """Importing fails with a hint."""
     real = builtins.__import__
 
     def without(name: str, *rest, **more):

@@ -133,6 +133,5 @@ def test_there_is_enough_to_see(offices: list[World]):
 
 @pytest.mark.parametrize("rooms", [0, 33])
 def test_offices_that_cannot_be_built_are_refused(rooms: int):
-    """One line says why."""
     with pytest.raises(SettingsError, match=f"rooms must be a whole number, 1 to 32; it is {rooms}"):
         make_world("office", 1, rooms=rooms)

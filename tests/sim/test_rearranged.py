@@ -91,12 +91,10 @@ def test_furniture_is_not_put_down_near_robots():
 
 @pytest.mark.parametrize("share", [0.0, -0.1, 1.01, math.nan, math.inf])
 def test_shares_that_are_none_are_refused(share: float):
-    """One line says what a share is."""
     with pytest.raises(InvalidValue, match="share of the furniture"):
         world_of("office", 1).rearranged(1, share)
 
 
 def test_a_world_without_furniture_cannot_be_rearranged():
-    """One line says so."""
     with pytest.raises(InvalidValue, match="no furniture that can be moved"):
         world_of("corridor", 1).rearranged(1, 0.5)

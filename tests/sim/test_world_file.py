@@ -71,7 +71,6 @@ def test_saved_worlds_are_the_same_again(kind: str, tmp_path):
 
 
 def test_an_unwritable_file_is_reported_in_one_line(tmp_path):
-    """A folder that is not there."""
     with pytest.raises(MapweaveError, match="No such file"):
         save_design(make_design("arena", 1), tmp_path / "nowhere" / "a.toml")
 
@@ -180,7 +179,6 @@ WRONG = [
 
 @pytest.mark.parametrize(("text", "says"), WRONG)
 def test_errors_are_reported_in_one_line(text: str, says: str, tmp_path):
-    """Which file, which item, and what to do."""
     (tmp_path / "my.toml.png").write_text("no picture")
     (tmp_path / "folder.png").mkdir()
     with pytest.raises(MapweaveError, match=says) as caught:
@@ -200,13 +198,11 @@ def test_a_bomb_of_pixels_is_not_decoded(tmp_path, monkeypatch):
 
 
 def test_a_missing_file_is_reported_in_one_line(tmp_path):
-    """Its name, and that it is not there."""
     with pytest.raises(MapweaveError, match=r"gone\.toml: no such file"):
         load_world(tmp_path / "gone.toml")
 
 
 def test_the_page_names_everything():
-    """Every field, texture, kind and parameter stands in docs/worlds.md."""
     page = DOCS.read_text(encoding="utf-8")
     names = [field.name for cls in (Design, *ITEMS.values()) for field in dataclasses.fields(cls)]
     names += [*WALLS, *PAINTERS, *WITH_ARGUMENT, NOTHING, *KINDS]

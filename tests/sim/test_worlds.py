@@ -88,7 +88,6 @@ def test_sixteen_robots_can_start(name: str, seed: int):
 
 @pytest.mark.parametrize("name", ["twins", "small warehouse"])
 def test_too_many_robots_are_refused_with_the_number_that_fits(name: str):
-    """And so many do fit."""
     world = world_of(name, 1)
     with pytest.raises(InvalidValue, match="make the world larger") as caught:
         world.start_poses(400, 1)

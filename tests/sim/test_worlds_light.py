@@ -35,7 +35,6 @@ SURFACES = {
 
 @pytest.mark.parametrize("name", SURFACES)
 def test_light_is_that_of_points_under_lamps(name: str):
-    """Inverse squares and two cosines, one point after another."""
     surface = SURFACES[name]
     outward = {"wall to the south": (0, -1, 0), "wall to the east": (1, 0, 0), "floor": (0, 0, 1)}[name]
     columns, rows = 7, 5
