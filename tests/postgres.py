@@ -5,12 +5,15 @@ import os
 import shutil
 import tempfile
 from collections.abc import Iterator
+from contextlib import contextmanager
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import pytest
 
 from synthetic.postgres_server import PostgresServer, binaries
+from tests.waiting import eventually
 
 TEMPLATE = "MAPWEAVE_TEST_POSTGRES"
 """Names the folder of the cluster that others are copies of, to all processes of a run."""
@@ -44,6 +47,29 @@ def postgres(postgres_server: PostgresServer) -> Iterator[PostgresServer]:
     """The same; a test takes databases of its own."""
     yield postgres_server
     postgres_server.take_back()
+
+
+@pytest.fixture
+def own_postgres() -> Iterator[PostgresServer]:
+    """One that a test may kill."""
+    yield from started()
+
+
+@contextmanager
+def absent_standby(postgres: PostgresServer) -> Iterator[Any]:
+    """Commits wait for a standby that is not there; yields a connection by which people look."""
+    import psycopg
+
+    with psycopg.connect(postgres.address(), autocommit=True) as people:
+        people.execute("ALTER SYSTEM SET synchronous_standby_names = 'absent'")
+        people.execute("SELECT pg_reload_conf()")
+        try:
+            # The setting is in force a little later.
+            eventually(lambda: people.execute("SHOW synchronous_standby_names").fetchone() == ("absent",))
+            yield people
+        finally:
+            people.execute("ALTER SYSTEM RESET synchronous_standby_names")
+            people.execute("SELECT pg_reload_conf()")
 
 
 @pytest.fixture

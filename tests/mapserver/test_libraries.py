@@ -26,11 +26,9 @@ def test_all_are_loaded_and_the_kernels_behind_them(monkeypatch: pytest.MonkeyPa
 
 
 def test_a_server_loads_all_of_them(hub: MemoryHub, tmp_path: Path) -> None:
-    bus = MemoryBus(hub)
-    with MapServer(bus, Keys("fleet"), tmp_path / "s0.sqlite", "s0") as running:
+    with MapServer(MemoryBus(hub), Keys("fleet"), tmp_path / "s0.sqlite", "s0") as running:
         assert running.settle(60)
         assert set(SLOW) <= sys.modules.keys()
-    bus.close()
 
 
 def test_a_server_that_is_stopped_meanwhile_ends_without_the_rest(
@@ -44,10 +42,8 @@ def test_a_server_that_is_stopped_meanwhile_ends_without_the_rest(
         more.wait(0.5)
 
     monkeypatch.setattr(server, "library_jobs", lambda: [first, lambda: ran.append(2), lambda: ran.append(3)])
-    bus = MemoryBus(hub)
-    with MapServer(bus, Keys("fleet"), tmp_path / "s0.sqlite", "s0"):
+    with MapServer(MemoryBus(hub), Keys("fleet"), tmp_path / "s0.sqlite", "s0"):
         assert began.wait(30)
-    bus.close()
     assert not ran
 
 
@@ -70,4 +66,3 @@ def test_a_server_whose_start_fails_leaves_nothing_running(
     # Nor does it hold its store.
     with MapServer(bus, Keys(), tmp_path / "s", "s0") as running:
         assert running.settle(60)
-    bus.close()

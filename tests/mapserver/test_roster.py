@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from contextlib import ExitStack, closing
+from collections.abc import Iterable, Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -37,6 +38,7 @@ from mapweave.mapserver.roster import MOST_ALIVE, STAGGER, STATUSES_PER_S, Roste
 from mapweave.mapserver.routes import Router
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.merged_map import MergedMap
+from mapweave.wire.bus import Closing
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import decode, encode
@@ -46,33 +48,43 @@ from tests.waiting import eventually
 KEYS = Keys("fleet")
 
 
+class Listening:
+    """A roster on a bus of its own, at the time that a test sets."""
+
+    def __init__(self, hub: MemoryHub) -> None:
+        self.bus, self.quotas, self.now = MemoryBus(hub), Quotas(), 0.0
+        self.roster = Roster(self.bus, KEYS, lambda: self.now, lambda status: None, self.quotas)
+
+    def come(self, maps: Iterable[MapId]) -> list[Closing]:
+        return [self.bus.announce(KEYS.agent_alive(map_id)) for map_id in maps]
+
+
+@pytest.fixture
+def listening(hub: MemoryHub) -> Iterator[Listening]:
+    listening = Listening(hub)
+    yield listening
+    listening.roster.close()
+
+
 @pytest.mark.parametrize(
     ("robots", "period"), first_quick([(0, 0.0), (200, 0.0), (300, 0.75), (1000, 2.5), (1700, 4.0)], 3)
 )
-def test_the_period_of_statuses_grows_with_the_number_of_robots(robots: int, period: float) -> None:
-    with ExitStack() as stack:
-        bus = MemoryBus(MemoryHub())
-        stack.callback(bus.close)
-        roster = Roster(bus, KEYS, lambda: 0.0, lambda status: None, Quotas())
-        stack.callback(roster.close)
-        tokens = [bus.announce(KEYS.agent_alive(MapId(f"r{k}", 1))) for k in range(robots)]
-        eventually(lambda: roster.status_period() == period and roster.alive("r0") is bool(robots))
-        for token in tokens[50:]:
-            token.close()
-        eventually(lambda: roster.status_period() == 0.0)
+def test_the_period_of_statuses_grows_with_the_number_of_robots(
+    listening: Listening, robots: int, period: float
+) -> None:
+    roster = listening.roster
+    tokens = listening.come(MapId(f"r{k}", 1) for k in range(robots))
+    eventually(lambda: roster.status_period() == period and roster.alive("r0") is bool(robots))
+    for token in tokens[50:]:
+        token.close()
+    eventually(lambda: roster.status_period() == 0.0)
 
 
-def test_robots_that_begin_together_report_apart_after_two_periods() -> None:
+def test_robots_that_begin_together_report_apart_after_two_periods(listening: Listening) -> None:
     """In step, 1000 robots filled two cores for half a second, five times in 12.5 s."""
-    with ExitStack() as stack:
-        bus = MemoryBus(MemoryHub())
-        stack.callback(bus.close)
-        roster = Roster(bus, KEYS, lambda: 0.0, lambda status: None, Quotas())
-        stack.callback(roster.close)
-        for k in range(1000):
-            bus.announce(KEYS.agent_alive(MapId(f"r{k}", 1)))
-        eventually(lambda: roster.status_period() == 2.5)
-        periods = np.array([roster.status_period_of(f"r{k}") for k in range(1000)])
+    listening.come(MapId(f"r{k}", 1) for k in range(1000))
+    eventually(lambda: listening.roster.status_period() == 2.5)
+    periods = np.array([listening.roster.status_period_of(f"r{k}") for k in range(1000)])
     rate = float(np.sum(1.0 / periods))
     assert rate == pytest.approx(400.0, rel=0.02)
     times = np.arange(50)[:, None] * periods
@@ -80,50 +92,43 @@ def test_robots_that_begin_together_report_apart_after_two_periods() -> None:
         assert np.count_nonzero((times >= begin) & (times < begin + 0.5)) < 2 * 0.5 * rate
 
 
-def test_a_robot_that_reports_far_too_often_is_reminded() -> None:
-    now, reminded = [0.0], list[MapId]()
-    with ExitStack() as stack:
-        bus = MemoryBus(MemoryHub())
-        stack.callback(bus.close)
-        roster = Roster(bus, KEYS, lambda: now[0], lambda status: None, Quotas())
-        stack.callback(roster.close)
-        roster.remind = reminded.append
+def test_a_robot_that_reports_far_too_often_is_reminded(listening: Listening) -> None:
+    roster, reminded = listening.roster, list[MapId]()
+    roster.remind = reminded.append
 
-        def report(robot: str, at: float) -> int:
-            now[0], before = at, reminded.count(MapId(robot, 3))
-            said = AgentStatus(Status("standing", "", 1, 0, Pose2(), False), round(1e9 * at), robot, 3)
-            # The second one is taken when all is done about the first.
-            for one in (said, replace(said, robot="another")):
-                bus.publish(KEYS.agent_status(one.robot), encode(one))
-                eventually(lambda one=one: roster.status(one.robot) == one)
-            return reminded.count(MapId(robot, 3)) - before
+    def report(robot: str, at: float) -> int:
+        listening.now, before = at, reminded.count(MapId(robot, 3))
+        said = AgentStatus(Status("standing", "", 1, 0, Pose2(), False), round(1e9 * at), robot, 3)
+        # The second one is taken when all is done about the first.
+        for one in (said, replace(said, robot="another")):
+            listening.bus.publish(KEYS.agent_status(one.robot), encode(one))
+            eventually(lambda one=one: roster.status(one.robot) == one)
+        return reminded.count(MapId(robot, 3)) - before
 
-        for k in range(4):
-            report("r0", 100.0 + 0.5 * (k // 2))
-        assert not reminded, "a small fleet reports as it likes"
-        for k in range(1000):
-            bus.announce(KEYS.agent_alive(MapId(f"r{k}", 3)))
-        eventually(lambda: roster.status_period() == 2.5)
-        period = roster.status_period_of("r0")
-        for k in range(4):
-            assert not report("r0", 200.0 + period * k), "as it should"
-        assert not report("r1", 300.0), "the first"
-        assert report("r1", 300.5) == 1
-        # One that does not listen keeps no other from it.
-        assert sum(report("r1", 300.6 + 0.01 * k) for k in range(40)) == 0
-        assert not report("r2", 301.0) and report("r2", 301.5) == 1
-        assert not report("r1", 300.5 + LONGEST_STATUS_PERIOD), "as rarely as it may"
-        assert report("r1", 305.0) == 1
+    for k in range(4):
+        report("r0", 100.0 + 0.5 * (k // 2))
+    assert not reminded, "a small fleet reports as it likes"
+    listening.come(MapId(f"r{k}", 3) for k in range(1000))
+    eventually(lambda: roster.status_period() == 2.5)
+    period = roster.status_period_of("r0")
+    for k in range(4):
+        assert not report("r0", 200.0 + period * k), "as it should"
+    assert not report("r1", 300.0), "the first"
+    assert report("r1", 300.5) == 1
+    # One that does not listen keeps no other from it.
+    assert sum(report("r1", 300.6 + 0.01 * k) for k in range(40)) == 0
+    assert not report("r2", 301.0) and report("r2", 301.5) == 1
+    assert not report("r1", 300.5 + LONGEST_STATUS_PERIOD), "as rarely as it may"
+    assert report("r1", 305.0) == 1
 
 
 @pytest.mark.parametrize("comes_first", [False, True])
-def test_a_robot_that_makes_no_node_hears_how_rarely_to_report(tmp_path: Path, comes_first: bool) -> None:
+def test_a_robot_that_makes_no_node_hears_how_rarely_to_report(
+    hub: MemoryHub, tmp_path: Path, comes_first: bool
+) -> None:
     """It is acknowledged nothing new: 1000 such robots sent 2000 statuses a second."""
-    hub = MemoryHub()
-    with ExitStack() as stack:
-        bus = MemoryBus(hub)
-        stack.callback(bus.close)
-        stack.enter_context(MapServer(bus, KEYS, tmp_path / "s0.sqlite", "s0"))
+    bus = MemoryBus(hub)
+    with MapServer(bus, KEYS, tmp_path / "s0.sqlite", "s0"):
 
         def others_come() -> None:
             for k in range(1000):
@@ -179,20 +184,16 @@ def test_one_answer_holds_all_robots_whatever_they_do() -> None:
     assert decode(encode(FleetStatus(entries)), FleetStatus).robots == entries
 
 
-def test_a_robot_that_is_alive_under_many_maps_is_named_and_harms_itself_alone() -> None:
-    with ExitStack() as stack:
-        bus, quotas = MemoryBus(MemoryHub()), Quotas()
-        stack.callback(bus.close)
-        roster = Roster(bus, KEYS, lambda: 0.0, lambda status: None, quotas)
-        stack.callback(roster.close)
-        tokens = [bus.announce(KEYS.agent_alive(MapId("r3", epoch))) for epoch in range(40)]
-        bus.announce(KEYS.agent_alive(MapId("r1", 1)))
-        eventually(lambda: roster.alive("r1"))
-        eventually(lambda: quotas.over() == {"r3": "over its quota: 32 liveliness tokens"})
-        places, way = PlaceResolver(Router(MergedMap.empty()), Annotations()), 100 * (NodeId("r3", 1, 1),)
-        entries = roster.robots(places, {"r3": way}).robots
-        assert entries[1].over_quota and [len(one.ahead) for one in entries] == [0, MOST_AHEAD]
-        assert roster.alive("r3") and len(roster._alive["r3"]) == MOST_ALIVE
-        for token in tokens:
-            token.close()
-        eventually(lambda: not roster.alive("r3"))
+def test_a_robot_that_is_alive_under_many_maps_is_named_and_harms_itself_alone(listening: Listening) -> None:
+    roster, quotas = listening.roster, listening.quotas
+    tokens = listening.come(MapId("r3", epoch) for epoch in range(40))
+    listening.come([MapId("r1", 1)])
+    eventually(lambda: roster.alive("r1"))
+    eventually(lambda: quotas.over() == {"r3": "over its quota: 32 liveliness tokens"})
+    places, way = PlaceResolver(Router(MergedMap.empty()), Annotations()), 100 * (NodeId("r3", 1, 1),)
+    entries = roster.robots(places, {"r3": way}).robots
+    assert entries[1].over_quota and [len(one.ahead) for one in entries] == [0, MOST_AHEAD]
+    assert roster.alive("r3") and len(roster._alive["r3"]) == MOST_ALIVE
+    for token in tokens:
+        token.close()
+    eventually(lambda: not roster.alive("r3"))

@@ -140,22 +140,17 @@ def test_one_of_several_standbys_may_become_the_primary() -> None:
 
 @pytest.mark.slow
 @pytest.mark.waits
-def test_a_pooler_whose_server_is_down_is_waited_for() -> None:
-    servers = started()
-    server = next(servers)
-    try:
-        with pooled(server, "session") as pooler:
-            address = pooler.through(server.address())
-            server.stop()
-            pooler.process.terminate()
-            pooler.process.wait(30)
-            pooler.process = subprocess.Popen(
-                pooler.process.args, user=server.user, stderr=subprocess.DEVNULL
-            )
-            eventually(lambda: "/.s.PGSQL" not in refused(address))
-            assert away(address)
-    finally:
-        servers.close()
+def test_a_pooler_whose_server_is_down_is_waited_for(own_postgres: PostgresServer) -> None:
+    with pooled(own_postgres, "session") as pooler:
+        address = pooler.through(own_postgres.address())
+        own_postgres.stop()
+        pooler.process.terminate()
+        pooler.process.wait(30)
+        pooler.process = subprocess.Popen(
+            pooler.process.args, user=own_postgres.user, stderr=subprocess.DEVNULL
+        )
+        eventually(lambda: "/.s.PGSQL" not in refused(address))
+        assert away(address)
 
 
 def test_what_is_wrong_with_a_session_that_was_made_is_no_reason_to_wait(postgres: PostgresServer) -> None:

@@ -109,27 +109,20 @@ def test_a_standby_is_named_as_one_that_only_reads(tmp_path: Path) -> None:
         servers.close()
 
 
-def test_a_password_that_is_missing_is_looked_for_in_its_file() -> None:
-    servers = started()
-    server = next(servers)
-    try:
-        (server.data / "pg_hba.conf").write_text("local all all scram-sha-256\n")
-        with psycopg.connect(server.address(), autocommit=True) as connection:
-            connection.execute("SELECT pg_reload_conf()")
-        address = PostgresAddress.read(server.address())
+def test_a_password_that_is_missing_is_looked_for_in_its_file(own_postgres: PostgresServer) -> None:
+    (own_postgres.data / "pg_hba.conf").write_text("local all all scram-sha-256\n")
+    with psycopg.connect(own_postgres.address(), autocommit=True) as connection:
+        connection.execute("SELECT pg_reload_conf()")
+    address = PostgresAddress.read(own_postgres.address())
 
-        def refused() -> str:
-            session = PostgresSession(address, "test")
+    def refused() -> str:
+        with closing(PostgresSession(address, "test")) as session:
             try:
                 return str(session.connection.info.status)
             except InvalidFile as error:
                 return str(error)
-            finally:
-                session.close()
 
-        eventually(lambda: "no password supplied: ~/.pgpass (PGPASSFILE) has none" in refused())
-    finally:
-        servers.close()
+    eventually(lambda: "no password supplied: ~/.pgpass (PGPASSFILE) has none" in refused())
 
 
 def test_a_lock_that_another_session_holds_is_explained(postgres: PostgresServer) -> None:
@@ -171,13 +164,10 @@ def test_a_connection_that_is_lost_in_a_pipeline_says_no_more_than_its_error(
     assert not caplog.records
 
 
-def test_a_server_that_was_killed_is_named_without_guesses() -> None:
-    servers = started()
-    server = next(servers)
-    session = PostgresSession(PostgresAddress.read(server.address()), "test")
-    try:
+def test_a_server_that_was_killed_is_named_without_guesses(own_postgres: PostgresServer) -> None:
+    with closing(PostgresSession(PostgresAddress.read(own_postgres.address()), "test")) as session:
         connection = session.connection
-        server.kill()
+        own_postgres.kill()
         with pytest.raises(InvalidFile) as lost, session.guard():
             connection.execute("SELECT 1")
         # A process of PostgreSQL that outlives the first one for a moment says so itself.
@@ -186,6 +176,3 @@ def test_a_server_that_was_killed_is_named_without_guesses() -> None:
             "terminating connection due to unexpected postmaster exit",
         )
         assert str(lost.value).endswith(tuple(f"cannot be used ({reason})" for reason in reasons))
-    finally:
-        session.close()
-        servers.close()

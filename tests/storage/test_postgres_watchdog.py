@@ -14,7 +14,7 @@ from mapweave.storage import postgres_watchdog
 from mapweave.storage.postgres_session import PostgresAddress, PostgresSession
 from mapweave.storage.postgres_watchdog import PostgresWatchdog
 from synthetic.postgres_server import PostgresServer
-from tests.postgres import started
+from tests.postgres import absent_standby, started
 from tests.waiting import eventually
 
 
@@ -64,8 +64,7 @@ def test_a_session_that_waits_for_a_postgresql_that_runs_goes_on_waiting(server:
     began = time.monotonic()
     with psycopg.connect(server.address(), autocommit=True) as people:
         people.execute("CREATE TABLE public.made (number INT)")
-        people.execute("ALTER SYSTEM SET synchronous_standby_names = 'none'")
-        people.execute("SELECT pg_reload_conf()")
+    with absent_standby(server) as people:
         waiting = threading.Thread(
             target=ask, args=(session, "INSERT INTO public.made VALUES (1) RETURNING 1")
         )
@@ -75,8 +74,6 @@ def test_a_session_that_waits_for_a_postgresql_that_runs_goes_on_waiting(server:
         )
         time.sleep(max(0.0, began + 2.0 - time.monotonic()))
         assert waiting.is_alive()
-        people.execute("ALTER SYSTEM RESET synchronous_standby_names")
-        people.execute("SELECT pg_reload_conf()")
     waiting.join(20.0)
     assert not waiting.is_alive()
     assert session.is_open

@@ -35,7 +35,7 @@ from synthetic.postgres_server import PostgresServer
 from tests.mapserver.log.acknowledged_fleet import AGENT, KEYS, ROBOTS, SERVER, life
 from tests.mapserver.log.test_older_store import PATIENCE, Robot, contents
 from tests.mapserver.log.test_store import MAP, entry, node_put
-from tests.postgres import started
+from tests.postgres import absent_standby
 from tests.waiting import eventually
 
 Log = list[tuple[int, bytes]]
@@ -230,12 +230,11 @@ def test_decisions_on_one_server_reach_the_other(
 
 
 @pytest.mark.slow
-def test_robots_keep_what_they_have_while_postgresql_is_away(journals: list[Journal]) -> None:
+def test_robots_keep_what_they_have_while_postgresql_is_away(
+    journals: list[Journal], hub: MemoryHub, own_postgres: PostgresServer
+) -> None:
     """Also a robot that the server has not known before."""
-    servers = started()
-    postgres = next(servers)
-    hub = MemoryHub()
-    server = FrontServer(hub, postgres.database(), "s0")
+    server = FrontServer(hub, own_postgres.database(), "s0")
     rng = np.random.default_rng(3)
     maps = [journal.open_map(1) for journal in journals]
     robots = [
@@ -244,7 +243,7 @@ def test_robots_keep_what_they_have_while_postgresql_is_away(journals: list[Jour
     ]
     robots[0].submit(life(maps[0], rng, 10), 1)
     assert robots[0].wait_acknowledged(30)
-    postgres.kill()
+    own_postgres.kill()
     for robot, map_id in zip(robots, maps, strict=True):
         robot.submit(life(map_id, rng, 10), 2)
     eventually(lambda: "the map store cannot be used" in server.ingest.failure)
@@ -252,14 +251,13 @@ def test_robots_keep_what_they_have_while_postgresql_is_away(journals: list[Jour
     (answer,) = asked.ask(KEYS.ack("s0", "r1"), b"", 10.0)
     assert "the map store cannot be used" in answer.error, "it cannot know which maps there are"
     assert not any(robot.wait_acknowledged(0.0) for robot in robots)
-    postgres.start()
+    own_postgres.start()
     for robot in robots:
         assert robot.wait_acknowledged(60)
     assert server.logs() == logs_of(journals)
     for robot in robots:
         robot.close()
     server.close()
-    servers.close()
 
 
 def test_a_commit_that_waits_for_a_standby_is_reported(
@@ -274,18 +272,10 @@ def test_a_commit_that_waits_for_a_standby_is_reported(
     rng = np.random.default_rng(3)
     robot.submit(life(map_id, rng, 10), 1)
     assert robot.wait_acknowledged(30) and not server.ingest.failure
-    with psycopg.connect(postgres.address(), autocommit=True) as people:
-        people.execute("ALTER SYSTEM SET synchronous_standby_names = 'absent'")
-        people.execute("SELECT pg_reload_conf()")
-        try:
-            # The setting is in force a little later.
-            eventually(lambda: people.execute("SHOW synchronous_standby_names").fetchone() == ("absent",))
-            robot.submit(life(map_id, rng, 10), 2)
-            eventually(lambda: "no standby of PostgreSQL confirms" in server.ingest.failure)
-            assert not robot.wait_acknowledged(0.0)
-        finally:
-            people.execute("ALTER SYSTEM RESET synchronous_standby_names")
-            people.execute("SELECT pg_reload_conf()")
+    with absent_standby(postgres):
+        robot.submit(life(map_id, rng, 10), 2)
+        eventually(lambda: "no standby of PostgreSQL confirms" in server.ingest.failure)
+        assert not robot.wait_acknowledged(0.0)
     assert robot.wait_acknowledged(60)
     eventually(lambda: not server.ingest.failure)
     robot.close()

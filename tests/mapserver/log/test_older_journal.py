@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import shutil
 from collections.abc import Iterator
-from contextlib import ExitStack, closing
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 
@@ -46,18 +46,22 @@ def serving(bus: MemoryBus, store: SqliteStore) -> Ingest:
     return Ingest(bus, Keys("fleet"), store, "s0", lambda change: None)
 
 
-@pytest.fixture
-def hub() -> Iterator[MemoryHub]:
-    yield MemoryHub()
+@contextmanager
+def unchanged(hub: MemoryHub, folder: Path) -> Iterator[Ingest]:
+    """A server on that store, which has at the end what it had before."""
+    with closing(SqliteStore(folder / "s0.sqlite")) as store:
+        had = contents(change.body for change in store.replay(MAP))
+        with closing(MemoryBus(hub)) as bus, closing(serving(bus, store)) as ingest:
+            yield ingest
+            assert contents(change.body for change in store.replay(MAP)) == had
+            assert store.watermark(MAP) == 9
 
 
 @pytest.mark.parametrize("away", [False, True], ids=["the server is there", "the network comes later"])
 def test_what_a_robot_maps_behind_an_older_journal_does_not_pass_for_what_the_server_has(
     put_back: Path, hub: MemoryHub, away: bool
 ) -> None:
-    store = SqliteStore(put_back / "s0.sqlite")
-    had = contents(change.body for change in store.replay(MAP))
-    with closing(MemoryBus(hub)) as bus, closing(store), closing(serving(bus, store)) as ingest:
+    with unchanged(hub, put_back) as ingest:
         with closing(Robot(hub, put_back)) as robot:
             link = robot.replicator
             if away:
@@ -81,7 +85,6 @@ def test_what_a_robot_maps_behind_an_older_journal_does_not_pass_for_what_the_se
             with closing(Replicator(robot._bus, Keys("fleet"), robot.journal, MapId("r0", 2))) as fresh:
                 fresh.submit([NodePut(replace(node_put(1).node, id=NodeId("r0", 2, 1)))], 1)
                 assert fresh.wait_acknowledged(PATIENCE) and not fresh.status().failure
-        assert contents(change.body for change in store.replay(MAP)) == had and store.watermark(MAP) == 9
         assert asked <= 2
 
 
@@ -93,13 +96,9 @@ def test_so_is_what_was_mapped_without_a_network_before_the_last_start(
     with closing(Robot(MemoryHub(), put_back)) as robot:
         robot.replicator.submit([node_put(number) for number in range(20, 20 + count)], 1)
         assert robot.replicator.flush(PATIENCE) and robot.journal.head(MAP) == 5 + count
-    store = SqliteStore(put_back / "s0.sqlite")
-    had = contents(change.body for change in store.replay(MAP))
-    with closing(MemoryBus(hub)) as bus, closing(store), closing(serving(bus, store)):
-        with closing(Robot(hub, put_back)) as robot:
-            eventually(lambda: "begin a fresh map" in robot.replicator.status().failure, PATIENCE)
-            assert not robot.replicator.wait_acknowledged(1.0)
-        assert contents(change.body for change in store.replay(MAP)) == had and store.watermark(MAP) == 9
+    with unchanged(hub, put_back), closing(Robot(hub, put_back)) as robot:
+        eventually(lambda: "begin a fresh map" in robot.replicator.status().failure, PATIENCE)
+        assert not robot.replicator.wait_acknowledged(1.0)
 
 
 def test_so_is_what_follows_while_acknowledgements_that_compare_are_lost(
@@ -116,14 +115,10 @@ def test_so_is_what_follows_while_acknowledgements_that_compare_are_lost(
     with closing(Robot(MemoryHub(), put_back)) as robot:
         robot.replicator.submit([node_put(number) for number in range(20, 24)], 1)
         assert robot.replicator.flush(PATIENCE) and robot.journal.head(MAP) == 9
-    store = SqliteStore(put_back / "s0.sqlite")
-    had = contents(change.body for change in store.replay(MAP))
-    with closing(MemoryBus(hub)) as bus, closing(store), closing(serving(bus, store)):
-        with closing(Robot(hub, put_back)) as robot:
-            robot.replicator.submit([node_put(24)], 1)
-            eventually(lambda: "begin a fresh map" in robot.replicator.status().failure, PATIENCE)
-            assert robot.replicator.status().unacknowledged == 5
-        assert contents(change.body for change in store.replay(MAP)) == had and store.watermark(MAP) == 9
+    with unchanged(hub, put_back), closing(Robot(hub, put_back)) as robot:
+        robot.replicator.submit([node_put(24)], 1)
+        eventually(lambda: "begin a fresh map" in robot.replicator.status().failure, PATIENCE)
+        assert robot.replicator.status().unacknowledged == 5
 
 
 def test_a_robot_that_has_lost_nothing_is_acknowledged_what_it_did_not_know(
@@ -133,11 +128,10 @@ def test_a_robot_that_has_lost_nothing_is_acknowledged_what_it_did_not_know(
     with closing(Robot(MemoryHub(), put_back)) as robot:
         robot.replicator.submit([node_put(number) for number in range(6, 12)], 1)
         assert robot.replicator.flush(PATIENCE)
-    store = SqliteStore(put_back / "s0.sqlite")
-    with ExitStack() as stack:
-        bus = stack.enter_context(closing(MemoryBus(hub)))
-        stack.enter_context(closing(store))
-        stack.enter_context(closing(serving(bus, store)))
-        robot = stack.enter_context(closing(Robot(hub, put_back)))
+    with (
+        closing(SqliteStore(put_back / "s0.sqlite")) as store,
+        closing(serving(MemoryBus(hub), store)),
+        closing(Robot(hub, put_back)) as robot,
+    ):
         assert robot.replicator.wait_acknowledged(PATIENCE)
         assert robot.journal.acknowledged(MAP) == {"s0": 11} and not robot.replicator.status().failure

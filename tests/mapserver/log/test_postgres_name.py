@@ -24,6 +24,7 @@ from mapweave.mapserver.log.store import LogChanges
 from synthetic.postgres_server import ROLE, PostgresServer
 from tests.mapserver.log.test_store import MAP, entry
 from tests.pgbouncer import pooled
+from tests.postgres import absent_standby
 from tests.waiting import eventually
 
 Start = Callable[..., subprocess.Popen[str]]
@@ -126,21 +127,14 @@ def test_the_name_of_a_killed_server_is_free_while_its_commit_waits_for_a_standb
 ) -> None:
     """Lost robots get answers meanwhile."""
     PostgresStore(address, "s0").close()
-    with psycopg.connect(postgres.address(), autocommit=True) as people:
-        people.execute("ALTER SYSTEM SET synchronous_standby_names = 'absent'")
-        people.execute("SELECT pg_reload_conf()")
-        waits = "SELECT 1 FROM pg_stat_activity WHERE wait_event = 'SyncRep'"
-        try:
-            eventually(lambda: people.execute("SHOW synchronous_standby_names").fetchone() == ("absent",))
-            process = another(address, "and writes")
-            eventually(lambda: people.execute(waits).fetchall())
-            end(process)
-            store = PostgresStore(address, "s0")
-            assert store.watermark(MAP) == 0
-            assert people.execute(waits).fetchall(), "it waits on: what it commits is not to be cut short"
-        finally:
-            people.execute("ALTER SYSTEM RESET synchronous_standby_names")
-            people.execute("SELECT pg_reload_conf()")
+    waits = "SELECT 1 FROM pg_stat_activity WHERE wait_event = 'SyncRep'"
+    with absent_standby(postgres) as people:
+        process = another(address, "and writes")
+        eventually(lambda: people.execute(waits).fetchall())
+        end(process)
+        store = PostgresStore(address, "s0")
+        assert store.watermark(MAP) == 0
+        assert people.execute(waits).fetchall(), "it waits on: what it commits is not to be cut short"
     eventually(lambda: store.watermark(MAP) == 1)
     store.close()
 

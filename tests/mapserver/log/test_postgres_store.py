@@ -14,17 +14,17 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, rule, run_state_machine_as_test
 
 from mapweave.cli import main
-from mapweave.hybridmap.change import Change, ChangeBody, NodeRetired
+from mapweave.hybridmap.change import ChangeBody, NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue, MapweaveError
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.mapserver.log.entry import Applied, ReceivedChange
 from mapweave.mapserver.log.opening import open_store
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.store import LogChanges, Store
-from mapweave.wire.codec import encode_body, encode_change
+from mapweave.wire.codec import encode_body
 from synthetic.postgres_server import ROLE, PostgresServer, binaries
 from tests.mapserver.log.test_store import MAP, OTHER, broken, edge_put, entry, node_put
-from tests.postgres import started
+from tests.postgres import absent_standby
 from tests.waiting import eventually
 
 BODIES: list[ChangeBody] = [
@@ -42,11 +42,7 @@ def entries(map_id: MapId, first: int, picks: list[int]) -> list[ReceivedChange]
         if pick >= len(bodies):
             made.append(ReceivedChange.read(map_id, sequence, b"\xc1\0\xff"))
         else:
-            made.append(
-                ReceivedChange.read(
-                    map_id, sequence, encode_change(Change(map_id, sequence, 7, bodies[pick]))
-                )
-            )
+            made.append(entry(sequence, bodies[pick], map_id))
     return made
 
 
@@ -81,10 +77,7 @@ def content(store: Store) -> list[object]:
 
 
 @pytest.mark.parametrize("examples", [4, pytest.param(30, marks=pytest.mark.slow)])
-def test_both_stores_give_the_same_for_the_same(
-    postgres: PostgresServer, tmp_path: Path, examples: int
-) -> None:
-    address = postgres.database()
+def test_both_stores_give_the_same_for_the_same(address: str, tmp_path: Path, examples: int) -> None:
 
     class Both(RuleBasedStateMachine):
         def __init__(self) -> None:
@@ -161,8 +154,7 @@ def test_both_stores_give_the_same_for_the_same(
     )
 
 
-def test_two_servers_share_a_store(postgres: PostgresServer) -> None:
-    address = postgres.database()
+def test_two_servers_share_a_store(address: str) -> None:
     one, other = PostgresStore(address, "s0"), PostgresStore(address, "s1")
     assert one.id == other.id
     assert one.apply(MAP, 5, [entry(1), entry(2)]).before == 0
@@ -193,62 +185,49 @@ def test_two_servers_share_a_store(postgres: PostgresServer) -> None:
 
 
 @pytest.mark.slow
-def test_it_goes_on_when_postgresql_is_back(caplog: pytest.LogCaptureFixture) -> None:
-    servers = started()
-    server = next(servers)
-    try:
-        store = PostgresStore(server.database())
-        store.apply(MAP, 5, [entry(1)])
-        server.kill()
-        with pytest.raises(InvalidFile) as away:
-            store.apply(MAP, 5, [entry(2)])
-        assert "\n" not in str(away.value) and "the map store cannot be used" in str(away.value)
-        with pytest.raises(InvalidFile, match="the map store cannot be used"):
-            store.watermark(MAP)
-        assert [str(one) for one in store.apply_all([LogChanges(MAP, 5, [entry(2)])] * 2)], (
-            "each has its error"
-        )
-        server.start()
+def test_it_goes_on_when_postgresql_is_back(own_postgres: PostgresServer) -> None:
+    store = PostgresStore(own_postgres.database())
+    store.apply(MAP, 5, [entry(1)])
+    own_postgres.kill()
+    with pytest.raises(InvalidFile) as away:
+        store.apply(MAP, 5, [entry(2)])
+    assert "\n" not in str(away.value) and "the map store cannot be used" in str(away.value)
+    with pytest.raises(InvalidFile, match="the map store cannot be used"):
+        store.watermark(MAP)
+    assert [str(one) for one in store.apply_all([LogChanges(MAP, 5, [entry(2)])] * 2)], "each has its error"
+    own_postgres.start()
 
-        def taken() -> bool:
-            (result,) = store.apply_all([LogChanges(MAP, 5, [entry(1), entry(2)])])
-            return isinstance(result, Applied)
+    def taken() -> bool:
+        (result,) = store.apply_all([LogChanges(MAP, 5, [entry(1), entry(2)])])
+        return isinstance(result, Applied)
 
-        eventually(taken)
-        assert [change.sequence for change in store.replay(MAP)] == [1, 2]
-        store.close()
-        with pytest.raises(InvalidFile, match="is closed"):
-            store.watermark(MAP)
-    finally:
-        servers.close()
+    eventually(taken)
+    assert [change.sequence for change in store.replay(MAP)] == [1, 2]
+    store.close()
+    with pytest.raises(InvalidFile, match="is closed"):
+        store.watermark(MAP)
 
 
 def test_a_commit_that_no_standby_confirms_is_none(postgres: PostgresServer) -> None:
     """The wait for a standby may be cancelled; PostgreSQL then commits, with a warning."""
     store = PostgresStore(postgres.database(), "waits")
     store.apply(MAP, 5, [entry(1)])
-    with psycopg.connect(postgres.address(), autocommit=True) as people:
-        people.execute("ALTER SYSTEM SET synchronous_standby_names = 'absent'")
-        people.execute("SELECT pg_reload_conf()")
-        try:
-            results: list[Applied | MapweaveError] = []
+    results: list[Applied | MapweaveError] = []
 
-            def write() -> None:
-                # The setting is in force a little later.
-                while all(isinstance(result, Applied) for result in results):
-                    results.extend(store.apply_all([LogChanges(MAP, 5, [entry(2 + len(results))])]))
+    def write() -> None:
+        # The setting is in force a little later.
+        while all(isinstance(result, Applied) for result in results):
+            results.extend(store.apply_all([LogChanges(MAP, 5, [entry(2 + len(results))])]))
 
-            writer = threading.Thread(target=write)
-            writer.start()
-            waiting = "SELECT pid FROM pg_stat_activity WHERE wait_event = 'SyncRep'"
-            eventually(lambda: people.execute(waiting).fetchall())
-            assert store.traffic().nodes == 0, "questions are answered meanwhile"
-            people.execute("SELECT pg_cancel_backend(pid) FROM pg_stat_activity WHERE wait_event = 'SyncRep'")
-            writer.join(30)
-            assert "is not confirmed" in str(results[-1]) and isinstance(results[-1], InvalidFile)
-        finally:
-            people.execute("ALTER SYSTEM RESET synchronous_standby_names")
-            people.execute("SELECT pg_reload_conf()")
+    with absent_standby(postgres) as people:
+        writer = threading.Thread(target=write)
+        writer.start()
+        waiting = "SELECT pid FROM pg_stat_activity WHERE wait_event = 'SyncRep'"
+        eventually(lambda: people.execute(waiting).fetchall())
+        assert store.traffic().nodes == 0, "questions are answered meanwhile"
+        people.execute("SELECT pg_cancel_backend(pid) FROM pg_stat_activity WHERE wait_event = 'SyncRep'")
+        writer.join(30)
+        assert "is not confirmed" in str(results[-1]) and isinstance(results[-1], InvalidFile)
     again = LogChanges(MAP, 5, [entry(1 + len(results))])
     eventually(lambda: isinstance(store.apply_all([again])[0], Applied))
     store.close()
@@ -274,8 +253,7 @@ def test_a_password_in_the_address_is_refused_and_not_repeated(
     assert not any(part in out + err for part in ("s3cret", "anna", "s3", "cret"))
 
 
-def test_a_store_of_another_format_is_refused(postgres: PostgresServer) -> None:
-    address = postgres.database()
+def test_a_store_of_another_format_is_refused(address: str) -> None:
     with pytest.raises(InvalidFile, match=r"has no map store: a map server makes one at its first start"):
         PostgresStore(address, read_only=True)
     PostgresStore(address).close()
@@ -285,9 +263,8 @@ def test_a_store_of_another_format_is_refused(postgres: PostgresServer) -> None:
         PostgresStore(address)
 
 
-def test_a_server_whose_role_may_only_read_is_refused_at_its_start(postgres: PostgresServer) -> None:
+def test_a_server_whose_role_may_only_read_is_refused_at_its_start(address: str) -> None:
     """It would serve, and acknowledge nothing; a command that only reads needs no more."""
-    address = postgres.database()
     reader = address.replace(f"{ROLE}@", "reader@")
     store = PostgresStore(address, "s0")
     with psycopg.connect(address, autocommit=True) as owner:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sqlite3
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -53,9 +53,13 @@ def edge_put(number: int, a: int, b: int, shared: list[tuple[int, int]] | None =
     return EdgePut(Edge(NodeId(*MAP, number), *ends, HERE, EdgeKind.LOOP, pairs))
 
 
-def entry(sequence: int, body: ChangeBody | None = None) -> ReceivedChange:
-    change = Change(MAP, sequence, 7, body or NodeRetired(NodeId(*MAP, sequence)))
-    return ReceivedChange.read(MAP, sequence, encode_change(change))
+def entry(sequence: int, body: ChangeBody | None = None, map_id: MapId = MAP) -> ReceivedChange:
+    change = Change(map_id, sequence, 7, body or NodeRetired(NodeId(*map_id, sequence)))
+    return ReceivedChange.read(map_id, sequence, encode_change(change))
+
+
+def entries(bodies: Iterable[ChangeBody], first: int = 1) -> list[ReceivedChange]:
+    return [entry(sequence, body) for sequence, body in enumerate(bodies, first)]
 
 
 def broken(sequence: int) -> ReceivedChange:
@@ -86,7 +90,7 @@ def sequences(store: Store, map_id: MapId = MAP) -> list[int]:
 def test_a_log_is_compared_where_the_store_once_had_more_of_it(store: Store, acknowledged: int) -> None:
     store.doubt(MAP, acknowledged)
     assert store.unverified(MAP) is None, "there is nothing of this log"
-    store.apply(MAP, 5, [entry(k, node_put(k)) for k in range(1, 6)])
+    store.apply(MAP, 5, entries(node_put(k) for k in range(1, 6)))
     store.doubt(MAP, acknowledged)
     assert store.unverified(MAP) == ((MAP, 1, 5) if acknowledged > 5 else None)
 
@@ -182,7 +186,7 @@ def test_another_log_of_the_same_name_is_refused(store: Store) -> None:
 
 def test_many_logs_in_one_transaction(store: Store) -> None:
     store.apply(MAP, 5, [entry(1)])
-    foreign = ReceivedChange.read(OTHER, 1, encode_change(Change(OTHER, 1, 0, node_put(1, 10, OTHER))))
+    foreign = entry(1, node_put(1, 10, OTHER), OTHER)
     taken, other, mine, again = store.apply_all(
         [
             LogChanges(MAP, 6, [entry(2)]),
@@ -200,15 +204,12 @@ def test_many_logs_in_one_transaction(store: Store) -> None:
 
 
 def test_edges_to_landmarks_that_are_not_there_are_refused(store: Store) -> None:
-    entries = [
-        entry(1, node_put(1, landmarks=3)),
-        entry(2, edge_put(11, 1, 2, [(2, 500)])),
-        entry(3, node_put(2, landmarks=5)),
-        entry(4, edge_put(12, 1, 2, [(2, 4), (0, 0)])),
-        entry(5, edge_put(13, 1, 2, [(0, 0), (3, 0)])),
-        entry(6, edge_put(14, 1, 2, [(0, 5)])),
-    ]
-    applied = store.apply(MAP, 5, entries)
+    bodies: list[ChangeBody] = [
+        node_put(1, landmarks=3), edge_put(11, 1, 2, [(2, 500)]),
+        node_put(2, landmarks=5), edge_put(12, 1, 2, [(2, 4), (0, 0)]),
+        edge_put(13, 1, 2, [(0, 0), (3, 0)]), edge_put(14, 1, 2, [(0, 5)]),
+    ]  # fmt: skip
+    applied = store.apply(MAP, 5, entries(bodies))
     assert applied.refusals == (
         Refusal(5, "edge r0.1.13 shares landmark 3 of r0.1.1, which has 3"),
         Refusal(6, "edge r0.1.14 shares landmark 5 of r0.1.2, which has 5"),
@@ -279,18 +280,9 @@ def test_what_is_pruned_is_gone_and_is_not_taken_again(
         raise InvalidFile("the disk is full")
 
     store = open_store(place)
-    bodies: list[ChangeBody] = [
-        node_put(1, 3),
-        node_put(2, 5),
-        edge_put(11, 1, 2),
-        node_put(3, 2),
-        edge_put(12, 2, 3),
-    ]
-    log = [entry(k + 1, body) for k, body in enumerate(bodies)]
+    log = entries([node_put(1, 3), node_put(2, 5), edge_put(11, 1, 2), node_put(3, 2), edge_put(12, 2, 3)])
     store.apply(MAP, 5, log)
-    store.apply(
-        OTHER, 6, [ReceivedChange.read(OTHER, 1, encode_change(Change(OTHER, 1, 7, node_put(1, 4, OTHER))))]
-    )
+    store.apply(OTHER, 6, [entry(1, node_put(1, 4, OTHER), OTHER)])
     edges = [EdgeId(*MAP, k) for k in (11, 12)]
     with monkeypatch.context() as patch, pytest.raises(InvalidFile, match="full"):
         patch.setattr(store, "_put", refuse)
@@ -310,9 +302,8 @@ def test_what_is_pruned_is_gone_and_is_not_taken_again(
 
 def test_what_comes_while_nodes_are_pruned_stays(store: Store) -> None:
     """A node that is put again behind what was known then is there again, by its new change alone."""
-    bodies: list[ChangeBody] = [node_put(1, 3), node_put(2, 5), edge_put(11, 1, 2)]
-    store.apply(MAP, 5, [entry(k, body) for k, body in enumerate(bodies, 1)])
-    store.apply(MAP, 5, [entry(4, node_put(2, 4)), entry(5, edge_put(11, 1, 2))])
+    store.apply(MAP, 5, entries([node_put(1, 3), node_put(2, 5), edge_put(11, 1, 2)]))
+    store.apply(MAP, 5, entries([node_put(2, 4), edge_put(11, 1, 2)], 4))
     nodes, edges = [NodeId(*MAP, 1), NodeId(*MAP, 2)], [EdgeId(*MAP, 11)]
     assert store.prune(nodes, edges, {"pruned 0": b"two nodes"}, {OTHER: 9}), "nothing of this log was known"
     assert sequences(store) == [1, 2, 3, 4, 5] and store.kept("r0") == {MAP: (2, 7)}
@@ -336,15 +327,8 @@ def test_what_another_server_has_pruned_by_then_is_not_written_over(store: Store
 
 def test_what_a_lost_retirement_undid_goes_when_the_robot_has_dropped_it(place: Path | str) -> None:
     store = open_store(place)
-    bodies: list[ChangeBody] = [
-        node_put(1, 3),
-        node_put(2, 5),
-        edge_put(11, 1, 2),
-        node_put(2, 4),
-        node_put(3, 2),
-        edge_put(11, 1, 3),
-    ]
-    store.apply(MAP, 5, [entry(k, body) for k, body in enumerate(bodies, 1)], 8)
+    before = [node_put(1, 3), node_put(2, 5), edge_put(11, 1, 2), node_put(2, 4)]
+    store.apply(MAP, 5, entries([*before, node_put(3, 2), edge_put(11, 1, 3)]), 8)
     assert store.unverified(MAP) is None
     whole = store.restore(MAP, 7, 7, [entry(7, node_put(4, 1))])
     assert [change.sequence for change in whole] == [7] and store.unverified(MAP) is None
@@ -365,20 +349,19 @@ def test_what_a_lost_retirement_undid_goes_when_the_robot_has_dropped_it(place: 
 
 def test_the_wire_bytes_of_the_maps(store: Store) -> None:
     assert store.traffic().node_puts == 0
-    changes: list[ChangeBody] = [node_put(1, 100), node_put(1, 120), node_put(2, 50), edge_put(11, 1, 2)]
-    entries = [entry(k, body) for k, body in enumerate(changes, 1)]
-    store.apply(MAP, 5, entries)
-    store.apply(MAP, 5, entries)
-    sizes = [len(first.message) for first in entries]
+    log = entries([node_put(1, 100), node_put(1, 120), node_put(2, 50), edge_put(11, 1, 2)])
+    store.apply(MAP, 5, log)
+    store.apply(MAP, 5, log)
+    sizes = [len(first.message) for first in log]
     traffic = store.traffic(MAP)
     assert (traffic.nodes, traffic.node_puts, traffic.edge_puts) == (2, 3, 1)
     assert (traffic.node_bytes, traffic.edge_bytes) == (sum(sizes[:3]), sizes[3])
     assert store.traffic(OTHER).node_puts == 0
     assert store.traffic() == traffic
-    second = encode_change(Change(OTHER, 1, 0, node_put(1, 10, OTHER)))
-    store.apply(OTHER, 5, [ReceivedChange.read(OTHER, 1, second)])
+    second = entry(1, node_put(1, 10, OTHER), OTHER)
+    store.apply(OTHER, 5, [second])
     assert store.traffic().nodes == 3
-    assert store.traffic().payload_bytes == sum(sizes) + len(second)
+    assert store.traffic().payload_bytes == sum(sizes) + len(second.message)
 
 
 def test_results_are_kept_by_name(store: Store) -> None:
@@ -435,11 +418,9 @@ def test_what_later_changes_supersede_is_compacted(place: Path | str) -> None:
         edge_put(11, 2, 1), edge_put(12, 1, 3), node_put(3, 7),
     ]  # fmt: skip
     store = open_store(place)
-    log = [entry(sequence, body) for sequence, body in enumerate(bodies, 1)]
+    log = entries(bodies)
     store.apply(MAP, 5, log)
-    store.apply(
-        OTHER, 5, [ReceivedChange.read(OTHER, 1, encode_change(Change(OTHER, 1, 7, node_put(1, 4, OTHER))))]
-    )
+    store.apply(OTHER, 5, [entry(1, node_put(1, 4, OTHER), OTHER)])
     before, size = contents(store), store.stored_bytes(MAP, 0, 14)
     assert size == sum(len(one.message) + ROW_BYTES for one in log)
     assert store.stored_bytes(MAP, 3, 13) == sum(len(one.message) + ROW_BYTES for one in log[3:13])
@@ -473,7 +454,7 @@ def test_a_compacted_map_is_the_same(
                 EdgeRetired(edge)]  # fmt: skip
         bodies.append(made[kind])
     store = SqliteStore(tmp_path_factory.mktemp("store") / "s")
-    store.apply(MAP, 5, [entry(sequence, body) for sequence, body in enumerate(bodies, 1)])
+    store.apply(MAP, 5, entries(bodies))
     whole = contents(store)
     read_before = [HybridMap(bodies[:known]) for known in range(len(bodies) + 1)]
     store.drop(MAP, [sequence for sequence, _ in store.superseded(MAP, 10_000)])
@@ -507,7 +488,7 @@ def test_what_is_remembered_of_nodes_is_what_the_rows_say(
         for count, (kind, map_id, number) in enumerate(steps, 1):
             put = node_put(number, count, map_id)
             last = store.watermark(map_id)
-            coming = ReceivedChange.read(map_id, last + 1, encode_change(Change(map_id, last + 1, 7, put)))
+            coming = entry(last + 1, put, map_id)
             run = LogChanges(map_id, log_ids[map_id], [coming])
             if kind <= 1:
                 assert not isinstance(store.apply_all([run])[0], MapweaveError)
