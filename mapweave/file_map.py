@@ -9,8 +9,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import TYPE_CHECKING
 
-from mapweave.annotation_methods import AnnotationMethods
-from mapweave.constraint_methods import ConstraintMethods
+from mapweave.editable_map import EditableMap
 from mapweave.extras import need
 from mapweave.hybridmap.annotation import Annotation, Annotations
 from mapweave.hybridmap.errors import Refused
@@ -21,7 +20,6 @@ from mapweave.hybridmap.named_nodes import NodeWord, asked_of
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.login import login
-from mapweave.map import Map
 from mapweave.map_reading import MapReading
 from mapweave.merge.settings import MergeSettings
 from mapweave.refusals import refusals
@@ -31,7 +29,7 @@ if TYPE_CHECKING:
     from mapweave.mapserver.routes import Router
 
 
-class FileMap(Map, ConstraintMethods, AnnotationMethods):
+class FileMap(EditableMap):
     """A map from a file; it asks no server.
 
     Corrections (`link`, `unlink`, `retire`, `undo`) merge the map again, in memory: its nodes, components and

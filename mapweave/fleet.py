@@ -17,7 +17,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, overload
 
 from mapweave.connection import ANSWERED, reach
-from mapweave.fleet_constraints import FleetConstraints
 from mapweave.fleet_map import FleetMap
 from mapweave.hybridmap.agent_status import SILENT, AgentStatus, FleetStatus, RobotEntry
 from mapweave.hybridmap.errors import InvalidValue, MapweaveError, NotConnected, Refused
@@ -133,7 +132,7 @@ def author(holder: Credentials | None, by: str) -> str:
     return holder.name
 
 
-class Fleet(FleetMap, FleetConstraints):
+class Fleet(FleetMap):
     """A connection to a fleet, and its merged map. A context manager; it may be used from any thread.
 
     The merged map is fetched when it is first looked at, and again by `refresh`. Whereabouts, routes and

@@ -1,30 +1,42 @@
-"""The merged map of a running fleet: fetched, asked about, and what becomes of it."""
+"""The merged map of a running fleet: fetched, asked about, annotated and corrected."""
 
+import hashlib
 import math
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 
 from mapweave.connection import ANSWERED
+from mapweave.editable_map import EditableMap
 from mapweave.fleet_events import FleetEvent, FleetEvents
 from mapweave.fleet_questions import FleetQuestions
+from mapweave.hybridmap.annotation import Annotation, AnnotationRequest, Annotations
+from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import Explanation
+from mapweave.hybridmap.floor_plan import PIECE, PlacedPlans, PlanImage, PlanPiece, PlanReceived
+from mapweave.hybridmap.manual_constraint import ConstraintList, ConstraintRequest, ManualConstraint
 from mapweave.hybridmap.map_event import History, MapEvent
-from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, View
-from mapweave.map import Map
+from mapweave.hybridmap.named_nodes import NodeWord, asked_of
+from mapweave.hybridmap.query import ExplainRequest, RelocalizeAnswer, ResolveAnswer, ResolveRequest, View
 from mapweave.map_reading import MapReading
 from mapweave.storage.map_file import MapFile, unpack_map_file
 from mapweave.wire.bus import Bus
 from mapweave.wire.keys import Keys
+from mapweave.wire.log_messages import decode_record
 from mapweave.wire.messages import decode, decode_explanation, encode, encode_view
+from mapweave.wire.senders import sent_by
 
 PACKING = 120.0
 """How long a server may take to pack a large map, s."""
+ANSWER = 10.0
+"""A server that merges answers questions about its map late, s."""
+CHECKING = 20.0
+"""How long a server may take to check a manual constraint against a large map, s."""
 THINKING = 20.0
 """How long a server may take to find out where a view was taken, or to explain, s."""
 
 
-class FleetMap(FleetQuestions, Map):
+class FleetMap(FleetQuestions, EditableMap):
     """The part of `mapweave.fleet.Fleet` that is a map.
 
     It is fetched when it is first looked at, and again by `refresh`. Whereabouts, routes and explanations are
@@ -118,3 +130,80 @@ class FleetMap(FleetQuestions, Map):
         """An explanation of the kind that the request asks for, by the newest map."""
         payload = self._question(self._keys.any_explain(), encode(request), THINKING)
         return decode_explanation(payload, request)
+
+    def annotations(self) -> Annotations:
+        """What people say about the map.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        return decode(self._question(self._keys.any_annotations(), b"", ANSWER), Annotations)
+
+    def resolve(self, request: ResolveRequest | NodeWord | Iterable[NodeWord]) -> ResolveAnswer:
+        """Nodes for words: names of places, and positions in the merged map.
+
+        Raises:
+            InvalidValue: it is no text.
+            Refused: a word is none, with the reason.
+            NotConnected: no map server answers.
+        """
+        payload = encode(asked_of(request))
+        return decode(self._question(self._keys.any_resolve(), payload, ANSWER), ResolveAnswer)
+
+    def plans(self) -> PlacedPlans:
+        """Floor plans, and where they lie under the merged map.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        return decode(self._question(self._keys.any_plans(), b"", ANSWER), PlacedPlans)
+
+    def plan_image(self, sha256: str) -> bytes:
+        """The PNG file of a plan, by the name of its image.
+
+        Raises:
+            Refused: the server does not have it.
+            NotConnected: no map server answers.
+        """
+        return self._question(self._keys.any_plan_image(), sha256.encode(), ANSWER)
+
+    def put_plan_image(self, png: bytes) -> PlanImage:
+        """Send the image of a plan, a PNG file, before the annotation that names it.
+
+        Raises:
+            InvalidValue: it is no PNG file, or too large.
+            NotConnected: no map server answers.
+        """
+        self._check_role()
+        sha256, key = hashlib.sha256(png).hexdigest(), self._keys.any_put_plan_image()
+        for offset in range(0, len(png), PIECE):
+            piece = PlanPiece(sha256, len(png), offset, png[offset : offset + PIECE])
+            received = decode(self._question(key, encode(piece), ANSWER), PlanReceived)
+            if received.image is not None:
+                return received.image
+        raise InvalidValue("a plan is a PNG file")
+
+    def _check_writable(self, check: bool) -> None:
+        self._check_role()
+
+    def _say(self, annotation: Annotation, check: bool) -> str:
+        key = sent_by(self._keys.any_annotate(), self._sender)
+        return str(
+            decode_record(self._question(key, encode(AnnotationRequest(annotation, check)), ANSWER))["said"]
+        )
+
+    def constraints(self) -> tuple[ManualConstraint, ...]:
+        """What people have linked, unmerged, retired and taken back, in order; the first is number 1.
+
+        Raises:
+            NotConnected: no map server answers.
+        """
+        return decode(self._question(self._keys.any_constraints(), b"", ANSWER), ConstraintList).made
+
+    def keep(self, request: ConstraintRequest) -> str:
+        """Have every map server keep a manual constraint; where some refuse it, the words say why."""
+        self._check_role()
+        key = sent_by(self._keys.any_constrain(), self._sender)
+        answers, refused = self._answers(key, encode(request), CHECKING)
+        said = [str(decode_record(answer)["said"]) for answer in answers]
+        return "\n".join([*said, *(f"another map server refused: {reason}" for reason in refused)])

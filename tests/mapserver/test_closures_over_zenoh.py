@@ -97,7 +97,7 @@ def test_what_is_closed_from_the_shell_holds_for_all(
             # By a person whose clock is an hour behind.
             with monkeypatch.context() as patch:
                 behind = time.time_ns() - 3600 * 10**9
-                patch.setattr("mapweave.annotation_methods.time", SimpleNamespace(time_ns=lambda: behind))
+                patch.setattr("mapweave.editable_map.time", SimpleNamespace(time_ns=lambda: behind))
                 late = behind + 1800 * 10**9
                 with pytest.raises(InvalidValue, match=r"^by the clock of the map server, .* is over"):
                     fleet.annotate("closure", "late", place="kitchen", radius=0.02, end_ns=late)

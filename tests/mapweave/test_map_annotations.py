@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import mapweave
-from mapweave.annotation_methods import AnnotationMethods
 from mapweave.cli import main
+from mapweave.editable_map import EditableMap
 from mapweave.exit_status import NO
 from mapweave.hybridmap.floor_plan import PlanImage
 from mapweave.hybridmap.ids import MapId
@@ -203,7 +203,7 @@ def test_what_is_refused_has_the_reason_of_the_shell(joined: Path, tmp_path, cap
 
 
 def test_a_file_has_the_methods_of_a_fleet():
-    own = [name for name in vars(AnnotationMethods) if not name.startswith("_")]
+    own = [name for name in vars(EditableMap) if not name.startswith("_")]
     assert {"place", "close_way", "prefer", "floor", "portal", "pin", "plan", "withdraw"} <= {*own}
     for kind in (mapweave.FileMap, mapweave.Fleet):
-        assert issubclass(kind, AnnotationMethods)
+        assert issubclass(kind, EditableMap)
