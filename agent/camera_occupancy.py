@@ -50,12 +50,7 @@ class CameraOccupancyGrid(OccupancyGrid):
     """Free is what was driven over or seen past; occupied is what landmarks lie on and what was touched."""
 
     def __init__(self, description: RobotDescription, settings: OccupancyGridSettings | None = None) -> None:
-        """Start with everything unknown.
-
-        Args:
-            description: of the robot.
-            settings: of the grid.
-        """
+        """Start with everything unknown."""
         super().__init__(description, settings)
         self._driven = np.zeros(self._odds.shape, np.bool_)
         self._touched = np.zeros(self._odds.shape, np.bool_)
@@ -95,12 +90,7 @@ class CameraOccupancyGrid(OccupancyGrid):
         self.see_points(pose, points, sigmas, node.camera.mount_height)
 
     def see_landmarks(self, map_from_robot: Pose2, landmarks: LandmarkEstimates) -> None:
-        """Enter what is near by the mapping filter, now and then: it knows it before there is a node.
-
-        Args:
-            map_from_robot: pose.
-            landmarks: of the filter, now.
-        """
+        """Enter what is near by the mapping filter, now and then: it knows it before there is a node."""
         self._tick += 1
         near = np.isfinite(landmarks.depths) & (landmarks.depths < NEAR)
         if self._tick % EVERY == 0 and near.any():
@@ -141,9 +131,6 @@ class CameraOccupancyGrid(OccupancyGrid):
 
     def readings(self, map_from_robot: Pose2) -> Array:
         """What rangers along `BEARINGS` would read, but ahead and behind no further than the robot dares.
-
-        Args:
-            map_from_robot: pose.
 
         Returns:
             (K,) m from the robot's edge.

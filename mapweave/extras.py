@@ -41,11 +41,7 @@ class MissingExtra(MapweaveError):
     """A command needs libraries that are not installed."""
 
     def __init__(self, extras: Sequence[str]) -> None:
-        """Name the extras and how to install them.
-
-        Args:
-            extras: at least one.
-        """
+        """Name the extras and how to install them."""
         *first, last = (f'"{extra}"' for extra in extras)
         names = f"{', '.join(first)} and {last}" if first else last
         super().__init__(f"needs the extra{'s' * (len(extras) > 1)} {names}: {how_to_install(*extras)}")

@@ -27,10 +27,6 @@ def refusals() -> Iterator[None]:
 def listed(name: str, given: Iterable[Name]) -> tuple[Name, ...]:
     """What a list has; one text would be taken for as many names as it has letters.
 
-    Args:
-        name: of the argument.
-        given: nodes, or names of places.
-
     Raises:
         InvalidValue: it is one node, one name or one position.
     """

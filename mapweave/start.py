@@ -50,9 +50,6 @@ def _open_output() -> None:
 def _flushed(status: int) -> int:
     """Write what is still in the buffer of stdout.
 
-    Args:
-        status: with which the command ends.
-
     Returns:
         The exit status: that a full disk or a closed pipe takes no more is a failure.
     """

@@ -21,13 +21,7 @@ class EventExecutor:
     """Executes every kind of event. Each event has its own random numbers, by its index."""
 
     def __init__(self, stage: Stage, robots: Mapping[str, SimulatedRobot], seed: int) -> None:
-        """Start without events.
-
-        Args:
-            stage: where things happen.
-            robots: of the simulation, by name.
-            seed: of everything that an event leaves open.
-        """
+        """Start without events."""
         self._stage = stage
         self._robots = robots
         self._seed = seed

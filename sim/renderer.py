@@ -38,12 +38,7 @@ class Renderer:
     """Renders for one camera. Not thread-safe: it keeps its working memory."""
 
     def __init__(self, camera: Camera, background: int) -> None:
-        """Prepare the pixel grid.
-
-        Args:
-            camera: intrinsics and mount.
-            background: grey without panels.
-        """
+        """Prepare the pixel grid."""
         self.camera = camera
         self._background = background
         width, height = camera.width, camera.height

@@ -177,10 +177,6 @@ class World:
     def start_poses(self, robots: int, seed: int) -> tuple[Pose2, ...]:
         """Free poses, robot i in room i (counted around), where no two robots come close.
 
-        Args:
-            robots: how many.
-            seed: other seeds, other poses.
-
         Raises:
             InvalidValue: there is no room to start in, or so many robots do not fit.
         """

@@ -76,9 +76,6 @@ def kind_of(value: object) -> str:
 def driver_error(error: BaseException) -> DeviceError:
     """An error of the code of a driver, for its author.
 
-    Args:
-        error: was caught.
-
     Returns:
         One line that names the file, the line and the error.
 

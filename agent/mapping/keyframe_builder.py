@@ -205,11 +205,7 @@ class KeyframeBuilder:
             self._write(beside.node, self._edge(placed, beside, self._with_floor(view.anchor_from_view)))
 
     def join(self, placed: AnchoredKeyframe) -> None:
-        """Put the node of an episode into the map, with edges to the one before and to places known already.
-
-        Args:
-            placed: at the current anchor.
-        """
+        """Put the node of an episode into the map, with edges to the one before and to known places."""
         self.finish_pending()
         last = self._last
         if last is not None and last.evidence:

@@ -17,10 +17,6 @@ def relative_poses(own_map: HybridMap, start: NodeId) -> dict[NodeId, Pose2]:
     Loop closures take part at once, without a pose graph: what is near over them lies where they say. Around
     a loop the error that is left lies where two ways are equally certain, far from the start (Sibley, Mei,
     Reid, Newman: Adaptive relative bundle adjustment, RSS 2009).
-
-    Args:
-        own_map: nodes and edges.
-        start: a node of it.
     """
     poses: dict[NodeId, Pose2] = {}
     queue: list[tuple[float, NodeId, NodeId]] = [(0.0, start, start)]

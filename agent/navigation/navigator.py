@@ -193,11 +193,7 @@ class Navigator:
         return command, self._motion.questions()
 
     def touch(self, what: str) -> None:
-        """Something was touched: the present edge is blocked.
-
-        Args:
-            what: in words.
-        """
+        """Something was touched, in words: the present edge is blocked."""
         self._touched = what
 
     # Behaviours: each yields a command a tick, so the order of actions reads from top to bottom.

@@ -88,11 +88,7 @@ class Positioning:
         self._own.elsewhere &= fix.node not in self._own.map.nodes
 
     def find(self, expected: Pose2 | None) -> FixSearch:
-        """Search until the robot is found.
-
-        Args:
-            expected: see GlobalLocalization.search.
-        """
+        """Search until the robot is found."""
         self.search = self._localization
         return self._fix((yield from self._localization.search(expected)))
 

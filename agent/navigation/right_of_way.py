@@ -53,12 +53,7 @@ class RightOfWay:
         self._called = motion.now
 
     def passage(self, leg: int, fix: Fix) -> Passage:
-        """Whether the robot may drive to a node of the route; called each tick.
-
-        Args:
-            leg: index of the node.
-            fix: where the robot is.
-        """
+        """Whether the robot may drive to a node of the route; called each tick."""
         now = self._motion.now
         paused, self._called = now - self._called, now
         if paused > EVERY and self._held_since is not None:

@@ -87,13 +87,7 @@ class RouteSource:
         self._motion, self._own_map, self._description = motion, own_map, description
 
     def route(self, fix: Fix, goal: NodeId, blocks: Blocks) -> Generator[Command, None, RouteAnswer]:
-        """A way from where the robot is, or the reason why there is none.
-
-        Args:
-            fix: where the robot is.
-            goal: the node to reach.
-            blocks: where it could not drive.
-        """
+        """A way from where the robot is, or the reason why there is none."""
         blocked, obstacles = blocks.pairs(self._motion.now), blocks.obstacles(self._motion.now)
         here = fix.node_from_robot.mean
         question = WhichWay(self._motion.number(), fix.node, goal, here, blocked, obstacles)

@@ -65,10 +65,6 @@ def _natural_order(path: Path) -> tuple[list[int], str]:
 def read_times(path: Path, count: int) -> tuple[np.ndarray[Any, np.dtype[np.float64]], str]:
     """Times of the images, of a times.txt; ten images a second without one.
 
-    Args:
-        path: of it.
-        count: how many images there are.
-
     Returns:
         (K,) s, ascending, of the first K images, and what is missing, in one line; empty if K is `count`.
 
@@ -111,10 +107,6 @@ def read_times(path: Path, count: int) -> tuple[np.ndarray[Any, np.dtype[np.floa
 
 def read_increments(path: Path, count: int) -> tuple[np.ndarray[Any, np.dtype[np.float64]], str]:
     """Forward, m, and turn, rad, since the image before, of an odometry.csv.
-
-    Args:
-        path: of it.
-        count: how many images there are.
 
     Returns:
         (K, 2) the rows before the first that is damaged, and what is damaged, in one line; empty if nothing

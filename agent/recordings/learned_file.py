@@ -20,11 +20,6 @@ LOGARITHMIC = (Parameter.WHEEL_SCALE,)
 def write_learned(path: Path, learned: LearnedGeometry, on: date) -> None:
     """Write what is learned in place of what was.
 
-    Args:
-        path: of the file.
-        learned: what.
-        on: the day on which it is written.
-
     Raises:
         DeviceError: the disk does not take it.
     """

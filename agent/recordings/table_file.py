@@ -24,9 +24,6 @@ SEPARATORS = ";\t|"
 def read_text(path: Path) -> tuple[str, str]:
     """The lines of a file up to the first that is no text.
 
-    Args:
-        path: of the file.
-
     Returns:
         The lines before it, and which line it is, in one line; empty if all are text.
 

@@ -31,11 +31,6 @@ cars lie up to ten metres apart."""
 def encode_query(keys: Keys, question: Question, robot: str) -> tuple[str, bytes]:
     """Which server to ask, and how.
 
-    Args:
-        keys: of the fleet.
-        question: any.
-        robot: the asking one.
-
     Raises:
         InvalidValue: no message can hold it.
     """

@@ -42,10 +42,6 @@ class RetainedMap:
 
         What the disk has damaged is left out, with the edges at nodes that are missing for it. A damaged
         retirement still retires. Where a newer state of an element is damaged an older one is used.
-
-        Args:
-            map_id: of the map.
-            entries: its changes, in order.
         """
         hybrid, next_number, head = HybridMap(), 1, 0
         damaged: list[int] = []

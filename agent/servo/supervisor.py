@@ -56,11 +56,7 @@ class Servo:
     """
 
     def __init__(self, description: RobotDescription) -> None:
-        """Prepare for a robot.
-
-        Args:
-            description: camera, footprint and limits.
-        """
+        """Prepare for a robot."""
         self._description = description
         self._limits = SpeedLimits(max(description.max_forward, 1e-3), max(description.max_turn, 1e-3))
         self.start(Pose2(), np.zeros((0, 3)))

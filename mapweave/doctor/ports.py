@@ -36,11 +36,7 @@ class FoundPort:
 
 
 def serial_ports(devices: Path = DEVICES) -> list[FoundPort]:
-    """All serial ports, by their paths.
-
-    Args:
-        devices: folder of the devices.
-    """
+    """All serial ports, by their paths."""
     by_id = {_target(link): str(link) for link in sorted((devices / "serial" / "by-id").glob("*"))}
     known = _descriptions()
     paths = {path for pattern in PATTERNS for path in devices.glob(pattern) if path.exists()}

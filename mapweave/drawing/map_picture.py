@@ -174,12 +174,7 @@ def draw_map(picture: MapPicture, path: Path) -> None:
 
 
 def draw_on(axes: Any, picture: MapPicture) -> None:
-    """Draw into a picture of one's own.
-
-    Args:
-        axes: of matplotlib.
-        picture: what to draw.
-    """
+    """Draw into a picture of one's own."""
     _draw_outline(axes, picture.outline)
     if picture.backdrop is not None:
         _draw_backdrop(axes, picture.backdrop)

@@ -13,15 +13,7 @@ from mapweave.merge.pose_graph.merged_map import MergedMap
 def draw_plan(
     placed: PlacedPlan, part: PlanPart, pixels: NDArray[np.uint8], merged: MergedMap, path: Path
 ) -> None:
-    """Write a PNG: the plan, one component of the map over it, and the pairs with their differences.
-
-    Args:
-        placed: the plan.
-        part: under which component.
-        pixels: of the plan.
-        merged: the map.
-        path: where.
-    """
+    """Write a PNG: the plan, one component of the map over it, and the pairs with their differences."""
     poses = {node: part.plan_from_merged @ merged.pose(node) for node in merged.components[part.component]}
     nodes = (merged.maps[node.map].nodes[node] for node in poses)
     points = [poses[n.id].apply(n.points_in_robot[n.landmarks.has_depth, :2]) for n in nodes]

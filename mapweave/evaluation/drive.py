@@ -43,14 +43,7 @@ class DriveMap:
     def __init__(
         self, nodes: Mapping[NodeId, Node], relocalizer: Relocalizer, covered: list[Pose2], truth: Truth
     ) -> None:
-        """Take a map.
-
-        Args:
-            nodes: of the map.
-            relocalizer: answers by it.
-            covered: see the class.
-            truth: for scoring alone.
-        """
+        """Take a map."""
         self.nodes, self.covered = len(nodes), covered
         self.trials: list[LostDrive] = []
         self._nodes = nodes

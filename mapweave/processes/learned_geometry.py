@@ -17,12 +17,7 @@ class GeometryKeeper:
     """Reads the file at the start, and writes it when the geometry in use has changed, and at the end."""
 
     def __init__(self, path: Path, say: Callable[[str], None]) -> None:
-        """Take the file.
-
-        Args:
-            path: of it.
-            say: prints lines for people.
-        """
+        """Take the file."""
         self._path, self._say = path, say
         self._kept: LearnedGeometry | None = None
         self._used: DriveGeometry | None = None

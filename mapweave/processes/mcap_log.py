@@ -38,9 +38,6 @@ class McapLog(TickLog):
     def __init__(self, folder: str) -> None:
         """Begin a recording.
 
-        Args:
-            folder: new or empty.
-
         Raises:
             SettingsError: it cannot be made, or holds something.
         """

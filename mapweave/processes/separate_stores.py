@@ -12,13 +12,7 @@ class SeparateStores:
     """Watches for other servers beside one whose store no other has, and names each once."""
 
     def __init__(self, bus: Bus, keys: Keys, name: str) -> None:
-        """Begin to watch.
-
-        Args:
-            bus: the connection.
-            keys: of the fleet.
-            name: of this server.
-        """
+        """Begin to watch."""
         self._name, self._seen = name, set[str]()
         self._watch = bus.watch(keys.servers_alive(), self._see)
 

@@ -41,13 +41,7 @@ class WaitingServer:
     """
 
     def __init__(self, bus: Bus, keys: Keys, name: str) -> None:
-        """Nothing is waited for yet.
-
-        Args:
-            bus: the connection.
-            keys: of the fleet.
-            name: of the server.
-        """
+        """Nothing is waited for yet."""
         self._bus, self._keys, self._name = bus, keys, name
         self._words, self._serving = "", list[Closing]()
 

@@ -113,13 +113,7 @@ class TickLog(ABC):
         self._thread.start()
 
     def step(self, observation: Observation, step: TickResult, pipeline: Pipeline) -> None:
-        """Take in a tick; never waits.
-
-        Args:
-            observation: of the tick.
-            step: what it gave.
-            pipeline: after the tick.
-        """
+        """Take in a tick; never waits."""
         self._changed |= bool(step.changes) or pipeline is not self._pipeline
         self._pipeline, self._stamp_ns = pipeline, observation.stamp_ns
         if self._waiting.full():

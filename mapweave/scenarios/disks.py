@@ -32,11 +32,6 @@ class DiskRecord:
 def read_disks(agents: Path, store: Path, robots: Iterable[str]) -> dict[str, DiskRecord]:
     """Read journals and store; no process may have them open.
 
-    Args:
-        agents: folder of the journals.
-        store: of the server.
-        robots: names.
-
     Raises:
         InvalidFile: one is damaged.
     """

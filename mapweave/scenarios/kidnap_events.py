@@ -32,14 +32,7 @@ class KidnapEvents:
         command: Callable[[str, MissionKind, NodeId], None],
         note: Note,
     ) -> None:
-        """Start with no robot lost.
-
-        Args:
-            stage: what is tried.
-            fleet: whose robots.
-            command: gives a robot its mission.
-            note: remembers what happened.
-        """
+        """Start with no robot lost."""
         self._stage = stage
         self._fleet = fleet
         self._command = command
