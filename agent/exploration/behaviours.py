@@ -7,7 +7,8 @@ from enum import StrEnum
 import numpy as np
 
 from mapweave.agent.clearance import clearance
-from mapweave.agent.mapping.episode import Episode, EpisodeRequest, Move
+from mapweave.agent.mapping.episode import EpisodeRequest, Move
+from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.servo.image_drive import ImageDrive
 from mapweave.agent.servo.leg_controller import clip
@@ -65,7 +66,7 @@ class ExplorationBehaviours:
         patience: how many times longer than usual a drive may take.
     """
 
-    def __init__(self, description: RobotDescription, mapper: Episode, settings: ExplorerSettings) -> None:
+    def __init__(self, description: RobotDescription, mapper: Mapper, settings: ExplorerSettings) -> None:
         """Take the robot's description, and the mapper that the pipeline keeps up to date."""
         self.phase = Phase.LOOKING
         self.detail = ""

@@ -9,7 +9,8 @@ from mapweave.agent.cautious_driving import CREEP, SLOW
 from mapweave.agent.exploration.behaviours import Phase
 from mapweave.agent.exploration.explorer import Explorer
 from mapweave.agent.exploration.viewpoint_selection import REACH
-from mapweave.agent.mapping.episode import Episode, Move
+from mapweave.agent.mapping.episode import Move
+from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Command, RobotDescription
 from mapweave.agent.settings import ExplorerSettings
 from mapweave.hybridmap.ids import MapId
@@ -32,7 +33,7 @@ class CameraExploration(Explorer):
         self,
         map_id: MapId,
         description: RobotDescription,
-        mapper: Episode,
+        mapper: Mapper,
         floor: CameraOccupancyGrid,
         settings: ExplorerSettings | None = None,
         seed: int = 0,

@@ -3,7 +3,8 @@
 import math
 from collections.abc import Iterator
 
-from mapweave.agent.mapping.episode import Episode, EpisodeRequest, Move
+from mapweave.agent.mapping.episode import EpisodeRequest, Move
+from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.observation import Command
 
 CONVERGED = 0.7
@@ -27,7 +28,7 @@ class CarriedMapping:
         detail: in words, for the status line.
     """
 
-    def __init__(self, mapper: Episode) -> None:
+    def __init__(self, mapper: Mapper) -> None:
         """Take the mapper that the pipeline keeps up to date."""
         self.detail = "no image yet"
         self._mapper = mapper

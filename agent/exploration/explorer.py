@@ -15,7 +15,8 @@ from mapweave.agent.exploration.viewpoint_selection import (
     seen_around,
     views_of,
 )
-from mapweave.agent.mapping.episode import Episode, Move
+from mapweave.agent.mapping.episode import Move
+from mapweave.agent.mapping.mapper import Mapper
 from mapweave.agent.mapping.relative_poses import relative_poses, way_lengths
 from mapweave.agent.mission import Question, ServerAnswer
 from mapweave.agent.observation import Command, Observation, RobotDescription
@@ -49,7 +50,7 @@ class Explorer:
         self,
         map_id: MapId,
         description: RobotDescription,
-        mapper: Episode,
+        mapper: Mapper,
         floor: OccupancyGrid,
         settings: ExplorerSettings | None = None,
         seed: int = 0,

@@ -81,7 +81,7 @@ class Mapper:
         self._extraction = ThreadPoolExecutor(1, "features")
         self._extracting: tuple[Future[Features], Callable[[Features], None]] | None = None
 
-    # What behaviours read, see `Episode`
+    # What behaviours read
 
     @property
     def map(self) -> HybridMap:
