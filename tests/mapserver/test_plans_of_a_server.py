@@ -62,6 +62,14 @@ def map_of(fleet: Fleet) -> MapFile:
     return unpack_map_file(fleet.map_bytes())
 
 
+def with_plan(house: House) -> Fleet:
+    """A person in a house whose map lies under plan flat."""
+    house.person.put_plan_image(PNG.png)
+    assert house.server.settle(20.0)
+    house.person.annotate("plan", "flat", **fields())
+    return house.person
+
+
 def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> None:
     fleet = house.person
     assert house.server.settle(20.0)
@@ -93,10 +101,7 @@ def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> 
 
 def test_a_plan_that_no_message_holds_is_refused(house: House) -> None:
     """It would cost people the answer about all plans."""
-    fleet = house.person
-    assert house.server.settle(20.0)
-    fleet.put_plan_image(PNG.png)
-    fleet.annotate("plan", "flat", **fields())
+    fleet = with_plan(house)
     places = ((1e6, 1e6, 1.0, 1.0), (1e6, -1e6, 11.0, 1.0), (-1e6, 1e6, 1.0, 11.0))
     pairs = [{"node": "r0.1.1", "x": x, "y": y, "u": u, "v": v} for x, y, u, v in places]
     with pytest.raises(InvalidValue, match="plans: Expected"):
@@ -105,10 +110,7 @@ def test_a_plan_that_no_message_holds_is_refused(house: House) -> None:
 
 
 def test_a_pinned_frame_is_what_everything_of_a_server_is_in(house: House) -> None:
-    fleet, node, pose = house.person, NodeId("r0", 1, 3), Pose2(50.0, -20.0, 1.5)
-    fleet.put_plan_image(PNG.png)
-    assert house.server.settle(20.0)
-    fleet.annotate("plan", "flat", **fields())
+    fleet, node, pose = with_plan(house), NodeId("r0", 1, 3), Pose2(50.0, -20.0, 1.5)
     before = fleet.plans().plan("flat").part().plan_from_merged @ pose_of(fleet, node)
     said = fleet.annotate("pin", str(node), node=str(node), merged_from_node=packed(pose))
     assert said == "pin r0.1.3 is at 50.000,-20.000 m, 85.9 deg, by anna"
@@ -173,10 +175,7 @@ def test_plans_over_http(house: House) -> None:
 
 def test_answers_and_goals_in_coordinates_of_a_plan(house: House) -> None:
     """Of robots and photographs, over HTTP and in Python; what is no plan is refused, and not passed over."""
-    fleet = house.person
-    fleet.put_plan_image(PNG.png)
-    assert house.server.settle(20.0)
-    fleet.annotate("plan", "flat", **fields())
+    fleet = with_plan(house)
     house.robot()
     (robot,) = fleet.status(plan="flat").robots
     assert robot.merged_from_robot is not None and robot.plan_from_robot is not None
@@ -224,10 +223,7 @@ def test_answers_and_goals_in_coordinates_of_a_plan(house: House) -> None:
 
 
 def test_a_photograph_is_placed_on_the_plan_of_a_file(house: House) -> None:
-    fleet = house.person
-    fleet.put_plan_image(PNG.png)
-    assert house.server.settle(20.0)
-    fleet.annotate("plan", "flat", **fields())
+    fleet = with_plan(house)
     node = sorted(house.mapped.truth)[2]
     answer = house.server.locate(lambda: house.mapped.view(node), 1).result(20.0)
     placed = answer_on_plan(answer, fleet.plans().plan("flat"))
@@ -245,10 +241,7 @@ def test_a_photograph_is_placed_on_the_plan_of_a_file(house: House) -> None:
 
 
 def test_a_position_on_a_plan_under_two_parts_needs_to_know_where_the_robot_is(house: House) -> None:
-    fleet = house.person
-    fleet.put_plan_image(PNG.png)
-    assert house.server.settle(20.0)
-    fleet.annotate("plan", "flat", **fields())
+    fleet = with_plan(house)
     plan = fleet.plans().plan("flat")
     two = replace(plan, parts=(*plan.parts, replace(plan.part(), component=1)))
     assert goal_on_plan("4,5", two, 0, fleet.resolve) == goal_on_plan("4,5", plan, -1, fleet.resolve)

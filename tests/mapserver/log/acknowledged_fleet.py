@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import sqlite3
+from collections.abc import Iterator
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import cache
 from pathlib import Path
@@ -111,6 +113,20 @@ class Fleet:
             bus.close()
             journal.close()
 
+    def start(self) -> None:
+        self.start_server()
+        self.start_robots()
+
+    def stop(self) -> None:
+        self.stop_robots()
+        self.stop_server()
+
+    @contextmanager
+    def disk(self) -> Iterator[sqlite3.Connection]:
+        """The store of a server that is stopped, to be changed behind its back."""
+        with closing(sqlite3.connect(self.path)) as disk, disk:
+            yield disk
+
     def lacks(self) -> int:
         """Changes that robots keep and the store does not have as they are. Robots drop what was undone."""
         stored = self.stored()
@@ -155,9 +171,8 @@ def journal_bodies(whole: Path, one: MapId) -> list[ChangeBody]:
 
 
 def bodies_in(path: Path) -> list[tuple[MapId, int, bytes]]:
-    disk = sqlite3.connect(path)
-    rows = disk.execute("SELECT agent, epoch, sequence, body FROM change").fetchall()
-    disk.close()
+    with closing(sqlite3.connect(path)) as disk:
+        rows = disk.execute("SELECT agent, epoch, sequence, body FROM change").fetchall()
     return [(MapId(agent, epoch), sequence, body) for agent, epoch, sequence, body in rows]
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 import sqlite3
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from contextlib import closing
 from dataclasses import astuple, replace
 from pathlib import Path
 
@@ -43,8 +44,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         map_id = journal.open_map(None)
         journal.write(map_id, [Draft.of(body, k) for k, body in enumerate(life(map_id, rng, 25))])
         journal.close()
-    fleet.start_server()
-    fleet.start_robots()
+    fleet.start()
     for replicator, _, _ in fleet.robots:
         assert replicator.wait_acknowledged(30)
     book = ConstraintRecord(fleet.store)
@@ -52,8 +52,7 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> Path:
         book.add(
             ManualConstraint(Apart((MapId("r0", 1), MapId(f"r{k + 1}", 1))), True, "anna", k, "two kitchens")
         )
-    fleet.stop_robots()
-    fleet.stop_server()
+    fleet.stop()
     return fleet.folder
 
 
@@ -134,22 +133,18 @@ def test_what_a_lost_change_retired_stays_retired(
             store.drop(map_id, [sequence for sequence, _ in store.superseded(map_id, 10_000)])
         store.close()
     rng = np.random.default_rng(2000 + seed)
-    disk = sqlite3.connect(fleet.path)
     query = "SELECT agent, sequence FROM change WHERE kind IN ('NodeRetired', 'EdgeRetired') OR ?"
-    rows = disk.execute(query, (seed % 2,)).fetchall()
-    for k in rng.choice(len(rows), int(rng.integers(1, 9)), replace=False):
-        disk.execute("UPDATE change SET crc = crc + 1 WHERE agent = ? AND sequence = ?", rows[k])
-    if position_lost:
-        disk.execute("UPDATE log SET crc = crc + 1")
-    disk.commit()
-    disk.close()
-    fleet.start_server()
-    fleet.start_robots()
+    with fleet.disk() as disk:
+        rows = disk.execute(query, (seed % 2,)).fetchall()
+        for k in rng.choice(len(rows), int(rng.integers(1, 9)), replace=False):
+            disk.execute("UPDATE change SET crc = crc + 1 WHERE agent = ? AND sequence = ?", rows[k])
+        if position_lost:
+            disk.execute("UPDATE log SET crc = crc + 1")
+    fleet.start()
     # Of a compacted map robots may keep what the store need not have.
     eventually(lambda: all_is_whole(fleet.store) and (compacted or fleet.lacks() == 0))
     assert all(replicator.wait_acknowledged(60) for replicator, _, _ in fleet.robots)
-    fleet.stop_robots()
-    fleet.stop_server()
+    fleet.stop()
     assert fleet.served() == maps
     fleet.start_server()
     assert fleet.served() == maps
@@ -181,17 +176,20 @@ def test_a_flipped_bit_anywhere_is_repaired_or_reported_in_one_line(
     eventually(lambda: all_is_whole(fleet.store) and fleet.lacks() == 0)
     for replicator, _, _ in fleet.robots:
         assert replicator.wait_acknowledged(30)
-    fleet.stop_robots()
-    fleet.stop_server()
+    fleet.stop()
     assert fleet.served() == maps
+
+
+def without_journal(path: Path) -> bytes:
+    """All that a database holds, in one file."""
+    with closing(sqlite3.connect(path)) as connection:
+        connection.execute("PRAGMA journal_mode = DELETE")
+    return path.read_bytes()
 
 
 def test_a_damaged_schema_that_is_no_text_is_reported_in_one_line(whole: Path, fleet: Fleet) -> None:
     """SQLite quotes it in its error, which then is no text; found by fuzzing."""
-    with sqlite3.connect(fleet.path) as connection:
-        connection.execute("PRAGMA journal_mode = DELETE")
-    connection.close()
-    data = fleet.path.read_bytes()
+    data = without_journal(fleet.path)
     assert b"tableloglog" in data and b"CREATE TABLE log " in data
     data = data.replace(b"tableloglog", b"table\x95\x95glog").replace(
         b"CREATE TABLE log ", b"CREATE TABLX log "
@@ -205,10 +203,7 @@ def test_a_damaged_schema_that_is_no_text_is_reported_in_one_line(whole: Path, f
 def test_a_damaged_schema_with_a_line_break_is_reported_in_one_line(fleet: Fleet) -> None:
     """SQLite quotes it as it is; found by fuzzing a journal."""
     path = fleet.folder / "r0"
-    with sqlite3.connect(path) as connection:
-        connection.execute("PRAGMA journal_mode = DELETE")
-    connection.close()
-    data = path.read_bytes()
+    data = without_journal(path)
     assert data.count(b"server TEXT NOT NULL") == 1
     path.write_bytes(data.replace(b"server TEXT NOT NULL", b'server TEXT NOT "\nLL'))
     with pytest.raises(InvalidFile, match="agent journal is damaged") as caught:
@@ -219,25 +214,20 @@ def test_a_damaged_schema_with_a_line_break_is_reported_in_one_line(fleet: Fleet
 def test_the_state_of_a_log_may_be_lost(whole: Path, fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
     """Its robot may not be there: its map is served all the same, and its log goes on when it comes."""
     logs, maps = truth(whole)
-    disk = sqlite3.connect(fleet.path)
-    disk.execute("UPDATE log SET watermark = 5, log_id = '17' WHERE agent = 'r1'")
-    disk.commit()
-    disk.close()
+    with fleet.disk() as disk:
+        disk.execute("UPDATE log SET watermark = 5, log_id = '17' WHERE agent = 'r1'")
     fleet.start_server()
     assert fleet.stored() == logs and fleet.served() == maps
     assert "the position of r1.1 was damaged; its log is pulled from the beginning" in caplog.text
     fleet.start_robots()
     eventually(lambda: fleet.store.watermark(MapId("r1", 1)) == len(logs[MapId("r1", 1)]))
-    fleet.stop_robots()
-    fleet.stop_server()
+    fleet.stop()
     assert fleet.served() == maps
 
 
 def test_damage_is_remembered_until_the_robot_comes(fleet: Fleet) -> None:
-    disk = sqlite3.connect(fleet.path)
-    disk.execute("UPDATE change SET crc = crc + 1 WHERE agent = 'r1' AND sequence IN (3, 4, 9)")
-    disk.commit()
-    disk.close()
+    with fleet.disk() as disk:
+        disk.execute("UPDATE change SET crc = crc + 1 WHERE agent = 'r1' AND sequence IN (3, 4, 9)")
     for _ in range(2):
         fleet.start_server()
         assert [(gap.first, gap.last) for gap in fleet.store.damaged(MapId("r1", 1))] == [(3, 4), (9, 9)]
@@ -259,23 +249,18 @@ def test_a_damaged_key_misleads_no_reader(whole: Path, fleet: Fleet, bit: int) -
     assert len(fleet.seen) == sum(map(len, logs.values())) - 1
     fleet.start_robots()
     eventually(lambda: all_is_whole(fleet.store))
-    fleet.stop_robots()
-    fleet.stop_server()
+    fleet.stop()
     assert fleet.served() == maps
 
 
 def test_a_change_that_this_program_cannot_read_costs_only_itself(
     fleet: Fleet, caplog: pytest.LogCaptureFixture
 ) -> None:
-    disk = sqlite3.connect(fleet.path)
-    row = disk.execute("SELECT * FROM change WHERE agent = 'r1' AND sequence = 6").fetchone()
-    values = (*row[:7], b"\xc1 of a newer program")
-    disk.execute(
-        "UPDATE change SET body = ?, crc = ? WHERE agent = 'r1' AND sequence = 6",
-        (values[7], checksum(values)),
-    )
-    disk.commit()
-    disk.close()
+    which = "WHERE agent = 'r1' AND sequence = 6"
+    with fleet.disk() as disk:
+        row = disk.execute(f"SELECT * FROM change {which}").fetchone()
+        values = (*row[:7], b"\xc1 of a newer program")
+        disk.execute(f"UPDATE change SET body = ?, crc = ? {which}", (values[7], checksum(values)))
     fleet.start_server()
     assert 6 not in {change.sequence for change in fleet.seen if change.map.agent == "r1"}
     assert "change 6 of r1.1 cannot be read" in caplog.text
@@ -283,14 +268,12 @@ def test_a_change_that_this_program_cannot_read_costs_only_itself(
 
 
 def test_a_damaged_constraint_costs_only_itself(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
-    disk = sqlite3.connect(fleet.path)
-    disk.execute("UPDATE manual_constraint SET body = body || x'00' WHERE number = 2")
-    disk.commit()
-    disk.close()
-    store = SqliteStore(fleet.path)
-    assert [constraint.stamp_ns for constraint in ConstraintRecord(store).constraints.made] == [0, 2, 3, 4]
+    with fleet.disk() as disk:
+        disk.execute("UPDATE manual_constraint SET body = body || x'00' WHERE number = 2")
+    with closing(SqliteStore(fleet.path)) as store:
+        made = ConstraintRecord(store).constraints.made
+    assert [constraint.stamp_ns for constraint in made] == [0, 2, 3, 4]
     assert "1 damaged rows of table manual_constraint" in caplog.text
-    store.close()
 
 
 def test_the_number_of_constraints_is_limited(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -323,11 +306,8 @@ def test_a_store_with_broken_pages_is_extracted(
     fleet.path.write_bytes(bytes(data))
     assert main(["server", "--data", str(fleet.folder), "--listen", f"tcp/127.0.0.1:{free_port()}"]) == 1
     output = capfd.readouterr().err.splitlines()
-    assert (
-        len(output) == 1
-        and "is damaged (" in output[0]
-        and "`mapweave map extract FILE -o FOLDER`" in output[0]
-    )
+    assert len(output) == 1 and "is damaged (" in output[0]
+    assert "`mapweave map extract FILE -o FOLDER`" in output[0]
     out = fleet.folder / "out"
     assert main(["map", "extract", str(fleet.path), "-o", str(out)]) == 1
     assert "pages that cannot be read" in capfd.readouterr().err
@@ -336,12 +316,15 @@ def test_a_store_with_broken_pages_is_extracted(
         kept += sum(isinstance(body, NodePut) for body in read_map_file(path).changes)
     assert kept > 0.8 * sum(len(HybridMap(journal_bodies(whole, one)).nodes) for one in maps)
     fleet.path.rename(fleet.folder / "away")
-    fleet.start_server()
-    fleet.start_robots()
+    fleet.start()
     eventually(lambda: set(fleet.store.maps()) == set(maps) and fleet.lacks() == 0)
-    fleet.stop_robots()
-    fleet.stop_server()
+    fleet.stop()
     assert fleet.served() == maps
+
+
+def extracted(fleet: Fleet, maps: Iterable[MapId]) -> dict[MapId, list[bytes]]:
+    files = {one: read_map_file(fleet.folder / "out" / f"{one}.mapweave") for one in maps}
+    return {one: sorted(map(encode_body, content.changes)) for one, content in files.items()}
 
 
 @pytest.mark.parametrize("table", ["refused", "result", "damaged"])
@@ -355,9 +338,7 @@ def test_a_store_whose_description_of_a_table_is_damaged_is_extracted(
     fleet.path.write_bytes(data.replace(f"CREATE TABLE {table}".encode(), f"CREATE TABLF {table}".encode()))
     assert main(["map", "extract", str(fleet.path), "-o", str(fleet.folder / "out")]) == 1
     assert "pages that cannot be read" in capfd.readouterr().err
-    for one, changes in maps.items():
-        content = read_map_file(fleet.folder / "out" / f"{one}.mapweave")
-        assert sorted(map(encode_body, content.changes)) == changes
+    assert extracted(fleet, maps) == maps
 
 
 def test_a_whole_store_is_extracted_whole(
@@ -367,9 +348,7 @@ def test_a_whole_store_is_extracted_whole(
     before = fleet.path.read_bytes()
     assert main(["map", "extract", str(fleet.path), "-o", str(fleet.folder / "out")]) == 0
     assert capfd.readouterr().err == "" and fleet.path.read_bytes() == before
-    for one, changes in maps.items():
-        content = read_map_file(fleet.folder / "out" / f"{one}.mapweave")
-        assert sorted(map(encode_body, content.changes)) == changes
+    assert extracted(fleet, maps) == maps
     for path, words in (
         (fleet.folder / "nothing", "no such file"),
         (Path(__file__), "is neither a map file"),

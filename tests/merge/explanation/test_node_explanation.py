@@ -218,9 +218,8 @@ def test_too_few_inliers_are_reported_with_their_pose(merged: MergedMap) -> None
     assert len(explanation.shared) == explanation.evidence["inliers"] == len(explanation.residuals_px) >= 10
     assert {(int(shared[i, 0]), int(j)) for i, j in explanation.shared} <= set(map(tuple, shared.tolist()))
     assert explanation.a_from_b.mean.distance(link.a_from_b.mean) < 0.1
-    assert (
-        explanation.misfit is not None and explanation.other_links == () and explanation.probability is None
-    )
+    assert explanation.misfit is not None
+    assert explanation.other_links == () and explanation.probability is None
 
 
 def test_pairs_that_were_not_compared_are_compared_now(merged: MergedMap) -> None:
@@ -232,11 +231,8 @@ def test_a_robots_own_edge_is_explained_with_its_pose(merged: MergedMap) -> None
     edge = min(merged.maps[A].edges.values(), key=lambda edge: edge.id)
     explanation = explain_nodes(merged, edge.b, edge.a)
     assert explanation.standing is Standing.OWN and explanation.reason.endswith(f" (edge {edge.id})")
-    assert (
-        explanation.a_from_b is edge.a_from_b
-        and explanation.probability is None
-        and not explanation.other_links
-    )
+    assert explanation.a_from_b is edge.a_from_b
+    assert explanation.probability is None and not explanation.other_links
     assert explanation.misfit is not None and not explanation.claims
     relative = merged.relative(edge.a, edge.b)
     assert relative is not None
@@ -286,10 +282,8 @@ def test_two_maps(merged: MergedMap) -> None:
     assert not apart.joined and "are not one map" in apart.reason
     assert apart.unverified == sum({r.a.map, r.b.map} == {A, C} for r in merged.refused)
     assert [e.joined for e in explain_fleet(merged, 10)] == [False, False, True]
-    assert explain_fleet(merged, 10) == tuple(
-        explain_maps(merged, explanation.second, explanation.first)
-        for explanation in explain_fleet(merged, 10)
-    )
+    every = explain_fleet(merged, 10)
+    assert every == tuple(explain_maps(merged, one.second, one.first) for one in every)
 
 
 def test_manual_constraints_are_listed() -> None:
@@ -350,12 +344,8 @@ def test_joint_merges_are_listed_map_by_map_and_each_link_once() -> None:
     merged = merger_of(map_tours(world, {MapId(name, 1): stops for name in "abcdef"}, rng)).merged()
     assert len(merged.components) == 1
     result = joinings((), merged)
-    assert (
-        result[0].startswith("a.1 and ")
-        and result[1].startswith("a.1+")
-        and result[-1].startswith("5 maps with a.1 and ")
-        and len(result) == 5
-    )
+    assert len(result) == 5 and result[0].startswith("a.1 and ") and result[1].startswith("a.1+")
+    assert result[-1].startswith("5 maps with a.1 and ")
     count = sum(int(words.rsplit(" by ", 1)[1].split()[0]) for words in result)
     assert count == sum(not link.within for link in merged.links)
 

@@ -155,15 +155,25 @@ def changed(world: World, thing: np.ndarray, rng: np.random.Generator) -> World:
     return other
 
 
-@pytest.mark.slow
-def test_furniture_that_is_moved_fades_and_comes_back(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Landmarks of a thing that stands elsewhere from the second drive on; it returns before the last."""
-    rng = np.random.default_rng(2)
+@pytest.fixture
+def kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Nothing is superseded: what has been is linked with no later view."""
+    monkeypatch.setattr(superseding, "FOUND", 10_000)
+
+
+def with_thing(seed: int) -> tuple[World, World, np.ndarray, np.random.Generator]:
+    """A room, the same with other furniture, its points that are of that, and what both were drawn with."""
+    rng = np.random.default_rng(seed)
     world = room(0, 0, 6, 4, 700, rng)
     thing = thing_in(world)
-    other = changed(world, thing, rng)
-    # Nothing is superseded: what has been is linked with no later view.
-    monkeypatch.setattr(superseding, "FOUND", 10_000)
+    return world, changed(world, thing, rng), thing, rng
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("kept")
+def test_furniture_that_is_moved_fades_and_comes_back() -> None:
+    """Landmarks of a thing that stands elsewhere from the second drive on; it returns before the last."""
+    world, other, thing, rng = with_thing(2)
     merger = Merger()
     epochs = [world, *[other] * 8, *[world] * 3]
     collected: dict[int, np.ndarray] = {}
@@ -184,6 +194,7 @@ def test_furniture_that_is_moved_fades_and_comes_back(monkeypatch: pytest.Monkey
     assert collected[12][first].mean() < 0.5 * collected[9][first].mean(), "what is back is used again"
 
 
+@pytest.mark.usefixtures("kept")
 def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_with_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
@@ -193,7 +204,6 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
     wall = np.flatnonzero(world.normals[:, 0] < -0.5)
     other = changed(world, wall, rng)
     monkeypatch.setattr(removal, "USUAL", 0.5)
-    monkeypatch.setattr(superseding, "FOUND", 10_000)
     merger = Merger()
     shares = []
     for epoch, now in enumerate([world, *[other] * 4], start=1):
@@ -215,13 +225,10 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
     assert shares[-1][0].mean() < 0.2
 
 
-def test_views_of_implausible_maps_fade_no_landmarks_of_others(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.usefixtures("kept")
+def test_views_of_implausible_maps_fade_no_landmarks_of_others() -> None:
     """From when they are found to be so, and until they are not."""
-    rng = np.random.default_rng(2)
-    world = room(0, 0, 6, 4, 700, rng)
-    thing = thing_in(world)
-    other = changed(world, thing, rng)
-    monkeypatch.setattr(superseding, "FOUND", 10_000)
+    world, other, _, rng = with_thing(2)
     merger = Merger()
     for epoch, now in enumerate([world, *[other] * 6], start=1):
         tour = [Pose2(2.6 + 0.5 * k, 2.0 + rng.normal(0, 0.04), 0.05 * k) for k in range(2)]

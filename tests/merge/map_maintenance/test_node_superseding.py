@@ -36,6 +36,10 @@ from synthetic.world import room, take_map, take_view
 from tests.quick import first_quick
 
 OLD, NEW, OTHER = MapId("r0", 1), MapId("r0", 2), MapId("r1", 1)
+NEW_ALONE = ManualConstraints(
+    [ManualConstraint(Apart((other, NEW)), True, "anna", 1) for other in (OLD, OTHER)]
+)
+"""Nothing joins the newer drive with the others."""
 
 
 class Drives:
@@ -153,14 +157,7 @@ def test_removing_a_successor_makes_its_nodes_active(drives: Drives) -> None:
     merged = merger.merged()
     assert by not in merged.poses
     assert all(fate.by in active(merged) for fate in merged.superseded.values())
-    merger.constrain(
-        ManualConstraints(
-            [
-                ManualConstraint(Apart((OLD, NEW)), True, "anna", 1),
-                ManualConstraint(Apart((OTHER, NEW)), True, "anna", 1),
-            ]
-        )
-    )
+    merger.constrain(NEW_ALONE)
     assert not merger.merged().superseded, "nothing joins them now"
     merger.constrain(ManualConstraints())
     assert merger.merged().superseded
@@ -228,14 +225,7 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
     merged = merger.merged()
     assert {node_id for node_id in merged.poses if node_id in merger.places} == active(merged)
     assert {link.pair for link in merged.links} == before, "what tied it ties it still"
-    merger.constrain(
-        ManualConstraints(
-            [
-                ManualConstraint(Apart((OLD, NEW)), True, "anna", 1),
-                ManualConstraint(Apart((OTHER, NEW)), True, "anna", 1),
-            ]
-        )
-    )
+    merger.constrain(NEW_ALONE)
     merged = merger.merged()
     assert not merged.superseded and all(node_id in merger.places for node_id in merged.poses)
 

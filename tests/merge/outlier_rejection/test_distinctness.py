@@ -63,6 +63,12 @@ class Aisle:
             before = node
         self.maps[MapId(agent, 1)] = hybrid_map
 
+    def driven(self, **bays: Sequence[int]) -> Aisle:
+        """With a drive of each robot."""
+        for agent, some in bays.items():
+            self.drive(agent, some)
+        return self
+
     def step(self, a: NodeId, b: NodeId, edge_id: NodeId) -> Edge:
         """A step of the way; within a bay its landmarks were tracked."""
         true = self.truth[a].inverse() @ self.truth[b]
@@ -110,9 +116,7 @@ def silent(links: Sequence[Link]) -> list[Link]:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_landmarks_of_one_bay_alone_are_counted(seed: int) -> None:
-    aisle = Aisle(seed, signs=(1, 2))
-    aisle.drive("a", [0, 1, 2])
-    aisle.drive("b", [1, 2, 3])
+    aisle = Aisle(seed, signs=(1, 2)).driven(a=[0, 1, 2], b=[1, 2, 3])
     links = aisle.links()
     between = [link for link in aisle.weighed(links) if not link.within]
     assert {aisle.true(link) for link in between} == {True, False}
@@ -123,9 +127,7 @@ def test_landmarks_of_one_bay_alone_are_counted(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", first_quick(range(4), 2))
 def test_maps_are_joined_where_they_share_unique_landmarks(seed: int) -> None:
-    aisle = Aisle(seed, signs=(2, 3))
-    aisle.drive("a", [0, 1, 2, 3])
-    aisle.drive("b", [2, 3, 4, 5, 6])
+    aisle = Aisle(seed, signs=(2, 3)).driven(a=[0, 1, 2, 3], b=[2, 3, 4, 5, 6])
     merged = merge_maps(aisle.maps, aisle.links())
     between = [link for link in merged.links if not link.within]
     assert len(merged.components) == 1 and between
@@ -134,9 +136,7 @@ def test_maps_are_joined_where_they_share_unique_landmarks(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", range(4))
 def test_aliased_aisles_are_not_joined(seed: int) -> None:
-    aisle = Aisle(seed)
-    aisle.drive("a", [0, 1])
-    aisle.drive("b", [3, 4, 5])
+    aisle = Aisle(seed).driven(a=[0, 1], b=[3, 4, 5])
     links = aisle.links()
     merged = merge_maps(aisle.maps, links)
     assert len(merged.components) == 2 and not merged.links
@@ -145,9 +145,7 @@ def test_aliased_aisles_are_not_joined(seed: int) -> None:
 
 def test_a_view_of_one_bay_alone_is_ambiguous() -> None:
     """One bay each, of another place: nothing shows that there are two of it. Then the merge is accepted."""
-    aisle = Aisle(5)
-    aisle.drive("a", [0])
-    aisle.drive("b", [3])
+    aisle = Aisle(5).driven(a=[0], b=[3])
     assert len(merge_maps(aisle.maps, aisle.links()).components) == 1
 
 
@@ -179,9 +177,7 @@ def test_aliasing_found_for_one_node_is_used_for_its_neighbours() -> None:
 
 
 def test_without_aliasing_all_landmarks_count() -> None:
-    aisle = Aisle(8, signs=tuple(range(6)), cartons=0)
-    aisle.drive("a", [0, 1, 2])
-    aisle.drive("b", [1, 2, 3])
+    aisle = Aisle(8, signs=tuple(range(6)), cartons=0).driven(a=[0, 1, 2], b=[1, 2, 3])
     links = aisle.links()
     assert links and all(again is link for link, again in zip(links, aisle.weighed(links), strict=True))
 
@@ -212,9 +208,7 @@ def test_a_way_that_is_hardly_known_contradicts_nothing() -> None:
 
 
 def test_order_does_not_matter() -> None:
-    aisle = Aisle(10, signs=(1, 2))
-    aisle.drive("a", [0, 1, 2])
-    aisle.drive("b", [1, 2, 3])
+    aisle = Aisle(10, signs=(1, 2)).driven(a=[0, 1, 2], b=[1, 2, 3])
     links = aisle.links()
     collected = {link.pair: link.aliased for link in aisle.weighed(links)}
     aisle.rng.shuffle(links)  # type: ignore[arg-type]
@@ -225,9 +219,7 @@ def test_order_does_not_matter() -> None:
 
 def test_one_robot_alone_takes_no_landmarks_from_links_of_others() -> None:
     """It shows a bay once more, elsewhere on its way; a second robot that does so is believed."""
-    aisle = Aisle(1, signs=(0,), cartons=0)
-    aisle.drive("a", [0])
-    aisle.drive("b", [0])
+    aisle = Aisle(1, signs=(0,), cartons=0).driven(a=[0], b=[0])
     aliased = []
     for robot in ("y", "z"):
         aisle.drive(robot, [0, 5])

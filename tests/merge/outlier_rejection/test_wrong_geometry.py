@@ -84,14 +84,25 @@ def links_of(hybrid_map: HybridMap, other: HybridMap) -> list[Link]:
     return out
 
 
+def links_among(maps: dict[MapId, HybridMap]) -> tuple[list[MapId], dict[tuple[MapId, MapId], list[Link]]]:
+    """The maps in their order, and the links of each pair."""
+    ids = sorted(maps)
+    return ids, {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+
+
+def with_jump(agents: str = "ab") -> dict[MapId, HybridMap]:
+    """Sound maps, and map c, whose robot once moved without noticing."""
+    maps = {MapId(agent, 1): corridor(agent) for agent in agents}
+    return maps | {MapId("c", 1): corridor("c", 1.0, 2.0, 12)}
+
+
 @pytest.mark.parametrize(
     ("scale", "gap", "expected"), [(1.0, 0.0, False), (1.0, 2.0, True), (2.0, 0.0, True)]
 )
 def test_a_map_that_jumps_or_stretches_is_wrong(scale: float, gap: float, expected: bool) -> None:
     maps = {MapId(agent, 1): corridor(agent) for agent in "ab"}
     maps[MapId("c", 1)] = corridor("c", scale, gap, 12)
-    ids = sorted(maps)
-    links = {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+    ids, links = links_among(maps)
     finder = WrongGeometrySearch(ConsistencySettings())
     wrong = finder.wrong(maps, links.__getitem__, links.keys())
     assert (set(wrong) == {ids[2]}) is expected
@@ -107,8 +118,7 @@ def test_no_robot_alone_makes_maps_of_others_seem_wrong(count: int) -> None:
     """However many maps it sends that agree with each other, also if these come first."""
     maps = {MapId(agent, 1): corridor(agent) for agent in "yz"}
     maps |= {MapId("c", k): corridor("c", 1.0, 2.0, 12, k) for k in range(1, count + 1)}
-    ids = sorted(maps)
-    links = {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+    ids, links = links_among(maps)
     finder = WrongGeometrySearch(ConsistencySettings())
     assert finder.wrong(maps, links.__getitem__, links.keys()).keys() == set(ids[:-2])
     # Of two robots that contradict each other neither is wrong.
@@ -127,8 +137,7 @@ def drives(
     """Maps of one robot's drives, the last with a jump after six views, and all links between them."""
     maps = {MapId("c", k): corridor("c", epoch=k) for k in range(1, count)}
     maps[MapId("c", count)] = corridor("c", 1.0, gap, 8, epoch=count)
-    ids = sorted(maps)
-    return maps, {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+    return maps, links_among(maps)[1]
 
 
 def found(maps: dict[MapId, HybridMap], links: dict[tuple[MapId, MapId], list[Link]]) -> set[MapId]:
@@ -169,10 +178,8 @@ def test_a_part_of_a_map_that_few_links_show_elsewhere_makes_it_wrong() -> None:
 @given(st.randoms(use_true_random=False))
 def test_the_order_in_which_links_were_found_changes_nothing(random: Random) -> None:
     """Of more links than are tested, those were tested that came at certain turns."""
-    maps = {MapId(agent, 1): corridor(agent) for agent in "ab"}
-    maps[MapId("c", 1)] = corridor("c", 1.0, 2.0, 12)
-    ids = sorted(maps)
-    links = {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+    maps = with_jump()
+    links = links_among(maps)[1]
     shuffled = {pair: random.sample(some, len(some)) for pair, some in links.items()}
     first, second = (WrongGeometrySearch(ConsistencySettings()) for _ in range(2))
     with pytest.MonkeyPatch.context() as patch:
@@ -183,20 +190,16 @@ def test_the_order_in_which_links_were_found_changes_nothing(random: Random) -> 
 
 def test_a_map_that_was_left_out_when_its_links_came_is_searched_once_it_is_used() -> None:
     """Such as one that was taken for a copy. Before, it was searched when its links changed again."""
-    maps = {MapId(agent, 1): corridor(agent) for agent in "ab"}
-    maps[MapId("c", 1)] = corridor("c", 1.0, 2.0, 12)
-    ids = sorted(maps)
-    links = {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+    maps = with_jump()
+    ids, links = links_among(maps)
     finder = WrongGeometrySearch(ConsistencySettings())
     assert not finder.wrong(maps, links.__getitem__, links.keys(), [ids[1]])
     assert finder.wrong(maps, links.__getitem__, ()).keys() == {ids[2]}
 
 
 def test_a_pair_of_maps_that_no_solver_takes_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
-    maps = {MapId(agent, 1): corridor(agent) for agent in "abd"}
-    maps[MapId("c", 1)] = corridor("c", 1.0, 2.0, 12)
-    ids = sorted(maps)
-    links = {(a, b): links_of(maps[a], maps[b]) for a in ids for b in ids if a < b}
+    maps = with_jump("abd")
+    ids, links = links_among(maps)
     real = wrong_geometry.link_sets
 
     def fails(links: Sequence[Link], *rest: Any) -> list[list[Link]]:
