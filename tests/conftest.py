@@ -1,13 +1,13 @@
 """For all tests: one thread for algebra and images, as in Mapweave's own processes; and bytecode is kept."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os
 import sys
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, closing
+from typing import Any
 
 # numpy reads it when it is imported, and cv2 imports numpy.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -71,6 +71,13 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
 
 if not INSTALLED:
     sys.meta_path.insert(0, SkipWithoutSimulator())
+
+
+@pytest.fixture
+def opened() -> Iterator[Callable[[Any], Any]]:
+    """Gives back what it gets, and closes it at the end of the test; what was opened last is closed first."""
+    with ExitStack() as stack:
+        yield lambda thing: stack.enter_context(closing(thing))
 
 
 @pytest.fixture

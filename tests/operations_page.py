@@ -2,11 +2,11 @@
 
 import os
 import re
-import subprocess
 from collections.abc import Mapping
 from pathlib import Path
 
 from synthetic.postgres_server import PostgresServer, binaries
+from tests.programs import ran
 
 PAGE = Path(__file__).parents[1] / "docs" / "operations.md"
 BLOCK = re.compile(r"^```console\n(.*?)^```$", re.MULTILINE | re.DOTALL)
@@ -78,9 +78,7 @@ class PageShell:
         """Run a script; returns what it prints. The first command that fails ends it, and the test."""
         for words, own in self._instead.items():
             script = script.replace(words, own)
-        done = subprocess.run(
-            ["bash", "-euo", "pipefail", "-c", script],
-            cwd=self._folder, env=self._environment, capture_output=True, text=True, timeout=240,
-        )  # fmt: skip
+        program = ["bash", "-euo", "pipefail", "-c", script]
+        done = ran(*program, cwd=self._folder, env=self._environment, timeout=240)
         assert done.returncode == 0, f"{script}\n{done.stdout}{done.stderr}"
         return done.stdout

@@ -16,6 +16,7 @@ from mapweave.photographs import send_map
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus
+from tests.programs import going
 from tests.simulator import needs_simulator
 from tests.waiting import eventually, free_port
 
@@ -68,7 +69,7 @@ def test_an_example_without_its_extra_ends_in_one_line(name: str, tmp_path):
 
 @pytest.mark.slow
 @needs_simulator
-def test_they_run(tmp_path):
+def test_they_run(tmp_path, opened):
     """Each by itself; what one has driven the next finds, as in a person's folder."""
     out = tmp_path / "out" / "examples"
     printed = run(tmp_path, "plot_map")
@@ -94,27 +95,19 @@ def test_they_run(tmp_path):
     assert "not in it: nothing" in printed and (out / "r0.rrd").stat().st_size > 100_000
 
     endpoint, keys = f"tcp/127.0.0.1:{free_port()}", Keys("demo")
-    bus = ZenohBus(BusSettings(mode="router", listen=(endpoint,)))
-    robot = ZenohBus(BusSettings(endpoints=(endpoint,)))
-    try:
-        with MapServer(bus, keys, tmp_path / "server" / "s0.sqlite", "s0") as server:
-            watching = subprocess.Popen(
-                [sys.executable, "-u", str(EXAMPLES / "watch_fleet.py"), endpoint, "60"],
-                cwd=tmp_path, stdout=(log := (tmp_path / "watch.txt").open("w")), stderr=subprocess.STDOUT,
-            )  # fmt: skip
-            try:
-                eventually(lambda: "map: 0 nodes" in (tmp_path / "watch.txt").read_text(), 60.0)
-                for name in ("r0", "r1"):
-                    changes = mapweave.open(out / f"{name}.mapweave").content.changes
-                    journal = tmp_path / f"{name}.sqlite"
-                    assert send_map(changes, mapweave.MapId(name, 1), journal, robot, keys, "s0", 30.0)
-                assert server.settle(60.0)
-                eventually(lambda: "joined: " in (tmp_path / "watch.txt").read_text(), 60.0)
-                eventually(lambda: (out / "fleet.png").exists(), 60.0)
-            finally:
-                watching.kill()
-                watching.wait()
-                log.close()
-    finally:
-        robot.close()
-        bus.close()
+    bus = opened(ZenohBus(BusSettings(mode="router", listen=(endpoint,))))
+    robot = opened(ZenohBus(BusSettings(endpoints=(endpoint,))))
+    with MapServer(bus, keys, tmp_path / "server" / "s0.sqlite", "s0") as server:
+        program = [sys.executable, "-u", EXAMPLES / "watch_fleet.py", endpoint, 60]
+        with (
+            (tmp_path / "watch.txt").open("w") as log,
+            going(*program, cwd=tmp_path, stdout=log, stderr=log),
+        ):
+            eventually(lambda: "map: 0 nodes" in (tmp_path / "watch.txt").read_text(), 60.0)
+            for name in ("r0", "r1"):
+                changes = mapweave.open(out / f"{name}.mapweave").content.changes
+                journal = tmp_path / f"{name}.sqlite"
+                assert send_map(changes, mapweave.MapId(name, 1), journal, robot, keys, "s0", 30.0)
+            assert server.settle(60.0)
+            eventually(lambda: "joined: " in (tmp_path / "watch.txt").read_text(), 60.0)
+            eventually(lambda: (out / "fleet.png").exists(), 60.0)

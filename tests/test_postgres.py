@@ -51,15 +51,12 @@ def test_a_database_that_is_given_again_is_as_a_new_one(postgres: PostgresServer
     store.close()
 
 
-def test_a_database_that_is_in_use_or_holds_what_is_not_removed_is_not_given_again():
-    servers = started()
+def test_a_database_that_is_in_use_or_holds_what_is_not_removed_is_not_given_again(opened):
+    servers = opened(started())
     server = next(servers)
-    try:
-        used, filled = server.database(), server.database()
-        with psycopg.connect(filled) as connection:
-            connection.execute("CREATE TABLE public.held (number INT)")
-        with psycopg.connect(used):
-            server.take_back()
-            assert server.database() not in {used, filled}
-    finally:
-        servers.close()
+    used, filled = server.database(), server.database()
+    with psycopg.connect(filled) as connection:
+        connection.execute("CREATE TABLE public.held (number INT)")
+    with psycopg.connect(used):
+        server.take_back()
+        assert server.database() not in {used, filled}

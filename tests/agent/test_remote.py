@@ -2,7 +2,7 @@
 
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
@@ -211,17 +211,13 @@ def silence(request: Request) -> None:
 
 
 @pytest.fixture
-def body(hub: MemoryHub) -> Iterator[Body]:
-    made = Body(hub)
-    yield made
-    made.bus.close()
+def body(hub: MemoryHub) -> Body:
+    return Body(hub)
 
 
 @pytest.fixture
-def bus(hub: MemoryHub) -> Iterator[MemoryBus]:
-    made = MemoryBus(hub)
-    yield made
-    made.close()
+def bus(hub: MemoryHub) -> MemoryBus:
+    return MemoryBus(hub)
 
 
 def test_commands_are_clipped_and_travel_with_the_next_step(body: Body, bus: MemoryBus):

@@ -98,8 +98,8 @@ def test_recordings_are_replayed(folder, walls):
         assert not observation.bumped
 
 
-def test_the_robot_is_described_by_its_camera(folder):
-    replay = Replay(folder)
+def test_the_robot_is_described_by_its_camera(folder, opened):
+    replay = opened(Replay(folder))
     description = replay.describe()
     camera = description.camera
     assert (camera.width, camera.height, camera.fx, camera.cx) == (320, 240, 277.0, 159.5)
@@ -110,7 +110,6 @@ def test_the_robot_is_described_by_its_camera(folder):
     assert description.tick == pytest.approx(0.2)
     assert Replay(folder, "b").describe().tick == pytest.approx(0.6)
     assert replay.act(Command(0.3, 0.3)) == Command()
-    replay.close()
 
 
 def test_splits_add_up_the_odometry_of_skipped_frames(folder, walls):

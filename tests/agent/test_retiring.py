@@ -69,7 +69,7 @@ def agent(own: SurveyedMap, tmp_path: Path) -> Iterator[tuple[Agent, MemoryBus]]
     agent.close()
 
 
-def test_what_a_server_has_it_must_have_let_go(own: SurveyedMap, agent: tuple[Agent, MemoryBus]):
+def test_what_a_server_has_it_must_have_let_go(own: SurveyedMap, agent: tuple[Agent, MemoryBus], opened):
     robot, server = agent
     old, new = NodeId(*MAP, 1), NodeId(*MAP, 2)
     assert robot._released(old, new), "no server knows it"
@@ -81,7 +81,7 @@ def test_what_a_server_has_it_must_have_let_go(own: SurveyedMap, agent: tuple[Ag
     place = MergedPose(old, Pose2())
 
     whole = PoseNews(7, 0, 1, {old: place, new: place}).encode("r0")
-    serving = server.serve(KEYS.all_poses("s0"), lambda request: request.reply(whole))
+    opened(server.serve(KEYS.all_poses("s0"), lambda request: request.reply(whole)))
     server.publish(KEYS.poses("s0", "r0"), PoseNews(7, 1, 1).encode("r0"))
     eventually(lambda: robot.merged_poses.of(old) is not None)
     assert not robot._released(old, new), "the server has it"
@@ -93,10 +93,9 @@ def test_what_a_server_has_it_must_have_let_go(own: SurveyedMap, agent: tuple[Ag
     robot.missions.unknown_goal = lambda node: ""
     robot.missions.take(MissionOrder.new("r0", MissionKind.GO, "anna", old))
     assert not robot._released(old, new), "it is a goal"
-    serving.close()
 
 
-def test_a_map_that_it_has_left_goes_when_its_server_has_pruned_all_of_it(own: SurveyedMap, tmp_path):
+def test_a_map_that_it_has_left_goes_when_its_server_has_pruned_all_of_it(own: SurveyedMap, tmp_path, opened):
     journal = Journal(tmp_path / "r0.sqlite", "r0")
     journal.open_map(1)
     journal.append(MAP, own.map.contents(), 0)
@@ -112,8 +111,6 @@ def test_a_map_that_it_has_left_goes_when_its_server_has_pruned_all_of_it(own: S
     server.serve(KEYS.all_acks("s0"), answer)
     server.announce(KEYS.server_alive("s0"))
     options = AgentOptions("r0", tmp_path, fresh=True, patience=0.0)
-    robot = Agent(lambda: DESCRIPTION, MemoryBus(hub), KEYS, AgentSettings(), options)
+    robot = opened(Agent(lambda: DESCRIPTION, MemoryBus(hub), KEYS, AgentSettings(), options))
     eventually(lambda: not RetainedMap.of(robot.journal, MAP).contents)
     assert asked == [KeptNodes(1, tuple(sorted(node.number for node in own.map.nodes)))]
-    robot.close()
-    server.close()

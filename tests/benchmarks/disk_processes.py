@@ -28,6 +28,7 @@ from mapweave.wire.log_messages import decode_record
 from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.postgres_server import PostgresServer
 from tests.disks import empty, fill, make_read_only, mount
+from tests.programs import mapweave
 from tests.waiting import eventually, free_port
 
 SEED, INTERVAL = 7, 0.1
@@ -236,8 +237,7 @@ def read_only_disk(fleet: DiskFleet) -> dict[str, Any]:
     fleet.start("server")
     eventually(lambda: not fleet.runs("server"), PATIENCE)
     said = (fleet.root / "server.log").read_text().removeprefix(before).splitlines()
-    show = [sys.executable, "-m", "mapweave", "map", "show", fleet.address]
-    shown = subprocess.run(show, capture_output=True, text=True, timeout=PATIENCE)
+    shown = mapweave("map", "show", fleet.address, timeout=PATIENCE)
     return {"lines": said, "status": fleet.status("server"), "show": shown.returncode}
 
 

@@ -1,10 +1,10 @@
 """The agent's benchmark measures a process that lacks what the base installation lacks."""
 
 import json
-import subprocess
-import sys
 
 import pytest
+
+from tests.programs import python
 
 pytest.importorskip("pybullet")
 
@@ -12,8 +12,8 @@ pytest.importorskip("pybullet")
 @pytest.mark.slow
 @pytest.mark.timeout(300)
 def test_its_last_line_is_one_object():
-    command = [sys.executable, "-m", "benchmarks.agent", "--seconds", "10", "--seed", "3", "--json"]
-    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    arguments = "--seconds 10 --seed 3 --json"
+    done = python("-m", "benchmarks.agent", *arguments.split(), check=True, timeout=None)
     values = json.loads(done.stdout.strip().splitlines()[-1])
     assert values["ticks"] == 100 and values["nodes"] >= 1
     assert 0.0 < values["tick_ms_p50"] < values["tick_ms_p99"] < 1000.0

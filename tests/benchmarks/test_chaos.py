@@ -6,7 +6,6 @@ import json
 import os
 import shutil
 import sqlite3
-import subprocess
 import sys
 from collections.abc import Iterator
 from contextlib import closing
@@ -36,6 +35,7 @@ from mapweave.wire.codec import element_of, encode_change
 from mapweave.wire.keys import Keys
 from mapweave.wire.log_messages import Mark
 from mapweave.wire.memory import MemoryBus, MemoryHub
+from tests.programs import python
 from tests.waiting import eventually
 
 STEPS = 40
@@ -362,11 +362,8 @@ def test_a_server_that_found_no_database_is_started_again_before_robots_ask(tmp_
 @pytest.mark.alone
 @pytest.mark.timeout(600)
 def test_nothing_is_lost_in_a_short_chaos():
-    ran = subprocess.run(
-        [sys.executable, "-m", "benchmarks.chaos", "--agents", "2", "--seconds", "10", "--json",
-         "--store", "sqlite"],
-        capture_output=True, text=True, env=dict(os.environ),
-    )  # fmt: skip
+    arguments = "--agents 2 --seconds 10 --json --store sqlite"
+    ran = python("-m", "benchmarks.chaos", *arguments.split(), env=dict(os.environ), timeout=None)
     assert ran.returncode == 0, ran.stderr[-2000:]
     report = json.loads(ran.stdout.splitlines()[-1])
     assert report["kills"] >= LEAST_KILLS and report["lost_stores"] > 0 and report["lossy"] > 0

@@ -31,6 +31,7 @@ from mapweave.hybridmap import jit
 from mapweave.hybridmap.agent_status import FleetStatus, RobotEntry
 from mapweave.wire.bus import Reply
 from mapweave.wire.messages import encode
+from tests.programs import python
 from tests.waiting import eventually
 
 FIGURES: Figures = {
@@ -202,10 +203,7 @@ def test_it_ends_with_1_unless_it_is_good_and_prints_json(
 def test_a_small_fleet_is_measured_as_a_whole():
     """Not how fast it is: that is a matter of the machine and of what else it does."""
     arguments = "--agents 4 --seconds 12 --burst 40 --disturb --seed 5 --json"
-    ran = subprocess.run(
-        [sys.executable, "-m", "benchmarks.fleet", *arguments.split()],
-        capture_output=True, text=True, timeout=380,
-    )  # fmt: skip
+    ran = python("-m", "benchmarks.fleet", *arguments.split(), timeout=380)
     assert ran.stdout, ran.stderr[-2000:]
     report = json.loads(ran.stdout.splitlines()[-1])
     assert ran.returncode == (not report["good"])

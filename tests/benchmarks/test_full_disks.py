@@ -3,7 +3,6 @@
 import json
 import os
 import shutil
-import subprocess
 import sys
 import tempfile
 from collections.abc import Iterator
@@ -15,6 +14,7 @@ import pytest
 
 from synthetic.postgres_server import binaries
 from tests.disks import own_mounts
+from tests.programs import ran
 
 pytestmark = [pytest.mark.slow, pytest.mark.waits, pytest.mark.timeout(900)]
 
@@ -33,13 +33,11 @@ def said(request: pytest.FixtureRequest) -> Iterator[dict[str, Any]]:
     folder = Path(tempfile.mkdtemp(prefix="disk-"))
     try:
         folder.chmod(0o755)
-        ran = subprocess.run(
-            [*unshare, sys.executable, "-m", "tests.benchmarks.disk_processes", store, str(folder)],
-            capture_output=True, text=True, timeout=800, cwd=Path(__file__).parents[2], env=dict(os.environ),
-        )  # fmt: skip
+        program = [*unshare, sys.executable, "-m", "tests.benchmarks.disk_processes"]
+        done = ran(*program, store, folder, timeout=800, cwd=Path(__file__).parents[2], env=dict(os.environ))
         logs = "\n".join(path.read_text(errors="replace")[-3000:] for path in folder.glob("*.log"))
-        assert ran.returncode == 0, ran.stderr + logs
-        yield dict(json.loads(ran.stdout.splitlines()[-1]), store=store)
+        assert done.returncode == 0, done.stderr + logs
+        yield dict(json.loads(done.stdout.splitlines()[-1]), store=store)
     finally:
         shutil.rmtree(folder, ignore_errors=True)
 

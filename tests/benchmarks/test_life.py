@@ -1,8 +1,6 @@
 """The benchmark of a map's life: a short one as a whole, and its ratios by hand."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -11,6 +9,7 @@ from rich.console import Console
 
 from benchmarks.life import benchmark
 from benchmarks.life.benchmark import FIFTIETH, SOME, MapAfterDrive, change_of, in_the_long_run, run
+from tests.programs import python
 
 DRIVE = MapAfterDrive(20, 5, 3, 1, 5.0, 0.1, 200_000_000, 1_000_000, 100_000)
 
@@ -59,10 +58,7 @@ def test_the_map_after_some_drives_is_asked_as_it_was_then(monkeypatch):
 @pytest.mark.slow
 def test_a_short_life():
     arguments = "--drives 3 --stops 1 --queries 20 --seed 4 --json"
-    ran = subprocess.run(
-        [sys.executable, "-m", "benchmarks.life", *arguments.split()],
-        capture_output=True, text=True, timeout=300,
-    )  # fmt: skip
+    ran = python("-m", "benchmarks.life", *arguments.split(), timeout=300)
     assert ran.returncode == 0, ran.stderr[-2000:]
     figures = json.loads(ran.stdout)
     for name in ("curve", "node_ms", "merge_s", "memory_mb", "store_mb", "journal_mb"):

@@ -16,7 +16,7 @@ from synthetic.world import room, take_map
 
 
 @pytest.mark.slow
-def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path):
+def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path, opened):
     rng = np.random.default_rng(5)
     tour = [Pose2(2.5, 2.0, 0.7 * k) for k in range(6)]
     nodes = take_map(room(0, 0, 5, 4, 400, rng), MapId("m0", 1), tour, rng)[0]
@@ -27,7 +27,7 @@ def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path):
     none = Differences(np.zeros((1, 32), np.float32), np.zeros((1, 128), np.int16))
     distractors, result = Distractors(places, none, 7), list[int]()
     fill(tmp_path / "store", places, distractors, 20, result.append)
-    store = SqliteStore(tmp_path / "store")
+    store = opened(SqliteStore(tmp_path / "store"))
     maps = {map_id: HybridMap(change.body for change in store.replay(map_id)) for map_id in store.maps()}
     assert sum(result) == 20
     assert {map_id: len(outcome.nodes) for map_id, outcome in maps.items()} == {
@@ -42,4 +42,3 @@ def test_each_robot_has_its_nodes_and_they_hang_together(tmp_path):
     puts = (change.body for change in store.replay(MapId("d0", 1)) if isinstance(change.body, NodePut))
     for k, put in enumerate(puts):
         assert np.array_equal(put.node.landmarks.codes, distractors.node(k).landmarks.codes)
-    store.close()

@@ -1,8 +1,6 @@
 """The benchmark of shards: its figures by hand, and a small run with a real cluster and a killed shard."""
 
 import json
-import subprocess
-import sys
 import tempfile
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,6 +25,7 @@ from benchmarks.shards.benchmark import (
 from benchmarks.shards.fleet import BuildingFleet
 from benchmarks.shards.shared_store import SharedStore, can_be_shared
 from mapweave.mapserver.log.opening import open_store
+from tests.programs import python
 
 WITHOUT = "needs the extra `postgres` and Debian's package postgresql"
 
@@ -117,10 +116,7 @@ def test_a_small_run(store: str, kind: str):
         pytest.skip(WITHOUT)
     sizes = "--shards 2 --robots 4 --nodes 12 --seconds 1 --ray-nodes 2"
     arguments = f"{sizes} --store {store} --kills {kind} --seed 1 --json"
-    run = subprocess.run(
-        [sys.executable, "-m", "benchmarks.shards", *arguments.split()],
-        capture_output=True, text=True, timeout=220,
-    )  # fmt: skip
+    run = python("-m", "benchmarks.shards", *arguments.split(), timeout=220)
     assert run.returncode == 0, run.stderr[-3000:]
     figures = json.loads(run.stdout)
     assert figures["store"] == store and {*figures["not_killed"]} == {*KILLS, *SHARED_KILLS} - {kind}

@@ -1,7 +1,5 @@
 """`mapweave map backup`: copies of stores and journals whose processes run on."""
 
-import subprocess
-import sys
 import threading
 from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
@@ -36,6 +34,7 @@ from tests.mapserver.log.acknowledged_fleet import AGENT, life
 from tests.mapserver.log.test_front_servers import Log, logs_of
 from tests.mapweave.command_line import complaint
 from tests.mapweave.test_opened_map import LOGS, annotated_store
+from tests.programs import mapweave
 from tests.waiting import eventually, free_port
 
 KEYS = Keys("fleet")
@@ -124,12 +123,7 @@ def test_a_running_servers_store_is_backed_up_and_a_server_on_it_is_completed(tm
 
             eventually(lambda: min(acknowledged().values(), default=0) > 100, PATIENCE)
             before = acknowledged()
-            command = [sys.executable, "-m", "mapweave", "map", "backup"]
-            ran = subprocess.run(
-                [*command, str(tmp_path / "first" / "s0.sqlite"), "-o", str(backup)],
-                capture_output=True,
-                text=True,
-            )
+            ran = mapweave("map", "backup", tmp_path / "first" / "s0.sqlite", "-o", backup, timeout=None)
             assert (ran.returncode, ran.stderr) == (0, "")
             assert ran.stdout.startswith(f"{backup}: copy of the store")
             after = acknowledged()

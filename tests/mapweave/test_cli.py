@@ -2,14 +2,13 @@
 
 import json
 import re
-import subprocess
-import sys
 
 import pytest
 
 from mapweave.cli import main
 from mapweave.exit_status import FAILED, NO, USAGE
 from tests.mapweave.command_line import commands, complaint
+from tests.programs import mapweave, python
 
 pytestmark = pytest.mark.usefixtures("signals", "simulator")
 
@@ -164,14 +163,8 @@ def test_an_epoch_out_of_range(capfd, recording, tmp_path, closed):
 # As processes
 
 
-def run(*arguments: object) -> subprocess.CompletedProcess[str]:
-    """`mapweave` as a user runs it."""
-    command = [sys.executable, "-m", "mapweave", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
-
-
 def test_a_failing_process_prints_one_line_and_ends(tmp_path):
-    done = run("map", "show", tmp_path / "nothing.mapweave")
+    done = mapweave("map", "show", tmp_path / "nothing.mapweave")
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == f"mapweave: {tmp_path / 'nothing.mapweave'}: no such file\n"
 
@@ -185,7 +178,7 @@ def test_help_is_quick():
         "heavy &= set(sys.modules)\n"
         "sys.exit(', '.join(sorted(heavy)) or 0)"
     )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=False)
+    done = python("-c", program)
     assert (done.returncode, done.stderr) == (0, "")
 
 
@@ -197,9 +190,7 @@ def test_what_is_wrong_with_settings_is_said_before_the_pipeline_is_imported(tmp
         "heavy = {'mapweave.agent.pipeline', 'networkx', 'cv2', 'rosbags'} & set(sys.modules)\n"
         "sys.exit(', '.join(sorted(heavy)) or status)"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", program, tmp_path / "r0.toml"], capture_output=True, text=True, check=False
-    )
+    done = python("-c", program, tmp_path / "r0.toml")
     assert done.returncode == FAILED
     (line,) = done.stderr.splitlines()
     assert "no setting 'sped'" in line

@@ -2,8 +2,6 @@
 
 import json
 import os
-import subprocess
-import sys
 import threading
 from pathlib import Path
 
@@ -21,6 +19,7 @@ from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.storage.map_file import MapFile, write_map_file
 from tests.mapweave.command_line import complaint
+from tests.programs import mapweave
 
 pytestmark = pytest.mark.usefixtures("signals", "simulator")
 
@@ -151,9 +150,7 @@ def test_ffmpeg_prints_nothing_beside_the_one_line(tmp_path):
         writer.write(np.full((48, 64, 3), 20 * k, np.uint8))
     writer.release()
     path.write_bytes(path.read_bytes()[:-300])
-    command = [sys.executable, "-m", "mapweave", "info", str(path)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False)
-    (line,) = done.stderr.splitlines()
+    (line,) = mapweave("info", path).stderr.splitlines()
     assert "an MP4 that was cut off has lost its index" in line
 
 

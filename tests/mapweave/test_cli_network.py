@@ -28,6 +28,7 @@ from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.mapweave.command_line import complaint
 from tests.mapweave.expired_key import EXPIRED, expired_key
+from tests.programs import python
 from tests.simulator import needs_simulator
 from tests.waiting import eventually
 
@@ -121,8 +122,7 @@ def test_a_router_is_looked_for_while_the_pipeline_is_imported(command, recordin
         "mapweave.cli.main(sys.argv[1:])\n"
     )
     which = "r0" if command == "agent" else recording
-    run = [sys.executable, "-c", program, command, which, "--connect", closed]
-    done = subprocess.run(run, capture_output=True, text=True, check=False, timeout=60)
+    done = python("-c", program, command, which, "--connect", closed)
     assert (done.returncode, done.stdout, done.stderr) == (7, "False\n", "")
 
 
@@ -302,8 +302,7 @@ def test_the_own_certificate_that_has_expired_is_named_by_an_agent(tmp_path, clo
 
 def printed(program: str) -> str:
     """What a program prints that ends well."""
-    run = [sys.executable, "-c", program]
-    return subprocess.run(run, capture_output=True, text=True, timeout=60, check=True).stdout
+    return python("-c", program, check=True).stdout
 
 
 def status_without_terminal(program: str, gone: Path) -> int:

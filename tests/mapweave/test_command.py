@@ -44,10 +44,10 @@ FLEET = "kept"
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_killed(tmp_path, capfd):
+def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_killed(tmp_path, capfd, opened):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     network = ["--fleet", FLEET, "--connect", endpoint]
-    bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
+    bus = opened(ZenohBus(BusSettings(mode="client", endpoints=(endpoint,))))
 
     def shell(*words: str) -> tuple[int, str]:
         """Exit status and output. A busy machine may take longer than a person would wait: asked again."""
@@ -60,79 +60,74 @@ def test_a_robot_is_commanded_from_the_shell_and_keeps_its_goal_when_it_is_kille
         eventually(run, PATIENCE)
         return done[0]
 
-    try:
-        with Children(tmp_path / "logs") as children:
+    with Children(tmp_path / "logs") as children:
 
-            def start_server() -> None:
-                data = str(tmp_path / "server")
-                children.start("server", ["server", "--fleet", FLEET, "--listen", endpoint, "--data", data])
-                eventually(lambda: bus.ask(Keys(FLEET).any_robots(), b"", 1.0), PATIENCE)
+        def start_server() -> None:
+            data = str(tmp_path / "server")
+            children.start("server", ["server", "--fleet", FLEET, "--listen", endpoint, "--data", data])
+            eventually(lambda: bus.ask(Keys(FLEET).any_robots(), b"", 1.0), PATIENCE)
 
-            def start_robot(*more: str) -> None:
-                data = str(tmp_path / "agents")
-                children.start("r0", ["agent", "r0", "--data", data, *network, *more])
+        def start_robot(*more: str) -> None:
+            data = str(tmp_path / "agents")
+            children.start("r0", ["agent", "r0", "--data", data, *network, *more])
 
-            def robot(alive: bool = True) -> dict:
-                """The robot's line; waits until it is there, or gone."""
-                found: list[dict] = []
+        def robot(alive: bool = True) -> dict:
+            """The robot's line; waits until it is there, or gone."""
+            found: list[dict] = []
 
-                def look() -> bool:
-                    children.check()
-                    robots = json.loads(shell("status", "--json")[1])["robots"]
-                    found[:] = [one for one in robots if one["alive"] is alive and one["status"]]
-                    return bool(found)
+            def look() -> bool:
+                children.check()
+                robots = json.loads(shell("status", "--json")[1])["robots"]
+                found[:] = [one for one in robots if one["alive"] is alive and one["status"]]
+                return bool(found)
 
-                eventually(look, PATIENCE)
-                return found[0]
+            eventually(look, PATIENCE)
+            return found[0]
 
-            start_server()
-            Body(bus)
-            start_robot("--mission", "carried")
-            eventually(lambda: robot()["status"]["status"]["nodes"] >= 2, PATIENCE)
-            eventually(lambda: robot()["merged_from_robot"] is not None, PATIENCE)
-            assert robot()["status"]["mission"]["order"]["kind"] == "carried"
+        start_server()
+        Body(bus)
+        start_robot("--mission", "carried")
+        eventually(lambda: robot()["status"]["status"]["nodes"] >= 2, PATIENCE)
+        eventually(lambda: robot()["merged_from_robot"] is not None, PATIENCE)
+        assert robot()["status"]["mission"]["order"]["kind"] == "carried"
 
-            assert shell("stop", "r0")[0] == 0
-            eventually(lambda: robot()["status"]["mission"]["state"] == "done", PATIENCE)
-            code, printed = shell("go", "r0", "home", "--json")
-            (mission,) = json.loads(printed)["missions"]
-            assert (code, mission["state"], mission["order"]["node"]) == (0, "running", "r0.1.1")
-            children.kill("r0")
-            robot(alive=False)
-            listed = shell("missions", "r0")[1].splitlines()
-            assert "running" in listed[-1] and listed[-1].endswith(
-                "; the robot is gone, see `mapweave status`"
-            )
-            assert not any("gone" in line for line in listed[:-1])
-            start_robot()
-            # The server shows the last status before the kill until the next one comes.
-            eventually(lambda: robot()["status"]["mission"]["order"] == mission["order"], PATIENCE)
-            assert robot()["status"]["mission"]["state"] == "running", "killed, and it goes on"
+        assert shell("stop", "r0")[0] == 0
+        eventually(lambda: robot()["status"]["mission"]["state"] == "done", PATIENCE)
+        code, printed = shell("go", "r0", "home", "--json")
+        (mission,) = json.loads(printed)["missions"]
+        assert (code, mission["state"], mission["order"]["node"]) == (0, "running", "r0.1.1")
+        children.kill("r0")
+        robot(alive=False)
+        listed = shell("missions", "r0")[1].splitlines()
+        assert "running" in listed[-1] and listed[-1].endswith("; the robot is gone, see `mapweave status`")
+        assert not any("gone" in line for line in listed[:-1])
+        start_robot()
+        # The server shows the last status before the kill until the next one comes.
+        eventually(lambda: robot()["status"]["mission"]["order"] == mission["order"], PATIENCE)
+        assert robot()["status"]["mission"]["state"] == "running", "killed, and it goes on"
 
-            children.kill("server")
-            start_server()
-            assert robot()["status"]["mission"]["order"] == mission["order"]
-            with Fleet(endpoint, FLEET) as fleet:
-                kinds = [report.order.kind for report in fleet.missions("r0")]
-                assert kinds == ["carried", "stop", "go"], "the record outlasts the server"
+        children.kill("server")
+        start_server()
+        assert robot()["status"]["mission"]["order"] == mission["order"]
+        with Fleet(endpoint, FLEET) as fleet:
+            kinds = [report.order.kind for report in fleet.missions("r0")]
+            assert kinds == ["carried", "stop", "go"], "the record outlasts the server"
 
-            assert shell("map", "fetch", str(tmp_path / "m.mapweave"))[0] == 0
-            assert len(read_map_file(tmp_path / "m.mapweave", "merged").poses) >= 2
-            refused = complaint(capfd, "missions", "r9", *network, status=NO)
-            assert "there is no robot r9; there are: r0" in refused
-            refused = complaint(capfd, "go", "r0", "r0.7.1", *network, status=NO)
-            assert "r0.7.1 is not in the merged map" in refused
-            complaint(capfd, "go", "r.0", "r0.7.1", *network, status=USAGE)
-            code, printed = shell("go", "r0", "r0.1.999")
-            assert code == NO and "refused: there is no node r0.1.999; the nearest is r0.1." in printed
-            code, printed = shell("status")
-            assert code == 0 and "r0" in printed and "go to r0.1.1" in printed
-            code, printed = shell("stop", "--all")
-            assert code == 0 and "r0: stop" in printed
-            for name in ("r0", "server"):
-                children.end(name)
-    finally:
-        bus.close()
+        assert shell("map", "fetch", str(tmp_path / "m.mapweave"))[0] == 0
+        assert len(read_map_file(tmp_path / "m.mapweave", "merged").poses) >= 2
+        refused = complaint(capfd, "missions", "r9", *network, status=NO)
+        assert "there is no robot r9; there are: r0" in refused
+        refused = complaint(capfd, "go", "r0", "r0.7.1", *network, status=NO)
+        assert "r0.7.1 is not in the merged map" in refused
+        complaint(capfd, "go", "r.0", "r0.7.1", *network, status=USAGE)
+        code, printed = shell("go", "r0", "r0.1.999")
+        assert code == NO and "refused: there is no node r0.1.999; the nearest is r0.1." in printed
+        code, printed = shell("status")
+        assert code == 0 and "r0" in printed and "go to r0.1.1" in printed
+        code, printed = shell("stop", "--all")
+        assert code == 0 and "r0: stop" in printed
+        for name in ("r0", "server"):
+            children.end(name)
 
 
 def test_a_stop_that_has_not_reached_its_robot_is_no_success(capsys, monkeypatch):

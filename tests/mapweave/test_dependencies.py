@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from tests.programs import python
+
 ROOT = Path(__file__).parents[2]
 
 
@@ -35,5 +37,4 @@ def test_ray_is_imported_without_a_grammar_of_addresses():
     """It takes 1.6 s of 3; a node of a cluster that has no 15 s for its processes does not start."""
     pytest.importorskip("ray", reason="needs the extra `cluster`")
     code = "import ray, sys; print('rfc3987_syntax' in sys.modules)"
-    ran = subprocess.run([sys.executable, "-c", code], check=True, capture_output=True, text=True)
-    assert ran.stdout == "False\n"
+    assert python("-c", code, check=True, timeout=None).stdout == "False\n"

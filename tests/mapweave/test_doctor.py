@@ -4,7 +4,6 @@ import io
 import json
 import shlex
 import socket
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
@@ -37,6 +36,7 @@ from mapweave.wire.zenoh_bus import ZenohBus
 from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.agent.drivers.emulators import ArduinoSketch
 from tests.mapweave.expired_key import EXPIRED, expired_key
+from tests.programs import python
 from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[2]
@@ -63,10 +63,8 @@ def test_it_runs_without_libraries_and_names_them(missing: list[str], tmp_path):
         ["doctor", "--json", "--data", str(tmp_path), "--offline"],
         ["doctor", "--data", str(tmp_path), "--offline"],
     ]
-    ran = subprocess.run(
-        [sys.executable, "-m", "tests.mapweave.without_libraries", *missing],
-        input=json.dumps(commands), capture_output=True, text=True, check=True, cwd=ROOT, timeout=60,
-    )  # fmt: skip
+    program = "tests.mapweave.without_libraries"
+    ran = python("-m", program, *missing, input=json.dumps(commands), check=True, cwd=ROOT)
     (status, out, err), (plain_status, plain, plain_err) = json.loads(ran.stdout)
     assert status == plain_status == NO and not err and not plain_err
     wrong = [one for one in json.loads(out)["findings"] if one["verdict"] == "wrong"]
@@ -201,10 +199,8 @@ height_m = 0.3
 
 
 @pytest.fixture
-def sketch(tmp_path: Path) -> Iterator[ArduinoSketch]:
-    emulator = ArduinoSketch(tmp_path)
-    yield emulator
-    emulator.close()
+def sketch(tmp_path: Path, opened) -> ArduinoSketch:
+    return opened(ArduinoSketch(tmp_path))
 
 
 @pytest.mark.slow

@@ -4,7 +4,6 @@ import json
 import os
 import re
 import shlex
-import subprocess
 import sys
 import tomllib
 from collections.abc import Iterable
@@ -25,6 +24,7 @@ from mapweave.offline_merge import merge_parts
 from mapweave.storage.map_file import MapFile, write_map_file
 from synthetic.maps import looked_around
 from tests.mapweave.command_line import commands
+from tests.programs import python, ran
 from tests.simulator import needs_simulator
 
 ROOT = Path(__file__).parents[2]
@@ -171,12 +171,11 @@ def outcomes(without: Iterable[str], lines: Iterable[str], path: str = ACTIVATED
     without = set(without)
     there = {module for extra in MODULES.keys() - without for module in MODULES[extra]}
     missing = sorted({module for extra in without for module in MODULES[extra]} - there)
-    ran = subprocess.run(
-        [sys.executable, "-m", "tests.mapweave.without_libraries", *missing],
-        input=json.dumps([line.split() for line in lines]),
-        capture_output=True, text=True, check=True, cwd=ROOT, timeout=120, env=os.environ | {"PATH": path},
+    done = python(
+        "-m", "tests.mapweave.without_libraries", *missing, check=True, cwd=ROOT, timeout=120,
+        input=json.dumps([line.split() for line in lines]), env=os.environ | {"PATH": path},
     )  # fmt: skip
-    return [(status, out, err) for status, out, err in json.loads(ran.stdout)]
+    return [(status, out, err) for status, out, err in json.loads(done.stdout)]
 
 
 def test_every_command_is_tried():
@@ -230,9 +229,7 @@ def test_the_pip_that_is_named_is_that_of_this_environment(tmp_path, path: str):
     said = outcome[2].removeprefix('mapweave server needs the extra "server": ').rstrip("\n")
     program, *words = shlex.split(said)
     assert words == ["-m", "pip", "install", "mapweave[server]"]
-    where = subprocess.run(
-        [program, "-c", "import pip; print(pip.__file__)"], capture_output=True, text=True, check=True
-    )
+    where = ran(program, "-c", "import pip; print(pip.__file__)", check=True)
     assert Path(sys.prefix).resolve() in Path(where.stdout.strip()).resolve().parents
 
 
@@ -272,12 +269,8 @@ def test_help_wrong_use_and_version_import_no_library():
     """All that takes time to import is left until a command runs."""
     asked = [[*command.split(), "--help"] for command in commands()]
     wrong = [[*command.split(), "--no-such-option"] for command in commands()]
-    ran = subprocess.run(
-        [sys.executable, "-c", HELP],
-        input=json.dumps([[], ["--help"], ["--version"], ["fly"], *asked, *wrong]),
-        capture_output=True, text=True, check=True, cwd=ROOT, timeout=60,
-    )  # fmt: skip
-    assert set(ran.stdout.split()) == {"mapweave"}
+    lines = json.dumps([[], ["--help"], ["--version"], ["fly"], *asked, *wrong])
+    assert set(python("-c", HELP, input=lines, check=True, cwd=ROOT).stdout.split()) == {"mapweave"}
 
 
 ASK = """
@@ -297,11 +290,8 @@ except mapweave.MapweaveError as error:
 
 def test_python_asks_a_fleet_without_extras_and_a_file_names_the_one_that_it_needs(filled: dict[str, object]):
     """Both ended with: No module named 'faiss'."""
-    ran = subprocess.run(
-        [sys.executable, "-c", ASK, str(filled["merged"]), *MODULES["server"]],
-        capture_output=True, text=True, check=True, cwd=ROOT, timeout=60,
-    )  # fmt: skip
-    view, file = ran.stdout.splitlines()
+    done = python("-c", ASK, filled["merged"], *MODULES["server"], check=True, cwd=ROOT)
+    view, file = done.stdout.splitlines()
     assert view == "0" and file.startswith('needs the extra "server": ')
 
 

@@ -2,7 +2,6 @@
 
 import json
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ import pytest
 
 from mapweave.exit_status import FAILED
 from tests.disks import own_mounts
+from tests.programs import ran
 
 pytestmark = [pytest.mark.slow, pytest.mark.waits, pytest.mark.timeout(600)]
 
@@ -19,12 +19,10 @@ pytestmark = [pytest.mark.slow, pytest.mark.waits, pytest.mark.timeout(600)]
 def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Any]:
     """What was seen of a robot whose disk is full now and then."""
     folder = tmp_path_factory.mktemp("robot")
-    ran = subprocess.run(
-        [*own_mounts(), sys.executable, "-m", "tests.mapweave.full_disk_agent", str(folder)],
-        capture_output=True, text=True, timeout=550, cwd=Path(__file__).parents[2], env=dict(os.environ),
-    )  # fmt: skip
-    assert ran.returncode == 0, ran.stderr + (folder / "logs" / "r0.log").read_text(errors="replace")
-    return dict(json.loads(ran.stdout.splitlines()[-1]))
+    program = [*own_mounts(), sys.executable, "-m", "tests.mapweave.full_disk_agent"]
+    done = ran(*program, folder, timeout=550, cwd=Path(__file__).parents[2], env=dict(os.environ))
+    assert done.returncode == 0, done.stderr + (folder / "logs" / "r0.log").read_text(errors="replace")
+    return dict(json.loads(done.stdout.splitlines()[-1]))
 
 
 def about_disks(lines: list[str]) -> list[str]:

@@ -305,7 +305,7 @@ def test_a_process_that_ends_after_an_episode_keeps_what_follows_from_it(tmp_pat
 
 
 @pytest.mark.parametrize("recorded", [False, True])
-def test_changes_that_no_disk_took_are_no_success(tmp_path, monkeypatch, recorded: bool):
+def test_changes_that_no_disk_took_are_no_success(tmp_path, monkeypatch, recorded: bool, opened):
     """Nor does who has ended say that they are written once there is room."""
 
     def full(*_: object) -> int:
@@ -313,7 +313,7 @@ def test_changes_that_no_disk_took_are_no_success(tmp_path, monkeypatch, recorde
 
     monkeypatch.setattr(Journal, "write", full)
     monkeypatch.setattr(Replicator, "flush", lambda *_: False)
-    bus = MemoryBus(MemoryHub())
+    bus = opened(MemoryBus(MemoryHub()))
     options = AgentOptions(
         "r0", tmp_path, epoch=1, mission=MissionKind.CARRIED, patience=0.0, recorded=recorded
     )
@@ -322,7 +322,6 @@ def test_changes_that_no_disk_took_are_no_success(tmp_path, monkeypatch, recorde
     again = ", and replay the recording again" if recorded else ""
     with pytest.raises(InvalidFile, match=rf"^r0: \d+ changes are lost: r0\.sqlite: {NO_ROOM}{again}$"):
         run_agent(robot, bus, KEYS, AgentSettings(), options, threading.Event())
-    bus.close()
 
 
 class Ended:
@@ -345,16 +344,15 @@ class Ended:
         pass
 
 
-def test_a_map_file_that_does_not_fit_on_the_disk_leaves_a_whole_journal(tmp_path):
+def test_a_map_file_that_does_not_fit_on_the_disk_leaves_a_whole_journal(tmp_path, opened):
     """The journal was never closed: what waited for the disk was lost without a word."""
     bus = ZenohBus(BusSettings(endpoints=(f"tcp/127.0.0.1:{free_port()}",)))
     options = AgentOptions("r0", tmp_path, epoch=1, patience=0.0)
     with pytest.raises(InvalidFile, match=r"r0\.1\.mapweave"):
         run_agent(Ended(tmp_path / "r0.1.mapweave"), bus, KEYS, AgentSettings(), options, threading.Event())
     bus.close()
-    journal = Journal(tmp_path / "r0.sqlite", "r0")  # in use, as long as the agent has not closed it
+    journal = opened(Journal(tmp_path / "r0.sqlite", "r0"))  # in use, as long as the agent has not closed it
     assert journal.maps() == [MapId("r0", 1)]
-    journal.close()
 
 
 @pytest.mark.parametrize(

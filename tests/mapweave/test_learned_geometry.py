@@ -3,7 +3,7 @@
 import json
 import math
 import threading
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from datetime import date
 from pathlib import Path
@@ -32,11 +32,9 @@ P = Parameter
 
 
 @pytest.fixture
-def bus() -> Iterator[MemoryBus]:
+def bus(opened) -> MemoryBus:
     """It reaches no one."""
-    bus = MemoryBus(MemoryHub())
-    yield bus
-    bus.close()
+    return opened(MemoryBus(MemoryHub()))
 
 
 def learned_of(description: RobotDescription, heading: float = 0.02) -> LearnedGeometry:
@@ -66,9 +64,9 @@ def test_the_start_says_what_was_learned_and_how_to_forget_it(bus: MemoryBus, tm
     assert not file.exists()
 
 
-def test_a_correction_is_on_the_disk_before_the_process_ends(bus: MemoryBus, tmp_path):
+def test_a_correction_is_on_the_disk_before_the_process_ends(bus: MemoryBus, tmp_path, opened):
     """It may be killed. That a correction is found is tested with the calibration."""
-    agent = started(bus, tmp_path, [])
+    agent = opened(started(bus, tmp_path, []))
     calibration, file = agent.pipeline.calibration, tmp_path / "r0.learned.toml"
     walls, here = PhotoWalls(), Pose2(-1.0)
     agent.tick(walls.observe(here, here, 1))
@@ -83,14 +81,12 @@ def test_a_correction_is_on_the_disk_before_the_process_ends(bus: MemoryBus, tmp
     eventually(file.exists, 10.0)
     read = read_learned(file)
     assert read is not None and read[0].parameters == {P.HEADING: LearnedParameter(0.05, 0.002)}
-    agent.close()
 
 
-def test_a_recording_is_the_same_map_whatever_was_learned(bus: MemoryBus, tmp_path):
+def test_a_recording_is_the_same_map_whatever_was_learned(bus: MemoryBus, tmp_path, opened):
     write_learned(tmp_path / "r0.learned.toml", learned_of(DESCRIPTION), date(2026, 11, 29))
-    agent = started(bus, tmp_path, [], recorded=True)
+    agent = opened(started(bus, tmp_path, [], recorded=True))
     assert agent.pipeline.calibration.geometry.heading == 0.0
-    agent.close()
 
 
 @pytest.mark.parametrize("damaged", [True, False])

@@ -244,14 +244,13 @@ def test_what_is_no_image_of_the_camera_is_refused(running: Running, tmp_path):
         running.fleet.relocalize(tmp_path / "none.png", camera)
 
 
-def test_without_a_server_one_line_says_so():
-    bus = MemoryBus(MemoryHub())
+def test_without_a_server_one_line_says_so(opened):
+    bus = opened(MemoryBus(MemoryHub()))
     fleet = mapweave.Fleet(fleet="fleet", bus=bus)
     for ask in (lambda: fleet.nodes, lambda: fleet.route("r0.1.1", "r0.1.3"), fleet.history, fleet.refresh):
         with pytest.raises(NotConnected, match="no map server of fleet fleet answers"):
             ask()
     assert list(fleet.events(0.01)) == []
-    bus.close()
 
 
 def test_map_bytes_are_a_map_file(running: Running):

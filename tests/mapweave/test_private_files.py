@@ -1,7 +1,6 @@
 """With keys, what server and agent write is for their own user alone; without, as the umask says."""
 
 import signal
-import subprocess
 import sys
 from pathlib import Path
 
@@ -9,6 +8,7 @@ import pytest
 
 from mapweave.identities.key_folder import KeyFolder, Profile
 from mapweave.wire.credentials import Role
+from tests.programs import going
 from tests.quick import first_quick
 from tests.waiting import eventually, free_port
 
@@ -55,17 +55,14 @@ def test_files_are_for_their_owner_alone_if_there_are_keys(keys: bool, process: 
     data, made = {
         "server": (tmp_path / "out/server", "s0.sqlite"), "agent": (tmp_path / "out/agents", "r0.sqlite"),
     }[process]  # fmt: skip
-    with (tmp_path / "log.txt").open("w") as output:
-        running = subprocess.Popen(
-            [sys.executable, "-m", "mapweave", *words],
-            cwd=tmp_path, stdout=output, stderr=output, umask=0o022,
-        )  # fmt: skip
-    try:
+    program = [sys.executable, "-m", "mapweave", *words]
+    with (
+        (tmp_path / "log.txt").open("w") as output,
+        going(*program, cwd=tmp_path, stdout=output, stderr=output, umask=0o022) as running,
+    ):
         eventually(lambda: (data / made).exists() or running.poll() is not None)
         running.send_signal(signal.SIGTERM)
         running.wait(30)
-    finally:
-        running.kill()
     found = modes(data)
     assert made in found, (tmp_path / "log.txt").read_text()
     if keys:

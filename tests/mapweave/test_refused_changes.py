@@ -96,10 +96,9 @@ def test_a_server_that_begins_with_the_file_knows_it(stores: tuple[Path, Path], 
             assert server.settle(60) and server.merged().implausible.keys() == known
 
 
-def test_a_damaged_store_still_says_which_map(stores: tuple[Path, Path]):
+def test_a_damaged_store_still_says_which_map(stores: tuple[Path, Path], opened):
     sound, unsound = stores
     assert salvage(sound).refused_changes == {}
     found = salvage(unsound).refused_changes
-    store = SqliteStore(unsound)
+    store = opened(SqliteStore(unsound))
     assert found.keys() == {R1} and all_of(store).refused_changes == found
-    store.close()

@@ -234,16 +234,11 @@ def test_without_an_odometry_frame_of_others_it_publishes_its_own(
     assert whole.x == pytest.approx(x, abs=0.03)
 
 
-def test_names_of_agents_become_names_of_topics():
-    router = ZenohFleet()
-    publisher = Ros2Publisher(Ros2Link(router.endpoints[0], domain=0, namespace="/a"), "2-kitchen")
-    robot = RosPeer(router.endpoints[0])
-    try:
-        eventually(lambda: any("%a%mapweave%_2_kitchen%pose" in token for token in robot.tokens()))
-    finally:
-        publisher.close()
-        robot.close()
-        router.close()
+def test_names_of_agents_become_names_of_topics(opened):
+    router = opened(ZenohFleet())
+    opened(Ros2Publisher(Ros2Link(router.endpoints[0], domain=0, namespace="/a"), "2-kitchen"))
+    robot = opened(RosPeer(router.endpoints[0]))
+    eventually(lambda: any("%a%mapweave%_2_kitchen%pose" in token for token in robot.tokens()))
 
 
 def test_an_agent_publishes_where_the_topics_of_its_robot_are(tmp_path):

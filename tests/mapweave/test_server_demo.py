@@ -33,6 +33,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.core_time import CoreTime
+from tests.programs import mapweave, python
 from tests.waiting import eventually, free_port
 
 ROBOT = "const r = mapweave.painter.robots.find(one => one.name === '{}'); return r ? [r.x, r.y] : null"
@@ -97,7 +98,7 @@ def test_the_port_is_open_before_large_libraries_are_loaded():
         "from mapweave.cli import main\n"
         f"main(['server', '--demo', '--http', '0', '--listen', 'tcp/127.0.0.1:{free_port()}'])\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = python("-c", code)
     # Port 0 takes a free one, and the line has that.
     assert re.search(r"for people: http://127\.0\.0\.1:[1-9]\d+/\n", done.stdout), "the port is open"
     assert (done.returncode, done.stderr) == (0, ""), "these are loaded already"
@@ -350,8 +351,7 @@ def test_the_page_is_filled_within_a_second_of_the_start_of_the_process():
 @pytest.mark.slow
 def test_the_demo_keeps_nothing(tmp_path):
     begin = time.monotonic()
-    command = [sys.executable, "-m", "mapweave", "server", "--demo", "--data", str(tmp_path)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    done = mapweave("server", "--demo", "--data", tmp_path)
     assert done.returncode != 0
     assert done.stderr.strip() == "mapweave: --demo keeps nothing: leave out --data and --store"
     assert not list(tmp_path.iterdir()) and time.monotonic() < begin + 30.0

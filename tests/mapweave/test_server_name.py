@@ -1,8 +1,6 @@
 """Two map servers of one name in one fleet: the second is refused, and where they meet later both say so."""
 
 import logging
-import subprocess
-import sys
 from collections.abc import Iterator
 
 import pytest
@@ -16,6 +14,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.zenoh_bus import ZenohBus
 from tests.mapweave.command_line import complaint
+from tests.programs import python
 from tests.waiting import eventually, free_port
 
 KEYS = Keys("fleet")
@@ -89,5 +88,5 @@ def test_a_server_looks_for_another_one_while_it_loads_its_libraries(tmp_path):
         "from mapweave.cli import main\n"
         f"main(['server', '--data', {str(tmp_path)!r}, '--connect', 'tcp/127.0.0.1:{free_port()}'])\n"
     )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=60)
+    done = python("-c", code)
     assert done.returncode == 1, done.stderr

@@ -6,7 +6,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
 from itertools import takewhile
 from urllib.request import urlopen
 
@@ -21,6 +21,7 @@ from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.wire.log_messages import Scalar
 from synthetic.maps import looked_around
+from tests.programs import going
 from tests.waiting import eventually, free_port
 
 
@@ -118,20 +119,18 @@ sys.exit(main(sys.argv[1:]))
 """
 
 
+def starting_slowly(*arguments: object) -> AbstractContextManager[subprocess.Popen[str]]:
+    """A server that reads for ten minutes, whose output is read."""
+    program = [sys.executable, "-c", SLOW_START, "server", "--listen", f"tcp/127.0.0.1:{free_port()}"]
+    return going(*program, *arguments, stdout=subprocess.PIPE, env=dict(os.environ), text=True)
+
+
 def test_a_server_that_reads_its_store_can_be_stopped(tmp_path):
-    command = [
-        sys.executable, "-c", SLOW_START, "server", "--data", str(tmp_path), "--listen",
-        f"tcp/127.0.0.1:{free_port()}",
-    ]  # fmt: skip
-    with subprocess.Popen(command, stdout=subprocess.PIPE, env=dict(os.environ), text=True) as running:
-        assert running.stdout is not None
-        try:
-            assert any("reading" in line for line in running.stdout)
-            running.send_signal(signal.SIGTERM)
-            assert "stopped while it was starting" in running.stdout.read()
-            assert running.wait(60) == 0
-        finally:
-            running.kill()
+    with starting_slowly("--data", tmp_path) as running:
+        assert any("reading" in line for line in running.stdout)
+        running.send_signal(signal.SIGTERM)
+        assert "stopped while it was starting" in running.stdout.read()
+        assert running.wait(60) == 0
 
 
 ANSWER_IN_TWO_PARTS = """
@@ -171,16 +170,8 @@ def test_a_server_that_begins_a_store_beside_those_of_others_says_so(tmp_path):
     Journal(tmp_path / "r0.sqlite", "r0").close()
     said = {}
     for name in ("s1", "monday"):
-        command = [
-            sys.executable, "-c", SLOW_START, "server", "--name", name, "--data", str(tmp_path), "--listen",
-            f"tcp/127.0.0.1:{free_port()}",
-        ]  # fmt: skip
-        with subprocess.Popen(command, stdout=subprocess.PIPE, env=dict(os.environ), text=True) as running:
-            assert running.stdout is not None
-            try:
-                said[name] = "".join(takewhile(lambda line: "reading" not in line, running.stdout))
-            finally:
-                running.kill()
+        with starting_slowly("--name", name, "--data", tmp_path) as running:
+            said[name] = "".join(takewhile(lambda line: "reading" not in line, running.stdout))
     assert f"{tmp_path / 's1.sqlite'} is a new store, with nothing in it" in said["s1"]
     assert "and not with monday.sqlite beside it\n" in said["s1"]
     assert "a new store" not in said["monday"]

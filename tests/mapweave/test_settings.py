@@ -2,8 +2,6 @@
 
 import dataclasses
 import re
-import subprocess
-import sys
 import time
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from mapweave.agent.drivers.settings_writer import write_camera
 from mapweave.hybridmap.errors import SettingsError
 from mapweave.settings import Settings, load_settings, settings_from
 from mapweave.storage.settings_file import build, read_toml
+from tests.programs import python
 
 
 def load(tmp_path: Path, text: str | bytes) -> Settings:
@@ -133,7 +132,7 @@ def test_a_robot_reads_the_file_without_the_merges_libraries():
         "import sys; from mapweave.settings import load_settings; load_settings(None); "
         "sys.exit(', '.join({'gtsam', 'faiss', 'scipy'} & sys.modules.keys()) or None)"
     )
-    subprocess.run([sys.executable, "-c", code], check=True, timeout=60)
+    python("-c", code, check=True)
 
 
 def test_a_file_that_is_not_there(tmp_path):

@@ -35,6 +35,7 @@ from synthetic.postgres_server import PostgresServer, binaries
 from tests.mapserver.log.acknowledged_fleet import AGENT, life, node
 from tests.mapserver.log.test_front_servers import FrontServer, logs_of
 from tests.mapweave.test_map_commands import logs
+from tests.programs import ran
 from tests.waiting import eventually
 
 KEYS = Keys("fleet")
@@ -146,8 +147,7 @@ def test_a_name_is_that_of_one_server(postgres: PostgresServer, tmp_path):
 
     def refused() -> str:
         """Its only line on stderr, but for the one about the tests' PostgreSQL."""
-        words = command("s0", "second", f"tcp/127.0.0.1:{free_port()}")
-        done = subprocess.run(words, capture_output=True, text=True, check=False)
+        done = ran(*command("s0", "second", f"tcp/127.0.0.1:{free_port()}"), timeout=None)
         assert done.returncode == FAILED
         (line,) = (line for line in done.stderr.splitlines() if "fsync=off" not in line)
         return line

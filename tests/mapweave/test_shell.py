@@ -38,6 +38,7 @@ from mapweave.storage.os_errors import NO_ROOM
 from mapweave.terminal import EVERY, PLAIN_WIDTH, Bar, EventLog, plain_or_terminal, tracked
 from synthetic.maps import looked_around, write_store
 from tests.mapweave.command_line import parsers
+from tests.programs import mapweave, python, ran
 from tests.waiting import eventually
 
 STAMP = r"\d{4}-\d\d-\d\d \d\d:\d\d:\d\d "
@@ -195,7 +196,7 @@ def test_the_code_for_completion_is_that_shells(shell: str, capfd):
     code = capfd.readouterr().out
     assert "mapweave" in code
     if shutil.which(shell):
-        checked = subprocess.run([shell, "-n"], input=code, capture_output=True, text=True, check=False)
+        checked = ran(shell, "-n", input=code)
         assert checked.returncode == 0, checked.stderr
 
 
@@ -361,9 +362,7 @@ sys.meta_path.insert(0, Interrupted())
 from mapweave.start import main
 sys.exit(main())
 """
-    done = subprocess.run(
-        [sys.executable, "-c", program, module], capture_output=True, text=True, timeout=60, check=False
-    )
+    done = python("-c", program, module)
     assert (done.stderr, done.returncode) == ("mapweave: interrupted\n", 130)
 
 
@@ -445,7 +444,6 @@ def test_a_home_that_cannot_be_written_is_no_matter(tmp_path):
     write_map_file(path, MapFile("agent", "r0.1", tuple(HybridMap(log).contents())))
     # Not even root can make a folder there.
     home = dict.fromkeys(("HOME", "XDG_CONFIG_HOME", "XDG_CACHE_HOME", "MPLCONFIGDIR"), "/proc/none")
-    run = [sys.executable, "-m", "mapweave", "map", "show", str(path), "-o", str(tmp_path / "a.png")]
-    shown = subprocess.run(run, capture_output=True, text=True, timeout=60, env=os.environ | home)
+    shown = mapweave("map", "show", path, "-o", tmp_path / "a.png", env=os.environ | home)
     assert (shown.returncode, shown.stderr) == (0, "")
     assert (tmp_path / "a.png").exists()

@@ -28,6 +28,7 @@ from mapweave.wire.memory import MemoryBus, MemoryHub
 from synthetic.postgres_server import PostgresServer
 from tests.mapweave.command_line import complaint
 from tests.postgres import started
+from tests.programs import going
 from tests.waiting import eventually, free_port
 
 PATIENCE = 120.0
@@ -98,10 +99,10 @@ def test_a_wait_ends_after_its_time_and_when_it_is_stopped():
     assert store.wait(60.0, stop) is None
 
 
-def test_who_asks_for_a_servers_status_hears_that_it_waits():
+def test_who_asks_for_a_servers_status_hears_that_it_waits(opened):
     hub, keys = MemoryHub(), Keys("fleet")
     bus, asker = MemoryBus(hub), MemoryBus(hub)
-    waits = WaitingServer(bus, keys, "s0")
+    waits = opened(WaitingServer(bus, keys, "s0"))
     assert server_statuses(asker, keys, 1.0) == []
     for words in ("waiting: refused", "waiting: it starts"):
         waits.show(words)
@@ -114,7 +115,6 @@ def test_who_asks_for_a_servers_status_hears_that_it_waits():
     waits.show("")
     assert server_statuses(asker, keys, 1.0) == [] and not alive
     assert "no map server of fleet fleet answers" in str(no_server(asker, keys))
-    waits.close()
 
 
 def test_a_database_that_goes_again_while_the_server_is_made_is_waited_for(
@@ -147,13 +147,11 @@ def server(folder: Path, store: str, *options: str, **environment: str) -> Itera
         sys.executable, "-m", "mapweave", "server", "--store", store, "--data", str(folder / "data"),
         "--listen", f"tcp/127.0.0.1:{free_port()}", *options,
     ]  # fmt: skip
-    with (folder / "log").open("wb") as log:
-        process = subprocess.Popen(command, stdout=log, stderr=log, env=os.environ | environment)
-    try:
+    with (
+        (folder / "log").open("wb") as log,
+        going(*command, stdout=log, stderr=log, env=os.environ | environment) as process,
+    ):
         yield process
-    finally:
-        process.kill()
-        process.wait()
 
 
 @pytest.mark.slow

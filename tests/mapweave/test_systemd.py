@@ -13,6 +13,7 @@ import pytest
 from mapweave.cli import main, parser
 from mapweave.doctor.ports import PATTERNS
 from mapweave.scenarios.children import free_port
+from tests.programs import ran
 
 UNITS = sorted((Path(__file__).parents[2] / "examples" / "systemd").glob("*.service"))
 INSTALLED = "/opt/mapweave/bin/mapweave"
@@ -24,7 +25,7 @@ def analyzed(unit: Path, folder: Path, *words: str) -> subprocess.CompletedProce
         pytest.skip("needs systemd-analyze")
     copy = folder / unit.name.replace("@", "@r0")
     copy.write_text(unit.read_text().replace(INSTALLED, "/bin/true"))
-    return subprocess.run(["systemd-analyze", *words, copy], capture_output=True, text=True, check=False)
+    return ran("systemd-analyze", *words, copy)
 
 
 @pytest.mark.parametrize("unit", UNITS, ids=lambda unit: unit.name)

@@ -33,11 +33,10 @@ def test_ten_lines_are_ten():
 
 
 @pytest.mark.slow
-def test_gymnasium_accepts_the_environment():
+def test_gymnasium_accepts_the_environment(opened):
     """Spaces, seeds, types, rendering."""
-    env = gymnasium.make("mapweave.sim.gym:mapweave/Park-v0", seconds=5.0, render_mode="rgb_array")
+    env = opened(gymnasium.make("mapweave.sim.gym:mapweave/Park-v0", seconds=5.0, render_mode="rgb_array"))
     check_env(env.unwrapped)
-    env.close()
 
 
 def drive(env: MapweaveEnv, info: dict) -> tuple[float, dict, bool]:

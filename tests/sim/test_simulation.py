@@ -17,6 +17,7 @@ from mapweave.sim.robots import RobotSetup, camera_from_table
 from mapweave.sim.simulation import Simulation
 from mapweave.sim.world import World
 from mapweave.sim.worlds.catalog import make_world
+from tests.programs import python
 
 RANGE_NOISE = RobotSetup("r0").range_noise
 
@@ -24,7 +25,7 @@ RANGE_NOISE = RobotSetup("r0").range_noise
 def test_pybullet_prints_nothing_amid_a_log():
     """It said on stderr when it was built: a line without the time, and none of JSON."""
     program = "import sys, mapweave.sim.physics; print('after it', file=sys.stderr)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    done = python("-c", program, check=True)
     assert (done.stdout, done.stderr) == ("", "after it\n")
 
 

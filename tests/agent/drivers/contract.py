@@ -22,6 +22,7 @@ from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.agent.observation import Command, Observation
 from mapweave.hybridmap.errors import InvalidValue
+from tests.programs import going
 from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[3]
@@ -221,11 +222,8 @@ class RobotContract:
         assert robot.sense() is None
 
     def test_wheels_stop_when_the_process_hangs_or_dies(self, settings: Path, emulator: Any):
-        child = subprocess.Popen(
-            [sys.executable, "-c", self.CHILD, str(settings)], stdout=subprocess.PIPE, cwd=ROOT,
-            env={**os.environ, "PYTHONPATH": str(ROOT)},
-        )  # fmt: skip
-        try:
+        program, paths = [sys.executable, "-c", self.CHILD, settings], {"PYTHONPATH": str(ROOT)}
+        with going(*program, stdout=subprocess.PIPE, cwd=ROOT, env=os.environ | paths) as child:
             assert child.stdout is not None
             for _ in range(3):
                 assert child.stdout.readline() == b"driving\n"
@@ -236,9 +234,6 @@ class RobotContract:
                 until(lambda: emulator.wheels.speeds == (0.0, 0.0), 1.5)
                 assert emulator.wheels.stopped_at - ended < STOPS_WITHIN + SLACK
                 child.send_signal(signal.SIGCONT)
-        finally:
-            child.kill()
-            child.communicate()
 
     def test_it_comes_back_when_the_port_has_vanished(self, robot: Robot, emulator: Any):
         drive_until(robot, Command(0.2, 0.0), lambda: emulator.wheels.speeds[0] > 0.1)

@@ -3,7 +3,6 @@
 import socket
 import threading
 import time
-from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -41,8 +40,8 @@ def clip(tmp_path: Path) -> str:
     return str(path)
 
 
-def test_a_file_plays_at_its_own_pace_and_gives_its_newest_frame(clip: str):
-    camera = Capture(settings(clip))
+def test_a_file_plays_at_its_own_pace_and_gives_its_newest_frame(clip: str, opened):
+    camera = opened(Capture(settings(clip)))
     first = camera.newer(0, 2.0)
     assert first is not None
     assert first.image.shape == (HEIGHT, WIDTH)
@@ -54,7 +53,6 @@ def test_a_file_plays_at_its_own_pace_and_gives_its_newest_frame(clip: str):
     assert passed == pytest.approx(0.5, abs=0.12)
     assert (int(later.image[0, 0]) - int(first.image[0, 0])) / 5 == pytest.approx(passed * RATE, abs=2)
     assert abs(time.time_ns() - later.stamp_ns) < 0.3e9
-    camera.close()
 
 
 def test_after_the_end_of_a_file_nothing_comes(clip: str):
@@ -69,12 +67,11 @@ def test_after_the_end_of_a_file_nothing_comes(clip: str):
     camera.close()
 
 
-def test_a_known_delay_is_subtracted(clip: str):
-    camera = Capture(settings(clip, delay=5.0))
+def test_a_known_delay_is_subtracted(clip: str, opened):
+    camera = opened(Capture(settings(clip, delay=5.0)))
     frame = camera.newer(0, 2.0)
     assert frame is not None
     assert (time.time_ns() - frame.stamp_ns) / 1e9 == pytest.approx(5.0, abs=0.4)
-    camera.close()
 
 
 @pytest.mark.parametrize(
@@ -105,14 +102,12 @@ class Stream(MjpegStream):
 
 
 @pytest.fixture
-def stream() -> Iterator[Stream]:
-    made = Stream()
-    yield made
-    made.close()
+def stream(opened) -> Stream:
+    return opened(Stream())
 
 
-def test_a_stream_over_http_is_no_more_than_two_frames_behind(stream: Stream):
-    camera = Capture(settings(stream.url))
+def test_a_stream_over_http_is_no_more_than_two_frames_behind(stream: Stream, opened):
+    camera = opened(Capture(settings(stream.url)))
     behind = []
     frame = camera.newer(0, 5.0)
     for _ in range(10):
@@ -122,7 +117,6 @@ def test_a_stream_over_http_is_no_more_than_two_frames_behind(stream: Stream):
         assert frame is not None
         behind.append((stream.number - round(int(frame.image[0, 0]) / 5)) % 50)
     assert np.median(behind) <= 2
-    camera.close()
 
 
 class OneAtATime:
@@ -170,19 +164,16 @@ class OneAtATime:
 
 
 @pytest.fixture
-def raw_stream() -> Iterator[OneAtATime]:
-    made = OneAtATime()
-    yield made
-    made.close()
+def raw_stream(opened) -> OneAtATime:
+    return opened(OneAtATime())
 
 
-def test_images_without_a_container_begin_with_that_of_now(raw_stream: OneAtATime):
+def test_images_without_a_container_begin_with_that_of_now(raw_stream: OneAtATime, opened):
     """They were five seconds old, with the stamp of now."""
-    camera = Capture(settings(raw_stream.url))
+    camera = opened(Capture(settings(raw_stream.url)))
     frame = camera.newer(0, 5.0)
     assert frame is not None
     assert (raw_stream.number - int(frame.image[20, 20])) % 256 <= 3
-    camera.close()
 
 
 def test_a_stream_that_serves_one_program_after_the_other_is_waited_for(raw_stream: OneAtATime):
@@ -193,8 +184,8 @@ def test_a_stream_that_serves_one_program_after_the_other_is_waited_for(raw_stre
         camera.close()
 
 
-def test_a_stream_that_ends_is_opened_again(stream: Stream):
-    camera = Capture(settings(stream.url))
+def test_a_stream_that_ends_is_opened_again(stream: Stream, opened):
+    camera = opened(Capture(settings(stream.url)))
     frame = camera.newer(0, 5.0)
     assert frame is not None
     stop, stream.stop = stream.stop, threading.Event()
@@ -203,7 +194,6 @@ def test_a_stream_that_ends_is_opened_again(stream: Stream):
     last = camera.newer(0, 0.1)
     assert last is not None
     assert camera.newer(last.stamp_ns, 6.0) is not None
-    camera.close()
 
 
 class Device:

@@ -54,14 +54,10 @@ class TestCreate(RobotContract):
         assert sum(o.odometry.forward for o in seen) < 0.15
 
 
-def test_a_device_that_is_no_create_is_named(tmp_path):
+def test_a_device_that_is_no_create_is_named(tmp_path, opened):
     """Ten bytes of whatever it sends were taken for encoders."""
-    board = ArduinoSketch(tmp_path)
+    board = opened(ArduinoSketch(tmp_path))
     board.take = lambda data: None  # type: ignore[method-assign]
-    base = CreateBase(str(board.path))
-    try:
-        with pytest.raises(DeviceError, match="no Create or Roomba answers so"):
-            base.open()
-    finally:
-        base.close()
-        board.close()
+    base = opened(CreateBase(str(board.path)))
+    with pytest.raises(DeviceError, match="no Create or Roomba answers so"):
+        base.open()

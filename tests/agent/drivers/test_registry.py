@@ -1,7 +1,6 @@
 """Drivers are found: shipped ones, another package's, a class in a file; what is wrong is one line."""
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from mapweave.agent.drivers.registry import SHIPPED, drivers, find_driver, listi
 from mapweave.agent.drivers.settings import CameraSettings, Geometry, RobotSettings
 from mapweave.hybridmap.errors import DeviceError, SettingsError
 from mapweave.settings import load_settings
+from tests.programs import mapweave
 
 ROOT = Path(__file__).parents[3]
 CLASS = """
@@ -43,10 +43,8 @@ def test_a_driver_of_another_package_is_found_and_what_it_lacks_is_said(tmp_path
         "[mapweave.robots]\n"
         "rover = rover:Rover\nlegs = legs:Rover\nbroken = broken:Rover\nkoala = rover:Rover\n"
     )
-    ran = subprocess.run(
-        [sys.executable, "-m", "mapweave", "robots"], capture_output=True, text=True, cwd=ROOT, check=True,
-        env={**os.environ, "PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"},
-    )  # fmt: skip
+    paths = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{tmp_path}"}
+    ran = mapweave("robots", cwd=ROOT, check=True, env=paths)
     lines = dict(line.split(maxsplit=1) for line in ran.stdout.splitlines())
     assert lines["rover"] == "A rover"
     assert lines["legs"] == "needs the library a_library_that_is_not_there"

@@ -47,10 +47,8 @@ class TestRos2(RobotContract):
     """The newest message is a period old, in which a wheel goes 6 mm."""
 
     @pytest.fixture
-    def emulator(self, tmp_path: Path) -> Iterator[Any]:
-        robot = Ros2Robot()
-        yield robot
-        robot.close()
+    def emulator(self, tmp_path: Path, opened) -> Any:
+        return opened(Ros2Robot())
 
     @pytest.fixture
     def settings(self, emulator: Any, tmp_path: Path) -> Path:
@@ -228,7 +226,7 @@ def test_another_clock_is_translated(start: Start):
     ({"lens": {"width": 128}}, {}, "images of 64x48 px, but /camera/camera_info is for 128x48"),
     ({"lens": {"model": "thin_prism"}}, {}, "/camera/camera_info: lens model 'thin_prism'"),
     ({"lens": {"focal": 0.0}}, {}, "focal lengths must be positive; calibrate it"),
-    ({"encoding": "bayer_rggb8"}, {}, "/camera/image_raw: images of encoding 'bayer_rggb8'"),
+    ({"encoding": "32FC1"}, {}, "/camera/image_raw: images of encoding '32FC1'"),
 ])  # fmt: skip
 def test_what_is_wrong_is_said_in_one_line(
     start: Start, given: dict[str, Any], options: dict[str, Any], line: str, monkeypatch
@@ -263,15 +261,12 @@ def test_settings_are_checked_before_anything_moves(start: Start):
         Ros2(RobotSettings("ros2", {"endpoint": "robot.local"}))
 
 
-def test_without_a_router_one_line_says_so(monkeypatch):
+def test_without_a_router_one_line_says_so(monkeypatch, opened):
     monkeypatch.setattr("mapweave.agent.drivers.wheeled.PATIENCE", 1.0)
     monkeypatch.setattr("mapweave.agent.drivers.ros2.PATIENCE", 0.3)
-    robot = Ros2(RobotSettings("ros2", {"endpoint": "tcp/127.0.0.1:9"}, None, Geometry(0.15, 0.25)))
-    try:
-        with pytest.raises(DeviceError, match=r"no router at tcp/127\.0\.0\.1:9"):
-            robot.describe()
-    finally:
-        robot.close()
+    robot = opened(Ros2(RobotSettings("ros2", {"endpoint": "tcp/127.0.0.1:9"}, None, Geometry(0.15, 0.25))))
+    with pytest.raises(DeviceError, match=r"no router at tcp/127\.0\.0\.1:9"):
+        robot.describe()
 
 
 @pytest.mark.parametrize(("degrees", "lens", "words"), first_quick([
@@ -364,16 +359,13 @@ def test_a_second_agent_of_one_robot_is_refused_and_says_nothing_to_the_wheels(
     until(described, 30.0)
 
 
-def test_others_who_publish_commands_are_named(start: Start, caplog):
+def test_others_who_publish_commands_are_named(start: Start, caplog, opened):
     """A person's teleoperation, or Nav2: no reason to refuse."""
     emulator = Ros2Robot()
     robot = start(emulator)
     robot.describe()
     assert "another publisher" not in caplog.text
-    other = RosPeer(emulator.endpoint)
-    try:
-        other.publisher("/cmd_vel", KINDS_OF_COMMANDS)
-        until(lambda: "/cmd_vel has another publisher, which drives the robot, too" in caplog.text, 10.0)
-        assert robot.sense() is not None
-    finally:
-        other.close()
+    other = opened(RosPeer(emulator.endpoint))
+    other.publisher("/cmd_vel", KINDS_OF_COMMANDS)
+    until(lambda: "/cmd_vel has another publisher, which drives the robot, too" in caplog.text, 10.0)
+    assert robot.sense() is not None

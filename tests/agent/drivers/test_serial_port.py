@@ -30,14 +30,13 @@ def ends() -> Iterator[tuple[int, SerialPort]]:
     lambda port: port.line(),
     lambda port: port.line_waiting(),
 ])  # fmt: skip
-def test_a_port_that_vanishes_is_a_device_error(call: Callable[[SerialPort], object]):
+def test_a_port_that_vanishes_is_a_device_error(call: Callable[[SerialPort], object], opened):
     master, slave = pty.openpty()
-    port = SerialPort(os.ttyname(slave), 115200)
+    port = opened(SerialPort(os.ttyname(slave), 115200))
     os.close(slave)
     os.close(master)
     with pytest.raises(DeviceError, match=r"^/dev/pts/\d+: the port is gone$"):
         call(port)
-    port.close()
 
 
 def test_lines_end_by_either_character_and_empty_ones_are_skipped(ends: tuple[int, SerialPort]):

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import threading
 import tty
+from contextlib import closing
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +21,7 @@ from mapweave.agent.observation import Command
 from mapweave.hybridmap.errors import DeviceError, SettingsError
 from tests.agent.drivers.contract import RobotContract, drive, drive_until
 from tests.agent.drivers.waveshare_emulators import UgvHttp, UgvSerial
+from tests.programs import going
 from tests.waiting import free_port
 
 
@@ -41,19 +43,17 @@ class TestUgvSerial(RobotContract):
         drive_until(robot, Command(0.1, 0.0), lambda: emulator.wheels.speeds[0] > 0.05)
 
 
-def test_odometers_go_before_speeds(tmp_path, video: Path):
+def test_odometers_go_before_speeds(tmp_path, video: Path, opened):
     """Firmware ugv_base_ros: `odl`, `odr` in centimetres."""
-    ugv = UgvSerial(tmp_path, odometers=True)
+    ugv = opened(UgvSerial(tmp_path, odometers=True))
     camera = CameraSettings(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3, source=str(video))
-    robot = Waveshare(RobotSettings(options={"port": str(ugv.path)}, camera=camera))
+    robot = opened(Waveshare(RobotSettings(options={"port": str(ugv.path)}, camera=camera)))
     robot.sense()
     seen = drive(robot, Command(0.2, 0.5), 1.0)
     seen += drive(robot, Command(), 0.3)
     left, right = ugv.wheels.way()
     assert sum(o.odometry.forward for o in seen) == pytest.approx((left + right) / 2, abs=0.01)
     assert sum(o.odometry.turn for o in seen) == pytest.approx((right - left) / 0.172, abs=0.06)
-    robot.close()
-    ugv.close()
 
 
 def test_a_base_that_streams_something_else_is_named(tmp_path):
@@ -115,26 +115,17 @@ def test_a_second_driver_at_an_address_is_refused_and_leaves_the_wheels_alone(tm
 
 def test_a_driver_in_another_process_is_refused_until_the_first_has_ended(tmp_path):
     ugv = UgvHttp(tmp_path)
-    holder = subprocess.Popen(
-        [sys.executable, "-c",
-         "import sys, time; from mapweave.agent.drivers.waveshare import WaveshareBase\n"
-         f"base = WaveshareBase({ugv.path!r}); base.open(); print(1, flush=True); time.sleep(60)"],
-        stdout=subprocess.PIPE,
-    )  # fmt: skip
-    base = WaveshareBase(ugv.path)
-    try:
-        assert holder.stdout is not None
-        assert holder.stdout.read(1) == b"1"
-        with pytest.raises(DeviceError, match="is in use by another process"):
-            base.open()
-        holder.kill()
-        holder.wait()
+    program = (
+        "import sys, time; from mapweave.agent.drivers.waveshare import WaveshareBase\n"
+        f"base = WaveshareBase({ugv.path!r}); base.open(); print(1, flush=True); time.sleep(60)"
+    )
+    with closing(ugv), closing(WaveshareBase(ugv.path)) as base:
+        with going(sys.executable, "-c", program, stdout=subprocess.PIPE) as holder:
+            assert holder.stdout is not None
+            assert holder.stdout.read(1) == b"1"
+            with pytest.raises(DeviceError, match="is in use by another process"):
+                base.open()
         base.open()
-    finally:
-        holder.kill()
-        holder.communicate()
-        base.close()
-        ugv.close()
 
 
 class TestUgvHttp(RobotContract):

@@ -105,7 +105,7 @@ def robot(base: EvenBase, camera: LateCamera) -> Iterator[CheckedRobot]:
     robot.close()
 
 
-def test_odometry_is_that_of_the_time_between_the_images(monkeypatch):
+def test_odometry_is_that_of_the_time_between_the_images(monkeypatch, opened):
     """The wheels' way is that of the middle of the base's answer. Time passes with its answers alone."""
     passed = [10**15]
 
@@ -119,7 +119,7 @@ def test_odometry_is_that_of_the_time_between_the_images(monkeypatch):
 
     for module in (wheeled, sys.modules[__name__]):
         monkeypatch.setattr(module, "now_ns", lambda: passed[0])
-    robot = CheckedRobot(WheeledRobot(Answers(), SETTINGS, LateCamera(0.13)))
+    robot = opened(CheckedRobot(WheeledRobot(Answers(), SETTINGS, LateCamera(0.13))))
     # Those before are images from before the base has answered first.
     eventually(lambda: (seen := robot.sense()) is not None and seen.odometry.forward > 0.0)
     first = robot.sense()
@@ -131,7 +131,6 @@ def test_odometry_is_that_of_the_time_between_the_images(monkeypatch):
         assert second.odometry.forward == pytest.approx(0.25 * seconds, abs=1e-6)
         assert second.odometry.turn == pytest.approx(0.1 / 0.25 * seconds, abs=1e-5)
         first = second
-    robot.close()
 
 
 def test_a_touch_between_two_observations_is_not_lost(robot: CheckedRobot, base: EvenBase):
@@ -238,35 +237,34 @@ class Reads(EvenBase):
     ],
 )
 def test_a_base_that_reads_wrongly_from_the_start(
-    read: Callable[[], Any], words: str, camera: LateCamera, monkeypatch
+    read: Callable[[], Any], words: str, camera: LateCamera, monkeypatch, opened
 ):
     # It is not waited for: that would take longer than any test may.
     monkeypatch.setattr(wheeled, "PATIENCE", 600.0)
-    robot = CheckedRobot(WheeledRobot(Reads(read), SETTINGS, camera))
+    robot = opened(CheckedRobot(WheeledRobot(Reads(read), SETTINGS, camera)))
     begin = time.monotonic()
     with pytest.raises(DeviceError, match=f"^driver: {words}"):
         robot.sense()
     assert time.monotonic() - begin < 4.0
-    robot.close()
 
 
-def test_a_base_that_cannot_be_closed_is_not_forgotten(base: EvenBase, camera: LateCamera, monkeypatch):
+def test_a_base_that_cannot_be_closed_is_not_forgotten(
+    base: EvenBase, camera: LateCamera, monkeypatch, opened
+):
     monkeypatch.setattr(base, "close", lambda: {}["port"])
     base.failing = True
-    robot = WheeledRobot(base, SETTINGS, camera)
+    robot = opened(WheeledRobot(base, SETTINGS, camera))
     with pytest.raises(DeviceError, match=r"^driver: .*test_wheeled.py, line \d+: KeyError: 'port'"):
         robot.sense()
-    robot.close()
 
 
-def test_a_base_that_never_answers_is_not_called_closed(camera: LateCamera, monkeypatch):
+def test_a_base_that_never_answers_is_not_called_closed(camera: LateCamera, monkeypatch, opened):
     monkeypatch.setattr("mapweave.agent.drivers.wheeled.PATIENCE", 0.2)
     ended = threading.Event()
-    robot = WheeledRobot(Reads(ended.wait), SETTINGS, camera)
+    robot = opened(WheeledRobot(Reads(ended.wait), SETTINGS, camera))
     with pytest.raises(DeviceError, match=r"^the robot's base has not answered for 0.2 s"):
         robot.sense()
     ended.set()
-    robot.close()
 
 
 def test_a_base_without_a_method_or_a_class_is_refused(camera: LateCamera, monkeypatch):
@@ -278,7 +276,7 @@ def test_a_base_without_a_method_or_a_class_is_refused(camera: LateCamera, monke
 
 
 def test_speeds_geometry_and_frames_of_another_type(
-    base: EvenBase, robot: CheckedRobot, camera: LateCamera, monkeypatch
+    base: EvenBase, robot: CheckedRobot, camera: LateCamera, monkeypatch, opened
 ):
     monkeypatch.setattr(base, "nearest", lambda speeds: tuple(speeds))
     with pytest.raises(DeviceError, match=r"^driver: nearest\(\) must be Wheels, not tuple"):
@@ -290,19 +288,17 @@ def test_speeds_geometry_and_frames_of_another_type(
         robot.sense()
     nameless = EvenBase()
     nameless.geometry = None  # type: ignore[assignment]
-    other = CheckedRobot(WheeledRobot(nameless, SETTINGS, camera))
+    other = opened(CheckedRobot(WheeledRobot(nameless, SETTINGS, camera)))
     with pytest.raises(DeviceError, match=r"^driver: geometry of the base must be a Geometry, not None"):
         other.describe()
-    other.close()
 
 
-def test_a_base_that_is_not_there_is_one_line(base: EvenBase, camera: LateCamera, monkeypatch):
+def test_a_base_that_is_not_there_is_one_line(base: EvenBase, camera: LateCamera, monkeypatch, opened):
     monkeypatch.setattr("mapweave.agent.drivers.wheeled.PATIENCE", 0.5)
     base.failing = True
-    robot = WheeledRobot(base, SETTINGS, camera)
+    robot = opened(WheeledRobot(base, SETTINGS, camera))
     with pytest.raises(DeviceError, match=r"^gone$"):
         robot.sense()
-    robot.close()
 
 
 def test_a_counter_that_wraps_or_is_set_back():

@@ -1,8 +1,6 @@
 """The journal: appended changes are there, whatever happens to the process or the file."""
 
 import sqlite3
-import subprocess
-import sys
 from collections.abc import Iterator
 from contextlib import closing
 from pathlib import Path
@@ -22,6 +20,7 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.wire.codec import decode_change, encode_body, encode_change
+from tests.programs import python
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25)
 MAP = MapId("r0", 1)
@@ -44,10 +43,8 @@ def path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def journal(path: Path) -> Iterator[Journal]:
-    journal = Journal(path, "r0")
-    yield journal
-    journal.close()
+def journal(path: Path, opened) -> Journal:
+    return opened(Journal(path, "r0"))
 
 
 def as_bytes(changes: list[Change]) -> list[bytes]:
@@ -117,7 +114,7 @@ def test_all_of_a_batch_or_nothing(journal: Journal):
     assert journal.head(map_id) == 1
 
 
-def test_acknowledgements_only_grow_and_stay(path: Path, journal: Journal):
+def test_acknowledgements_only_grow_and_stay(path: Path, journal: Journal, opened):
     map_id = journal.open_map(None)
     journal.append(map_id, [node_put(k) for k in range(1, 6)], 0)
     journal.acknowledge("s0", map_id, 4)
@@ -126,9 +123,8 @@ def test_acknowledgements_only_grow_and_stay(path: Path, journal: Journal):
     with pytest.raises(InvalidValue, match="there are 5"):
         journal.acknowledge("s0", map_id, 6)
     journal.close()
-    again = Journal(path, "r0")
+    again = opened(Journal(path, "r0"))
     assert again.acknowledged(map_id) == {"s0": 4, "s1": 1}
-    again.close()
 
 
 def test_pruning_waits_for_every_required_server(journal: Journal):
@@ -229,10 +225,9 @@ def test_a_journal_in_use_is_refused(path: Path, journal: Journal):
         f"try: Journal(Path({str(path)!r}), 'r0')\n"
         "except InvalidFile as error: print(error)\n"
     )
-    output = subprocess.run(
-        [sys.executable, "-c", program], capture_output=True, text=True, check=True
-    ).stdout
-    assert output == f"{path}: agent journal is in use by another process; stop it first\n"
+    assert python("-c", program, check=True).stdout == (
+        f"{path}: agent journal is in use by another process; stop it first\n"
+    )
 
 
 @pytest.mark.parametrize("data", [b"no database at all" * 100, b"SQLite format 3\0" + b"\xff" * 4096])

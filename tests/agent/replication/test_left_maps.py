@@ -4,7 +4,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Iterator
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -216,10 +215,8 @@ def test_in_whatever_order_maps_are_pruned_and_processes_killed(doings: list[tup
 
 
 @pytest.fixture
-def fleet(tmp_path: Path) -> Iterator[Fleet]:
-    fleet = Fleet(tmp_path)
-    yield fleet
-    fleet.close()
+def fleet(tmp_path: Path, opened) -> Fleet:
+    return opened(Fleet(tmp_path))
 
 
 def changes_kept(journal: Journal, map_id: MapId) -> int:
@@ -246,7 +243,7 @@ def test_what_is_pruned_as_a_whole_leaves_the_disk(fleet: Fleet):
     assert not server.map_of(old).nodes
 
 
-def test_a_map_that_the_server_has_not_acknowledged_is_not_asked_about(fleet: Fleet):
+def test_a_map_that_the_server_has_not_acknowledged_is_not_asked_about(fleet: Fleet, opened):
     """Whatever the server would say."""
     fleet.robot.drive()
     assert fleet.robot.replicator.wait_acknowledged(WAIT)
@@ -255,7 +252,7 @@ def test_a_map_that_the_server_has_not_acknowledged_is_not_asked_about(fleet: Fl
     fleet.robot.drive()
     _, acknowledged, unsent, _ = fleet.robot.journal.maps()
     asked: list[int] = []
-    bus = MemoryBus(fleet.hub)
+    bus = opened(MemoryBus(fleet.hub))
 
     def answer(request: Request) -> None:
         asked.append(KeptNodes.decode(request.payload).epoch)
@@ -270,17 +267,16 @@ def test_a_map_that_the_server_has_not_acknowledged_is_not_asked_about(fleet: Fl
     put = {body.node.id for body in fleet.robot.journal.replay(acknowledged) if isinstance(body, NodePut)}
     assert put == nodes_of(acknowledged)
     assert fleet.robot.kept(unsent) == nodes_of(unsent)
-    bus.close()
 
 
 @pytest.mark.parametrize("answer", [NewestMap(3).encode(), b"", b"\x81\xa1e\x03", None])
-def test_without_a_clear_answer_all_stays(fleet: Fleet, answer: bytes | None):
+def test_without_a_clear_answer_all_stays(fleet: Fleet, answer: bytes | None, opened):
     """A server that does not know the question, or none."""
     for _ in range(2):
         fleet.robot.drive()
     assert fleet.robot.replicator.wait_acknowledged(WAIT)
     fleet.do("kill server", 0)
-    bus = MemoryBus(fleet.hub)
+    bus = opened(MemoryBus(fleet.hub))
     if answer is None:
         bus.serve(KEYS.all_acks("s0"), lambda request: request.refuse("busy"))
     else:
@@ -290,7 +286,6 @@ def test_without_a_clear_answer_all_stays(fleet: Fleet, answer: bytes | None):
     assert fleet.robot.replicator.flush(WAIT)
     assert fleet.robot.journal.head(fleet.left[1]) == before
     fleet.check()
-    bus.close()
 
 
 def test_a_map_with_a_damaged_change_is_not_asked_about(fleet: Fleet):
@@ -331,20 +326,18 @@ def test_a_question_without_an_answer_is_asked_again_soon(fleet: Fleet, monkeypa
     bus.close()
 
 
-def test_it_asks_when_the_server_appears_and_then_at_times(tmp_path):
+def test_it_asks_when_the_server_appears_and_then_at_times(tmp_path, opened):
     hub = MemoryHub()
-    robot = Robot(MemoryBus(hub), tmp_path / "r0.sqlite")
+    robot = opened(Robot(MemoryBus(hub), tmp_path / "r0.sqlite"))
     robot.drive()
     robot.drive()
-    server = PruningServer(MemoryBus(hub), tmp_path / "s0.sqlite", set())
+    server = opened(PruningServer(MemoryBus(hub), tmp_path / "s0.sqlite", set()))
     assert robot.replicator.wait_acknowledged(WAIT)
     robot.left.close()
     robot.left = LeftMaps(robot.bus, KEYS, robot.journal, robot.replicator, "s0", every=0.05)
     old = robot.journal.maps()[1]
     server.prune(nodes_of(old))
     eventually(lambda: not robot.kept(old))
-    robot.close()
-    server.close()
 
 
 ROBOT = """
@@ -389,7 +382,7 @@ robot.close()
 @pytest.mark.slow
 @pytest.mark.parametrize("when", ["before", "after"])
 @pytest.mark.parametrize("method", ["write", "acknowledge", "prune"])
-def test_a_robot_is_killed_between_two_steps(tmp_path, method: str, when: str):
+def test_a_robot_is_killed_between_two_steps(tmp_path, method: str, when: str, opened):
     """Before and after it has the retirements on its disk, knows them acknowledged, and drops the nodes."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     path = tmp_path / "r0.sqlite"
@@ -401,7 +394,7 @@ def test_a_robot_is_killed_between_two_steps(tmp_path, method: str, when: str):
     log = {m: [*robot.journal.replay(m)] for m in (old, other, current)}
     robot.close()
     bus = ZenohBus(BusSettings(mode="router", listen=(endpoint,)))
-    server = PruningServer(bus, tmp_path / "s0.sqlite", set())
+    server = opened(PruningServer(bus, tmp_path / "s0.sqlite", set()))
 
     def run(when: str) -> int:
         command = [sys.executable, "-c", ROBOT, str(path), endpoint, method, when]
@@ -429,7 +422,6 @@ def test_a_robot_is_killed_between_two_steps(tmp_path, method: str, when: str):
     journal.close()
     assert not server.map_of(old).nodes and {*server.map_of(current).nodes} == nodes_of(current)
     assert {*server.map_of(other).nodes} == nodes_of(other) - {NodeId(*other, 1)}
-    server.close()
 
 
 class Calendar(LiveSchedule):

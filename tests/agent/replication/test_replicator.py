@@ -3,7 +3,6 @@
 import logging
 import threading
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -78,17 +77,13 @@ def path(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def agent(hub: MemoryHub, path: Path) -> Iterator[Agent]:
-    agent = Agent(hub, path)
-    yield agent
-    agent.close()
+def agent(hub: MemoryHub, path: Path, opened) -> Agent:
+    return opened(Agent(hub, path))
 
 
 @pytest.fixture
-def server(hub: MemoryHub) -> Iterator[HandServer]:
-    server = HandServer(hub)
-    yield server
-    server.bus.close()
+def server(hub: MemoryHub) -> HandServer:
+    return HandServer(hub)
 
 
 def test_changes_are_published_in_order_with_their_mark(agent: Agent, server: HandServer):
@@ -120,9 +115,9 @@ def test_the_longest_status_period_that_servers_want_counts(agent: Agent, hub: M
     second.bus.close()
 
 
-def test_the_disk_comes_first(hub: MemoryHub, path: Path):
+def test_the_disk_comes_first(hub: MemoryHub, path: Path, opened):
     """A published change is in the journal."""
-    agent = Agent(hub, path)
+    agent = opened(Agent(hub, path))
     on_disk: list[bool] = []
     server = MemoryBus(hub)
     server.subscribe(KEYS.changes(), lambda s: on_disk.append(agent.journal.head(MAP) >= len(on_disk) + 1))
@@ -130,8 +125,6 @@ def test_the_disk_comes_first(hub: MemoryHub, path: Path):
         agent.replicator.submit(bodies(k, k), 0)
     eventually(lambda: len(on_disk) == 29)
     assert all(on_disk)
-    agent.close()
-    server.close()
 
 
 def test_submitting_never_waits_for_the_disk(agent: Agent, monkeypatch):
@@ -221,7 +214,6 @@ def test_a_server_that_says_that_the_disk_was_put_back_is_believed(agent: Agent,
     eventually(lambda: "begin a fresh map" in agent.replicator.status().failure)
     agent.replicator.submit(bodies(4, 5), 0)
     assert agent.replicator.flush(30) and agent.replicator.status().newest == 5
-    liar.close()
 
 
 def test_a_question_for_which_there_is_no_room_is_refused(agent: Agent, hub: MemoryHub, monkeypatch):
@@ -281,13 +273,12 @@ def test_a_full_disk_that_takes_no_acknowledgement_either_is_one_line(
         eventually(lambda: len(caplog.records) == 2)
 
 
-def test_closing_commits_what_was_submitted(hub: MemoryHub, path: Path):
+def test_closing_commits_what_was_submitted(hub: MemoryHub, path: Path, opened):
     agent = Agent(hub, path)
     agent.replicator.submit(bodies(1, 100), 0)
     agent.close()
-    journal = Journal(path, "r0")
+    journal = opened(Journal(path, "r0"))
     assert journal.head(MAP) == 100
-    journal.close()
 
 
 def test_the_beacon_has_the_length_of_the_log_and_the_watermarks(agent: Agent, server: HandServer):
@@ -370,14 +361,13 @@ def test_acknowledgements_are_waited_for_while_that_is_worthwhile(agent: Agent, 
     assert agent.replicator.wait_acknowledged(30, lambda: False), "nothing is waited for"
 
 
-def test_without_required_servers_any_will_do(hub: MemoryHub, path: Path, server: HandServer):
-    agent = Agent(hub, path, ())
+def test_without_required_servers_any_will_do(hub: MemoryHub, path: Path, server: HandServer, opened):
+    agent = opened(Agent(hub, path, ()))
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
     assert not agent.replicator.wait_acknowledged(0.05)
     server.acknowledge(agent.log_id, 3)
     assert agent.replicator.wait_acknowledged(30)
-    agent.close()
 
 
 def test_old_and_foreign_acknowledgements_change_nothing(agent: Agent, server: HandServer):
@@ -416,10 +406,10 @@ def test_a_server_that_has_lost_its_store_lacks_everything_again(
 
 
 def test_a_late_acknowledgement_of_a_store_that_is_lost_says_nothing(
-    hub: MemoryHub, path: Path, server: HandServer, monkeypatch
+    hub: MemoryHub, path: Path, server: HandServer, monkeypatch, opened
 ):
     """The robot would drop retirements that the new store has never had."""
-    agent = Agent(hub, path)
+    agent = opened(Agent(hub, path))
     agent.replicator.submit(bodies(1, 3), 0)
     assert agent.replicator.flush(30)
     server.acknowledge(agent.log_id, 3, store=5)
@@ -438,7 +428,6 @@ def test_a_late_acknowledgement_of_a_store_that_is_lost_says_nothing(
     monkeypatch.setattr("mapweave.agent.replication.log_state.LATE", 0.0)
     server.acknowledge(agent.log_id, 3, store=5)
     assert agent.replicator.wait_acknowledged(30)
-    agent.close()
 
 
 def test_a_server_that_has_more_than_the_disk(agent: Agent, server: HandServer, caplog):

@@ -126,11 +126,10 @@ def test_an_older_state_is_used_where_the_newer_is_damaged(tmp_path):
     assert "\n" not in kept.complaint
 
 
-def test_another_agents_map_is_refused(tmp_path):
-    journal = Journal(tmp_path / "j", "r0")
+def test_another_agents_map_is_refused(tmp_path, opened):
+    journal = opened(Journal(tmp_path / "j", "r0"))
     with pytest.raises(InvalidValue, match="has no map r1"):
         RetainedMap.of(journal, MapId("r1", 1))
-    journal.close()
 
 
 def test_drives_among_nodes_of_others_are_kept(tmp_path):

@@ -225,14 +225,11 @@ def test_an_agent_keeps_the_view_of_each_node(walls, description, hub, tmp_path)
         agent.close()
 
 
-def test_without_the_setting_nothing_is_kept(walls, description, hub, tmp_path):
-    agent = run(walls, description, hub, tmp_path, keep_views=False)
-    try:
-        assert agent.pipeline.map.nodes
-        assert not (tmp_path / "r0.views").exists()
-        assert MemoryBus(hub).ask(KEYS.view("r0"), encode(ViewRequest(node(1))), 1.0) == []
-    finally:
-        agent.close()
+def test_without_the_setting_nothing_is_kept(walls, description, hub, tmp_path, opened):
+    agent = opened(run(walls, description, hub, tmp_path, keep_views=False))
+    assert agent.pipeline.map.nodes
+    assert not (tmp_path / "r0.views").exists()
+    assert MemoryBus(hub).ask(KEYS.view("r0"), encode(ViewRequest(node(1))), 1.0) == []
 
 
 @pytest.mark.parametrize("distortion", [(-0.3, 0.1, 0.001, -0.001, 0.0), (0.0,) * 5])

@@ -6,7 +6,7 @@ allowed before and after.
 
 import logging
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
@@ -70,17 +70,13 @@ class Fleet:
 
 
 @pytest.fixture(params=list(Profile))
-def fleet(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[Fleet]:
-    fleet = Fleet(tmp_path / "keys", request.param)
-    yield fleet
-    fleet.close()
+def fleet(request: pytest.FixtureRequest, tmp_path: Path, opened) -> Fleet:
+    return opened(Fleet(tmp_path / "keys", request.param))
 
 
 @pytest.fixture
-def certified(tmp_path: Path) -> Iterator[Fleet]:
-    fleet = Fleet(tmp_path / "keys", Profile.PRODUCTION)
-    yield fleet
-    fleet.close()
+def certified(tmp_path: Path, opened) -> Fleet:
+    return opened(Fleet(tmp_path / "keys", Profile.PRODUCTION))
 
 
 def answer(request: Request) -> None:
@@ -299,20 +295,17 @@ def test_who_has_no_good_key_is_not_let_in(certified: Fleet):
     assert not any(bus.wait_connected(0.5) for bus in (*strangers, plain))
 
 
-def test_a_wrong_password_is_not_let_in(tmp_path, caplog):
+def test_a_wrong_password_is_not_let_in(tmp_path, caplog, opened):
     caplog.set_level(logging.INFO, "mapweave.wire")
-    fleet = Fleet(tmp_path / "keys", Profile.LAB)
-    try:
-        wrong = fleet.join_as(Credentials("r0", Role.ROBOT, password="guessed"), connected=False)
-        keyless = fleet.join_as(None, connected=False)
-        fleet.join("r0")
-        assert not wrong.wait_connected(0.5)
-        assert not keyless.wait_connected(0.5)
-        # Zenoh does not say whose the password was.
-        eventually(lambda: "a client connects from tcp/127.0.0.1:" in caplog.text)
-        assert "refused" not in caplog.text
-    finally:
-        fleet.close()
+    fleet = opened(Fleet(tmp_path / "keys", Profile.LAB))
+    wrong = fleet.join_as(Credentials("r0", Role.ROBOT, password="guessed"), connected=False)
+    keyless = fleet.join_as(None, connected=False)
+    fleet.join("r0")
+    assert not wrong.wait_connected(0.5)
+    assert not keyless.wait_connected(0.5)
+    # Zenoh does not say whose the password was.
+    eventually(lambda: "a client connects from tcp/127.0.0.1:" in caplog.text)
+    assert "refused" not in caplog.text
 
 
 def test_a_robot_is_no_router(certified: Fleet):

@@ -5,8 +5,6 @@ import fcntl
 import json
 import os
 import stat
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -21,6 +19,7 @@ from mapweave.identities.logins import Logins
 from mapweave.identities.tokens import TOKENS, read_tokens
 from mapweave.wire.credentials import Role
 from tests.mapweave.command_line import complaint
+from tests.programs import python
 
 
 @pytest.fixture
@@ -63,10 +62,7 @@ sys.exit(sum(os.waitstatus_to_exitcode(os.wait()[1]) for _ in actions))
 
 def at_once(folder: Path, *actions: str) -> None:
     """Run each action in a process of its own, when all have read the folder."""
-    done = subprocess.run(
-        [sys.executable, "-c", AT_ONCE, str(folder), json.dumps(actions)],
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
+    done = python("-c", AT_ONCE, folder, json.dumps(actions))
     assert (done.returncode, done.stderr) == (0, "")
 
 

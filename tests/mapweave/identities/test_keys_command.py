@@ -7,7 +7,6 @@ import os
 import resource
 import socket
 import stat
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -26,6 +25,7 @@ from mapweave.wire.credentials import Role
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from tests.mapweave.command_line import complaint
+from tests.programs import ran
 
 
 @pytest.fixture(params=["production", "lab"])
@@ -308,9 +308,8 @@ def test_a_full_disk_leaves_keys_as_they_were(name: str, keys: Path, monkeypatch
 def test_a_disk_that_is_really_full_is_one_line(tmp_path):
     words = [sys.executable, "-m", "mapweave", "keys", "init", "--keys", "keys", "--profile", "lab"]
     # No bytecode: on a disk that takes half of a file, Python keeps the half, and no process starts again.
-    done = subprocess.run(
-        words, cwd=tmp_path, capture_output=True, text=True, check=False,
-        env={**os.environ, "PYTHONDONTWRITEBYTECODE": "1"},
+    done = ran(
+        *words, cwd=tmp_path, env=os.environ | {"PYTHONDONTWRITEBYTECODE": "1"},
         preexec_fn=lambda: resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100)),
     )  # fmt: skip
     assert done.returncode == 1 and done.stderr.count("\n") == 1 and "cannot be written" in done.stderr

@@ -2,7 +2,6 @@
 
 import socket
 import threading
-from collections.abc import Iterator
 from contextlib import suppress
 from datetime import timedelta
 from pathlib import Path
@@ -26,10 +25,8 @@ SECRET = b"where the safe is"
 
 
 @pytest.fixture
-def certified(tmp_path: Path) -> Iterator[Fleet]:
-    fleet = Fleet(tmp_path / "keys", Profile.PRODUCTION)
-    yield fleet
-    fleet.close()
+def certified(tmp_path: Path, opened) -> Fleet:
+    return opened(Fleet(tmp_path / "keys", Profile.PRODUCTION))
 
 
 class Listener:
@@ -70,39 +67,30 @@ class Listener:
 
 
 @pytest.mark.parametrize("profile", list(Profile))
-def test_who_listens_reads_a_lab_and_not_a_fleet_with_certificates(profile: Profile, tmp_path):
-    fleet = Fleet(tmp_path / "keys", profile)
+def test_who_listens_reads_a_lab_and_not_a_fleet_with_certificates(profile: Profile, tmp_path, opened):
+    fleet = opened(Fleet(tmp_path / "keys", profile))
     scheme, _, place = fleet.endpoint.partition("/")
-    listener = Listener(int(place.rpartition(":")[2]))
+    listener = opened(Listener(int(place.rpartition(":")[2])))
     key = read_key_file(fleet.folder.key_file("r0")).credentials
     got: list[bytes] = []
     fleet.router.subscribe(KEYS.changes(), lambda sample: got.append(sample.payload))
-    robot = ZenohBus(BusSettings(endpoints=(f"{scheme}/127.0.0.1:{listener.port}",), credentials=key))
-    try:
-        assert robot.wait_connected(10)
-        eventually(lambda: robot.publish(KEYS.change(MapId("r0", 1)), SECRET) or SECRET in got)
-        assert (SECRET in listener.heard) == (profile is Profile.LAB)
-        assert listener.heard
-    finally:
-        robot.close()
-        listener.close()
-        fleet.close()
+    robot = opened(ZenohBus(BusSettings(endpoints=(f"{scheme}/127.0.0.1:{listener.port}",), credentials=key)))
+    assert robot.wait_connected(10)
+    eventually(lambda: robot.publish(KEYS.change(MapId("r0", 1)), SECRET) or SECRET in got)
+    assert (SECRET in listener.heard) == (profile is Profile.LAB)
+    assert listener.heard
 
 
-def test_without_keys_any_program_of_this_machine_commands_under_any_name():
+def test_without_keys_any_program_of_this_machine_commands_under_any_name(opened):
     endpoint = f"tcp/127.0.0.1:{free_port()}"
-    router = ZenohBus(BusSettings(mode="router", listen=(endpoint,)))
-    program = ZenohBus(BusSettings(endpoints=(endpoint,)))
+    router = opened(ZenohBus(BusSettings(mode="router", listen=(endpoint,))))
+    program = opened(ZenohBus(BusSettings(endpoints=(endpoint,))))
     got: list[str] = []
-    try:
-        router.subscribe(KEYS.changes(), lambda sample: got.append(sample.key))
-        serve_senders(router, KEYS.mission("r0"), lambda request, who: answer(request))
-        assert program.wait_connected(10)
-        eventually(lambda: program.publish(KEYS.change(MapId("r1", 1)), b"x") or got)
-        assert asked(program, sent_by(KEYS.mission("r0"), "anna"))
-    finally:
-        program.close()
-        router.close()
+    router.subscribe(KEYS.changes(), lambda sample: got.append(sample.key))
+    serve_senders(router, KEYS.mission("r0"), lambda request, who: answer(request))
+    assert program.wait_connected(10)
+    eventually(lambda: program.publish(KEYS.change(MapId("r1", 1)), b"x") or got)
+    assert asked(program, sent_by(KEYS.mission("r0"), "anna"))
 
 
 def test_who_has_the_key_of_the_authority_is_any_member(certified: Fleet):

@@ -168,12 +168,11 @@ def test_waiting_for_a_frame_that_never_comes_ends(live):
     assert asyncio.run(live.next_frame(number, 0.05)) is None
 
 
-def test_pages_of_other_sites_cannot_watch(live):
+def test_pages_of_other_sites_cannot_watch(live, opened):
     live.show(frame(9))
-    connection = connect(live)
+    connection = opened(connect(live))
     connection.request("GET", "/frame.jpg", headers={"Host": "evil.example"})
     assert connection.getresponse().status == 403
-    connection.close()
 
 
 def test_without_the_http_extra_its_name_is_printed(monkeypatch):

@@ -149,13 +149,10 @@ def test_a_lossy_link_stalls_and_carries_little_but_loses_nothing(cable):
         assert time.monotonic() - began > 0.8
 
 
-def test_without_a_router_connections_end(cable):
-    lonely = NetworkEmulator(1, seed=0)
-    try:
-        with (
-            socket.create_connection(("127.0.0.1", lonely.port), 2) as one,
-            contextlib.suppress(ConnectionError),
-        ):
-            assert one.recv(10) == b""
-    finally:
-        lonely.close()
+def test_without_a_router_connections_end(cable, opened):
+    lonely = opened(NetworkEmulator(1, seed=0))
+    with (
+        socket.create_connection(("127.0.0.1", lonely.port), 2) as one,
+        contextlib.suppress(ConnectionError),
+    ):
+        assert one.recv(10) == b""

@@ -5,8 +5,6 @@ import json
 import os
 import re
 import shutil
-import subprocess
-import sys
 from pathlib import Path
 
 import cv2
@@ -22,6 +20,7 @@ from mapweave.scenarios.report_folder import write_folder
 from mapweave.scenarios.score import TrialResult, score
 from mapweave.storage.map_file import read_map_file
 from tests.mapweave.scenarios.conftest import stage, stage_events
+from tests.programs import python
 
 SCENARIO = 'name = "staged"\n[expect]\ncomponents = 2\nlink_recall = 0.99\n'
 WANTED = parse_expectations({"components": 2, "link_recall": 0.99})
@@ -52,11 +51,11 @@ def written(reported, tmp_path):
 def evo(program: str, *arguments: str, report_folder: Path, home: Path) -> float:
     """The root mean square error that one of evo's programs prints."""
     home.mkdir()
-    done = subprocess.run(
-        [sys.executable, "-c", f"from evo.cli.entry_points import {program}; {program}()", *arguments],
-        cwd=report_folder, env=os.environ | {"HOME": str(home)}, capture_output=True, text=True, timeout=60,
-        check=True,
-    )  # fmt: skip
+    code, at_home = (
+        f"from evo.cli.entry_points import {program}; {program}()",
+        os.environ | {"HOME": str(home)},
+    )
+    done = python("-c", code, *arguments, cwd=report_folder, env=at_home, check=True)
     return float(re.search(r"rmse\s+([0-9.e-]+)", done.stdout)[1])
 
 
@@ -191,9 +190,6 @@ def test_scoring_writes_no_file_at_home_and_prints_nothing(tmp_path):
         "assert not logging.getLogger().handlers\n"
         "assert not {'matplotlib', 'seaborn', 'pandas', 'evo.tools'} & set(sys.modules)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-W", "error", "-c", program], env=os.environ | {"HOME": str(tmp_path)},
-        capture_output=True, text=True, timeout=60, check=False,
-    )  # fmt: skip
+    done = python("-W", "error", "-c", program, env=os.environ | {"HOME": str(tmp_path)})
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
     assert list(tmp_path.iterdir()) == []

@@ -47,10 +47,10 @@ def event(value: int, kind: int, number: int) -> bytes:
     return (123456).to_bytes(4, "little") + value.to_bytes(2, "little", signed=True) + bytes([kind, number])
 
 
-def test_the_left_stick_drives_and_a_button_stops(tmp_path):
+def test_the_left_stick_drives_and_a_button_stops(tmp_path, opened):
     device = tmp_path / "js0"
     os.mkfifo(device)
-    pad = Gamepad(device, 0.8)
+    pad = opened(Gamepad(device, 0.8))
     with device.open("wb", buffering=0) as kernel:
         # The state at the opening: type 0x80 | axis, 0x80 | button.
         kernel.write(b"".join(event(0, 0x82, axis) for axis in range(6)) + event(0, 0x81, 0))
@@ -72,7 +72,6 @@ def test_the_left_stick_drives_and_a_button_stops(tmp_path):
         pad.read()
     with pytest.raises(DeviceError, match="gone"):
         pad.read()
-    pad.close()
 
 
 def test_a_gamepad_that_is_not_there_is_named(tmp_path):
