@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from mapweave import Observation, Odometry, Pose2
-from mapweave.agent.sensor_input import BlindZone, _within_turn
+from mapweave.agent.blind_zone import BlindZone, _within_turn
 from tests.agent.ranged_body import BEARINGS, BODY, ROOM, rangers
 
 DEPTH = 0.25

@@ -9,8 +9,7 @@ import pytest
 from mapweave import Certainty, HybridMap, MapId, Observation, Odometry, Pose2, PoseGaussian, RelocalizeAnswer
 from mapweave.agent.global_localization import candidates
 from mapweave.agent.global_localization.candidates import FleetMapSource, OwnMapSource
-from mapweave.agent.global_localization.global_localization import GlobalLocalization
-from mapweave.agent.global_localization.resumption import TO_NAVIGATE
+from mapweave.agent.global_localization.global_localization import TO_NAVIGATE, GlobalLocalization
 from mapweave.agent.mission import ServerAnswer, WhereAmI
 from mapweave.agent.motion_primitives import NO_ANSWER, MotionPrimitives
 from mapweave.hybridmap.change import NodePut

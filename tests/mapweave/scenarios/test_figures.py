@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from mapweave.scenarios.figures import MORE_IS_BETTER, Figures, RobotFigures, as_text, kinds, measured
 from mapweave.scenarios.report_page import GROUPS
 
-COUNTS = {f.name: 3 for f in fields(Figures) if f.type == "int"}
+COUNTS = {f.name: 3 for f in fields(Figures) if f.type is int}
 BARE = Figures(**COUNTS, map_hash="ab", sim_s=60.0, wall_s=15.0)
 ROBOT = RobotFigures(1, 20, 0, 1000, 2000, 0, "cd")
 numbers = st.floats(allow_nan=False, allow_infinity=False)
