@@ -49,6 +49,5 @@ class Busy(MapweaveError):
     """
 
     def __init__(self, retry_after: float) -> None:
-        """Take the time until the next attempt."""
         super().__init__(f"busy, retry after {retry_after:.1f} s")
         self.retry_after = retry_after

@@ -23,7 +23,6 @@ class HybridMap:
     """
 
     def __init__(self, changes: Iterable[ChangeBody] = ()) -> None:
-        """Replay the changes."""
         self.nodes: dict[NodeId, Node] = {}
         self.edges: dict[EdgeId, Edge] = {}
         # The keys of the edges from each to each; both directions of a pair have the same ones.

@@ -102,11 +102,6 @@ def own_ids_of(words: Iterable[str], annotations: Record, resolve: Resolve) -> l
 
     So the same name takes back what it has set, whatever has become of the node in between.
 
-    Args:
-        words: as people write them.
-        annotations: returns the places.
-        resolve: returns nodes for words.
-
     Raises:
         InvalidValue: see `ids_of`.
     """

@@ -58,7 +58,6 @@ class Landmarks:
             raise InvalidValue(f"landmarks: shapes {shapes} do not belong together")
 
     def __len__(self) -> int:
-        """How many."""
         return len(self.pixels)
 
     @property

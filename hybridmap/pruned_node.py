@@ -47,15 +47,10 @@ class PrunedNodes:
         return node in self.nodes
 
     def __len__(self) -> int:
-        """How many."""
         return len(self.nodes)
 
     def successor(self, node: NodeId, present: Container[NodeId]) -> tuple[NodeId, Pose2] | None:
         """The node of the map that replaces a pruned one, and the pruned node's pose there.
-
-        Args:
-            node: any.
-            present: the nodes of the map.
 
         Returns:
             The node itself if it is present; None if nothing is left of it.

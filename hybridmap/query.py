@@ -65,7 +65,6 @@ class View:
     near: NodeId | None = None
 
     def __len__(self) -> int:
-        """How many features."""
         return len(self.pixels)
 
 

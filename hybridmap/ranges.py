@@ -44,7 +44,6 @@ class Ranges:
             raise InvalidValue(f"ranges: a distance is not within 0 to {self.reach:g} m")
 
     def __len__(self) -> int:
-        """How many sensors."""
         return len(self.bearings)
 
     @staticmethod

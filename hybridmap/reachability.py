@@ -60,13 +60,7 @@ STOPS = 9
 
 
 def reachability_of(edge: Edge, a: Node, b: Node) -> Reachability:
-    """Whether the servo could drive an edge, in either direction: the same landmarks are in view both ways.
-
-    Args:
-        edge: between the two.
-        a: node at the edge's a.
-        b: node at its b.
-    """
+    """Whether the servo could drive an edge, either way: the same landmarks are in view both ways."""
     if edge.kind not in RECOGNISED:
         return Reachability(True, -1, f"{edge.kind} by a robot: it can be driven")
     between = edge.a_from_b.mean

@@ -17,7 +17,6 @@ class ReachabilityCache:
     """Keeps the reachability of edges from merged map to merged map."""
 
     def __init__(self) -> None:
-        """Start with nothing known."""
         self._cache: dict[EdgeId, tuple[tuple[object, ...], Reachability]] = {}
 
     def reach(self, edge: Edge, a: Node, b: Node, faded: Sequence[NDArray[np.bool_] | None]) -> Reachability:

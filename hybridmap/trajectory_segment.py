@@ -45,7 +45,6 @@ class TrajectorySegment:
             raise InvalidValue(f"trajectory: a pose is no number, or further away than {FURTHEST:g} m")
 
     def __len__(self) -> int:
-        """How many moments."""
         return len(self.ages)
 
 

@@ -25,7 +25,6 @@ class Blockages:
     """
 
     def __init__(self, forget: float = FORGET, most: int = MOST) -> None:
-        """Nothing is blocked."""
         self._forget, self._most = forget, most
         self._reported: dict[str, dict[Pair, float]] = {}
         self._turn = threading.Lock()

@@ -15,7 +15,6 @@ class SharedCoverage:
     """Answers what others have mapped. It belongs to one merged map; make another for the next."""
 
     def __init__(self, merged: MergedMap) -> None:
-        """Take a merged map."""
         self._merged = merged
 
     def answer(self, asking: MapId, position: tuple[float, float], reach: float) -> KnownAnswer:

@@ -9,6 +9,7 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from mapweave.hybridmap.annotation import Annotations
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.floor_plan import (
     MAX_PARTS,
@@ -53,7 +54,7 @@ def placed_plan(name: str, plan: FloorPlan, merged: MergedMap) -> PlacedPlan:
     parts, reasons = [], []
     for number, members in sorted(by_component.items(), key=lambda item: (-len(item[1]), item[0])):
         if len(members) < LEAST:
-            reasons.append(f"component {number} has {_pairs(len(members))}, and {LEAST} are needed")
+            reasons.append(f"component {number} has {counted(len(members), 'pair')}, and {LEAST} are needed")
             continue
         try:
             part = _part(plan, merged, number, members)
@@ -64,7 +65,9 @@ def placed_plan(name: str, plan: FloorPlan, merged: MergedMap) -> PlacedPlan:
             reasons.append(f"component {number}: {error}")
     nodes = Counter(str(plan.pairs[k].node) for k in missing)
     if missing:
-        reasons.append(f"{_pairs(len(missing))} of nodes that are not in the merged map: {', '.join(nodes)}")
+        reasons.append(
+            f"{counted(len(missing), 'pair')} of nodes that are not in the merged map: {', '.join(nodes)}"
+        )
     return PlacedPlan(name, plan, tuple(parts[:MAX_PARTS]), "; ".join(reasons)[:MAX_WORDS])
 
 
@@ -195,10 +198,6 @@ def _sigma(fit: SimilarityFit, pixel: Array) -> float:
     arm = Pose2(0.0, 0.0, fit.a_from_b.heading).apply(fit.a_from_b.scale * pixel)
     jacobian = np.array([[1.0, 0.0, -arm[1], arm[0]], [0.0, 1.0, arm[0], arm[1]]])
     return math.sqrt(0.5 * float(np.trace(jacobian @ fit.covariance @ jacobian.T)))
-
-
-def _pairs(count: int) -> str:
-    return "1 pair" if count == 1 else f"{count} pairs"
 
 
 def _tuple(point: Array) -> tuple[float, float]:

@@ -119,7 +119,6 @@ class Metrics:
     """The Prometheus metrics of one server. Thread-safe."""
 
     def __init__(self) -> None:
-        """Begin with nothing observed."""
         self._registry = CollectorRegistry()
         self._ack = self._histogram(
             "ack", "From the receipt of a published change to its acknowledgement.", ACK_BUCKETS

@@ -31,13 +31,7 @@ class NodeViews:
     """Asks robots; any thread may ask it."""
 
     def __init__(self, bus: Bus, keys: Keys, merged: Callable[[], MergedMap]) -> None:
-        """Begin to watch which robots keep images.
-
-        Args:
-            bus: the connection; stays the caller's.
-            keys: of the fleet.
-            merged: the newest merged map.
-        """
+        """Begin to watch which robots keep images."""
         self._bus, self._keys, self._merged = bus, keys, merged
         self._agents: set[str] = set()
         self._cache: OrderedDict[NodeId, bytes] = OrderedDict()

@@ -43,12 +43,6 @@ class PlaceResolver:
     """Resolves named places and node ids on one merged map. Cheap to make; works out only what is asked."""
 
     def __init__(self, router: Router, annotations: Annotations) -> None:
-        """Take a map.
-
-        Args:
-            router: of the merged map.
-            annotations: the record.
-        """
         self.router = router
         self.annotations = annotations
 

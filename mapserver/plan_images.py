@@ -133,7 +133,6 @@ class PlanImages:
         return png
 
     def __contains__(self, sha256: str) -> bool:
-        """Whether an image is there."""
         if sha256 in self._beside or self._path(sha256).is_file():
             return True
         return self._shared is not None and self._shared.result(RESULT + sha256) is not None

@@ -36,7 +36,6 @@ class Portals:
     """
 
     def __init__(self, merged: MergedMap, annotations: Annotations) -> None:
-        """Take a map and its record of annotations."""
         self.merged = merged
         self._floors = annotations.floors
         self._portals = {
@@ -98,12 +97,6 @@ class Portals:
 
 def check_portal(merged: MergedMap, annotations: Annotations, name: str, portal: Portal) -> None:
     """Refuse a portal that is a mistake.
-
-    Args:
-        merged: what it is made about.
-        annotations: the record.
-        name: of the portal.
-        portal: the new one.
 
     Raises:
         InvalidValue: a side is not in the merged map, the floors are not as they have to be, or it is there

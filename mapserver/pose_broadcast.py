@@ -56,14 +56,7 @@ class PoseBroadcast:
         name: str,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Begin to answer.
-
-        Args:
-            bus: the connection; stays the caller's.
-            keys: of the fleet.
-            name: of the server in the fleet.
-            clock: only grows, s.
-        """
+        """Begin to answer."""
         self._clock = clock
         self._bus, self._keys, self._name = bus, keys, name
         self._run = secrets.randbits(64)
@@ -78,12 +71,7 @@ class PoseBroadcast:
         self._serving.close()
 
     def tell(self, merged: MergedMap, now: float | None = None) -> None:
-        """Publish what has changed since the last time, if it is due.
-
-        Args:
-            merged: the newest merged map.
-            now: monotonic, s.
-        """
+        """Publish what has changed since the last time, if it is due."""
         now = self._clock() if now is None else now
         if now - self._checked_at < EVERY:
             return

@@ -102,12 +102,6 @@ class Quotas:
     def __init__(
         self, settings: QuotaSettings | None = None, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        """Start with no robot.
-
-        Args:
-            settings: how much.
-            clock: the time, s.
-        """
         self.settings = settings or QuotaSettings()
         self.clock = clock
         self._lock = threading.Lock()

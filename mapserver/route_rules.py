@@ -104,7 +104,6 @@ class RouteRules:
                 self.preferences.setdefault(hop, []).append(extent.entry)
 
     def __bool__(self) -> bool:
-        """Whether there are any."""
         return bool(self.closed or self.factors or self._closures)
 
     def closure_at(self, node: NodeId) -> Annotation | None:

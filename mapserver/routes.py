@@ -61,7 +61,6 @@ class _Shared:
     """What all routers of one merged map share; made when it is asked for first."""
 
     def __init__(self, merged: MergedMap, reaches: ReachabilityCache | None) -> None:
-        """Take a merged map and a cache."""
         self._merged = merged
         self._reaches = reaches or ReachabilityCache()
         self._turn = threading.Lock()

@@ -243,7 +243,6 @@ class LockstepSchedule:
     """
 
     def __init__(self) -> None:
-        """Start at time zero."""
         self._turn = threading.RLock()
         self._inbox: deque[Job] = deque()
         self._idle: IdleJob | None = None

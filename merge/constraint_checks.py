@@ -21,6 +21,7 @@ from mapweave.hybridmap.constraint_subject import (
     nodes_in_words,
     period_in_words,
 )
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
@@ -219,7 +220,7 @@ def _checked_separation(merged: MergedMap, about: Apart) -> str:
     ends = {first, second}
     count = sum(ends in ({a, b}, {a.map, b.map}) for a, b in pairs)
     if count:
-        return "1 link is undone" if count == 1 else f"{count} links are undone"
+        return f"{counted(count, 'link')} {'is' if count == 1 else 'are'} undone"
     for edge in merged.maps[MapId(*first[:2])].edges.values():
         if {edge.a, edge.b} == ends and edge.kind not in CLAIMS:
             way = f"their robot's way (edge {edge.id}, {edge.kind})"
@@ -258,8 +259,9 @@ def _checked_retirement(
             stamps = [node.stamp_ns for node in merged.maps[about.map].nodes.values()]
             why += f"; the nodes of {about.map} are {period_in_words(min(stamps), max(stamps))}"
         raise InvalidValue(f"{about}: {why}")
-    count = "1 node" if len(fresh) == 1 else f"{len(fresh)} nodes"
-    effects = [f"{count} of {', '.join(map(str, sorted({node.map for node in fresh})))}"]
+    effects = [
+        f"{counted(len(fresh), 'node')} of {', '.join(map(str, sorted({node.map for node in fresh})))}"
+    ]
     for which in sorted({node.map for node in fresh}):
         before = {node for node in constraints.nodes if node.map == which}
         now = before | {node for node in fresh if node.map == which}

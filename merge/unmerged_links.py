@@ -20,11 +20,6 @@ def with_unmerged_links(
     """The merged map as links by hand join it that it lacks; where it lacks none, the very same object.
 
     Only what these links join is optimised again, and no other link falls or is found.
-
-    Args:
-        merged: the newest merge.
-        constraints: all that were made.
-        settings: when links agree.
     """
     known, links_by_hand = merged.constraints.links, constraints.links
     lacking = [linked for pair, linked in links_by_hand.items() if known.get(pair) != linked]

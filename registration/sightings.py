@@ -72,7 +72,6 @@ class Sightings:
         )
 
     def __len__(self) -> int:
-        """How many."""
         return len(self.points)
 
     def take(self, index: slice) -> Sightings:

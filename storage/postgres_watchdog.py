@@ -26,7 +26,6 @@ class PostgresWatchdog:
     """A thread that looks at some sessions."""
 
     def __init__(self, *sessions: PostgresSession) -> None:
-        """Begin, with these."""
         self._sessions = [*sessions]
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="database watchdog", daemon=True)

@@ -255,7 +255,6 @@ class BitReader:
     """
 
     def __init__(self, data: bytes) -> None:
-        """Take the bytes."""
         self.at = 0
         padded = np.frombuffer(data + bytes(5), np.uint8).astype(np.int64)
         self.windows = np.zeros(len(data) + 1, np.int64)

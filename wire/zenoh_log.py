@@ -110,7 +110,6 @@ class ZenohLog:
     """
 
     def __init__(self) -> None:
-        """Prepare."""
         self._own = logging.getLogger("zenoh")
         # Zenoh's own filter has chosen already.
         self._own.setLevel(logging.DEBUG)

@@ -44,7 +44,6 @@ class Shard:
     """A share of the place index. One thread changes it; any may ask."""
 
     def __init__(self) -> None:
-        """Begin empty."""
         self._index = PlaceIndex()
         self._nodes: dict[NodeId, Node] = {}
 
@@ -76,7 +75,6 @@ class ShardServer:
     """A shard that is asked by messages, whose order it checks: a message may be lost, or the process."""
 
     def __init__(self) -> None:
-        """Begin empty."""
         self._reset()
 
     def call(self, request: bytes) -> bytes:

@@ -83,11 +83,9 @@ class ShardLink:
         self._thread = threading.Thread(target=self._keep, name=f"shard {name}", daemon=True)
 
     def __len__(self) -> int:
-        """How many nodes it must have."""
         return len(self._nodes)
 
     def __contains__(self, node_id: NodeId) -> bool:
-        """Whether it must have a node."""
         return node_id in self._nodes
 
     @property
@@ -173,10 +171,6 @@ class ShardLink:
 
     def ask(self, question: Question, message: bytes) -> Callable[[float], Any] | None:
         """Ask.
-
-        Args:
-            question: for a stand-in.
-            message: the same, encoded.
 
         Returns:
             Gives the answer when it is called with the time left, s; raises whatever went wrong. None if

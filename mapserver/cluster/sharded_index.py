@@ -52,11 +52,9 @@ class ShardedIndex:
             link.close()
 
     def __len__(self) -> int:
-        """How many nodes."""
         return sum(map(len, self._links))
 
     def __contains__(self, node_id: NodeId) -> bool:
-        """Whether a node is in the index."""
         return node_id in self._of(node_id.map)
 
     @property

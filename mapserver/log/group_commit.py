@@ -45,12 +45,6 @@ class GroupCommit:
     """Commits what is within the quotas, and keeps each log's failure to itself."""
 
     def __init__(self, store: Store, intakes: Intakes) -> None:
-        """Begin with nothing.
-
-        Args:
-            store: stays the caller's.
-            intakes: what is kept of each robot.
-        """
         self._store, self._intakes = store, intakes
         self._since: float | None = None
 

@@ -22,7 +22,6 @@ class Inbox(Generic[_T]):
     """Thread-safe."""
 
     def __init__(self) -> None:
-        """Start empty."""
         self._changed = threading.Condition()
         self._items: FairQueue[_T] = FairQueue(MOST, MOST_BYTES)
         self._woken = False
@@ -43,7 +42,6 @@ class Inbox(Generic[_T]):
         return taken
 
     def __len__(self) -> int:
-        """What waits."""
         with self._changed:
             return len(self._items)
 

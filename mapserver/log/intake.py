@@ -195,7 +195,6 @@ class Intakes:
     """Those of all robots."""
 
     def __init__(self, store: Store, quotas: Quotas, retired: Callable[[], Collection[MapId]]) -> None:
-        """Start with none."""
         self._store, self._quotas, self._retired = store, quotas, retired
         self._intakes: dict[str, Intake] = {}
 

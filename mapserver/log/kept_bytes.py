@@ -45,12 +45,6 @@ class KeptBytes:
     """How many bytes of one robot's maps the store keeps."""
 
     def __init__(self, agent: str, store: Store) -> None:
-        """Read nothing yet.
-
-        Args:
-            agent: the robot.
-            store: stays the caller's.
-        """
         self._agent, self._store = agent, store
         self._maps: dict[MapId, _Kept] = {}
         self._behind: set[MapId] | None = None

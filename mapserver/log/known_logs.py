@@ -31,20 +31,16 @@ class KnownLogs(Mapping[MapId, AgentLog]):
     """The logs that the server knows, by their maps. One thread changes them."""
 
     def __init__(self) -> None:
-        """Start with none."""
         self._logs: dict[MapId, AgentLog] = {}
         self._unknown: dict[MapId, None] = {}
 
     def __getitem__(self, map_id: MapId) -> AgentLog:
-        """The log of a map."""
         return self._logs[map_id]
 
     def __iter__(self) -> Iterator[MapId]:
-        """Their maps."""
         return iter(self._logs)
 
     def __len__(self) -> int:
-        """How many."""
         return len(self._logs)
 
     def restore(self, store: Store, positions: Mapping[MapId, Position], settings: PullSettings) -> None:

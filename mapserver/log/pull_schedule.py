@@ -18,7 +18,6 @@ class PullSchedule:
     """Logs that lack something. Robots that answer go first, and take turns."""
 
     def __init__(self) -> None:
-        """Start with nothing missing."""
         self._lacking: dict[MapId, AgentLog] = {}
         self._asked: dict[str, bool] = {}
         self._answering: set[str] = set()

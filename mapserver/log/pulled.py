@@ -91,7 +91,6 @@ class Pieces:
     """Pieces of logs of which a part is committed in this turn; one a log."""
 
     def __init__(self) -> None:
-        """Start with none."""
         self._pieces: dict[MapId, PulledChanges] = {}
 
     def put(self, piece: PulledChanges) -> None:

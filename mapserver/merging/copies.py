@@ -61,7 +61,6 @@ class Copies:
     """
 
     def __init__(self) -> None:
-        """None are known."""
         self._pairs: dict[tuple[NodeId, NodeId], int] = {}
         self._same: set[tuple[NodeId, NodeId]] = set()
         self._came: dict[NodeId, int] = {}

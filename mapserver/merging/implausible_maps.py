@@ -24,7 +24,6 @@ class ImplausibleMaps:
     """Maps of which something said is not believed, and why the first such thing is not."""
 
     def __init__(self) -> None:
-        """Nothing is known yet."""
         self._by_itself: dict[MapId, str] = {}
         self._by_views: dict[MapId, str] = {}
         self.refused = {}

@@ -35,7 +35,6 @@ class Isolation:
     """
 
     def __init__(self) -> None:
-        """None is set apart."""
         self._failures: dict[MapId, _Failure] = {}
         self._apart: set[MapId] = set()
 
@@ -45,7 +44,6 @@ class Isolation:
         return {map_id: self._failures[map_id].reason for map_id in sorted(self._apart)}
 
     def __contains__(self, map_id: MapId) -> bool:
-        """Whether a map is set apart."""
         return map_id in self._apart
 
     def add(self, map_id: MapId, reason: str) -> None:

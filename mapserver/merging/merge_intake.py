@@ -38,7 +38,6 @@ class MergeIntake:
         self.last: dict[MapId, int] = {}
 
     def __len__(self) -> int:
-        """Changes that wait."""
         return len(self._waiting)
 
     def waiting(self, robot: str) -> int:

@@ -41,12 +41,6 @@ class MergeSharing:
     """
 
     def __init__(self, store: Store, name: str) -> None:
-        """Nothing is written or read yet.
-
-        Args:
-            store: that servers share.
-            name: of this server.
-        """
         self.store, self._name = store, name
         self._prints: dict[MapId, tuple[HybridMap, bytes]] = {}
         self.begin()

@@ -80,11 +80,9 @@ class NodeComparisons:
         return sum(map(len, self._verdicts.values())) // 2
 
     def __getitem__(self, pair: Pair) -> Verdict:
-        """The verdict on a pair that was compared."""
         return self._verdicts[pair[0]][pair[1]]
 
     def __contains__(self, pair: Pair) -> bool:
-        """Whether there is a verdict on a pair."""
         return pair[1] in self._verdicts.get(pair[0], {})
 
     @property

@@ -16,11 +16,6 @@ class Unmerged:
     """What has come is numbered from one. Thread-safe."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
-        """Nothing has come yet.
-
-        Args:
-            clock: the time, s.
-        """
         self._clock = clock
         self._lock = threading.Lock()
         # Last number of each step, and the time of its first one.

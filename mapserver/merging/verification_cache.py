@@ -38,7 +38,6 @@ class VerificationCache:
     verdicts: Mapping[Pair, Verdict] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """How many pairs were compared."""
         return len(self.verdicts)
 
     def joined(self, later: VerificationCache) -> VerificationCache:
@@ -83,7 +82,6 @@ class CachedVerifications:
     """Results of another process, for nodes that are unchanged."""
 
     def __init__(self, findings: VerificationCache) -> None:
-        """Take them."""
         self._findings = findings
         self._overlaps: dict[NodeId, dict[NodeId, float]] = {}
         for (a, b), value in findings.overlaps.items():

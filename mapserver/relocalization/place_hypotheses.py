@@ -74,11 +74,6 @@ def is_lonely(node: Node, view: View, recognition: Recognition) -> bool:
 
     A thing can be moved with all its landmarks. Then landmarks away from it, each with the same detection
     rate, are missing. Landmarks that one person may occlude do not count.
-
-    Args:
-        node: the place.
-        view: the image's features.
-        recognition: that the view shows the place.
     """
     points = node.landmarks.points_in_robot(node.camera)
     agreeing = np.zeros(len(points), np.bool_)

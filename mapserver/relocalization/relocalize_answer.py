@@ -26,12 +26,6 @@ def answer_of(
     """Put a verdict into an answer.
 
     A place that seems certain while a part of the map is missing is ambiguous: its like may be in that part.
-
-    Args:
-        verdict: the places and the outcome.
-        merged: where nodes are.
-        node_of: gives a node by its id.
-        least_features: that a view needs.
     """
     reason = _reason(verdict, merged, least_features)
     known = verdict.outcome in (Outcome.FOUND, Outcome.AMBIGUOUS)

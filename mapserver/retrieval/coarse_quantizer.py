@@ -55,7 +55,6 @@ class CoarseQuantizer:
             raise InvalidFile("cells: centres that are no codes")
 
     def __len__(self) -> int:
-        """How many cells."""
         return len(self.centres)
 
     def nearest(self, vectors: Vectors) -> Ids:

@@ -17,14 +17,12 @@ class FlatLandmarks:
     """Codes with ids, in the order in which they came."""
 
     def __init__(self) -> None:
-        """Start empty."""
         self._codes = np.zeros((0, DIMENSIONS), np.uint8)
         self._ids = np.zeros(0, np.int64)
         self._rows = comparable(self._codes)
         self._count = 0
 
     def __len__(self) -> int:
-        """How many landmarks."""
         return self._count
 
     @property

@@ -41,7 +41,6 @@ class InvertedFile:
     """
 
     def __init__(self, quantizer: CoarseQuantizer) -> None:
-        """Begin with nothing in them."""
         import faiss
 
         self.quantizer = quantizer
@@ -52,7 +51,6 @@ class InvertedFile:
         self._index.train(np.zeros((1, DIMENSIONS), np.float32))
 
     def __len__(self) -> int:
-        """How many landmarks."""
         return int(self._index.ntotal)
 
     def add(self, codes: Codes, ids: Ids) -> None:

@@ -58,7 +58,6 @@ class LandmarkIndex:
     """
 
     def __init__(self, settings: LandmarkIndexSettings | None = None) -> None:
-        """Start empty."""
         self.lock = SharedLock()
         self._settings = settings or LandmarkIndexSettings()
         self._kept: dict[int, Landmarks] = {FLAT: FlatLandmarks()}
@@ -68,7 +67,6 @@ class LandmarkIndex:
         self._making = threading.Lock()
 
     def __len__(self) -> int:
-        """How many landmarks."""
         return len(self._any)
 
     def cells(self, wanted: int) -> int:

@@ -33,37 +33,27 @@ NodeOf = Callable[[NodeId], Node | None]
 class NodeIndex(Protocol):
     """What nodes are searched in: a PlaceIndex, or several as one (mapweave.mapserver.cluster)."""
 
-    def __len__(self) -> int:
-        """How many nodes."""
-        ...
+    def __len__(self) -> int: ...
 
-    def __contains__(self, node_id: NodeId) -> bool:
-        """Whether a node is in the index."""
-        ...
+    def __contains__(self, node_id: NodeId) -> bool: ...
 
     def announce(self, node: Node) -> None:
         """Add a node, or replace it; any thread may do so, and a search does not hold it up."""
-        ...
 
     def add(self, node: Node) -> None:
         """Add a node, or replace it."""
-        ...
 
     def extend(self, nodes: Iterable[Node]) -> None:
         """Add nodes, or replace them."""
-        ...
 
     def remove(self, node_id: NodeId, codes: NDArray[np.uint8] | None = None) -> None:
         """Forget a node; see `PlaceIndex.remove`."""
-        ...
 
     def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> Ranked:
         """At most k nodes with their similarity to a view, best first."""
-        ...
 
     def overlaps(self, node: Node, node_of: NodeOf) -> dict[NodeId, float]:
         """Overlaps of a node with those that are here; see `PlaceIndex.overlaps`."""
-        ...
 
 
 class PlaceDatabase:
@@ -85,11 +75,9 @@ class PlaceDatabase:
     # Ask.
 
     def __len__(self) -> int:
-        """How many nodes can be found."""
         return len(self._index)
 
     def __contains__(self, node_id: NodeId) -> bool:
-        """Whether a node can be found."""
         return node_id in self._index
 
     def query(self, view: View, k: int = 5, exclude: Collection[NodeId] = ()) -> Ranked:
@@ -142,10 +130,6 @@ class PlaceDatabase:
 
     def leave_out(self, superseded: Collection[NodeId], node_of: NodeOf) -> dict[NodeId, dict[NodeId, float]]:
         """Leave out the superseded nodes of earlier drives, and no others.
-
-        Args:
-            superseded: by the newest merge.
-            node_of: gives a node by its id.
 
         Returns:
             The nodes that are taken in again, each with its overlaps.

@@ -65,7 +65,6 @@ class PlaceIndex:
     """
 
     def __init__(self, settings: PlaceIndexSettings | None = None) -> None:
-        """Start empty."""
         self._settings = settings or PlaceIndexSettings()
         self._landmarks = LandmarkIndex(self._settings.landmarks)
         self._lock = self._landmarks.lock
@@ -76,12 +75,10 @@ class PlaceIndex:
         self._announced: deque[Node] = deque()
 
     def __len__(self) -> int:
-        """How many nodes."""
         with self._current():
             return len(self._slots)
 
     def __contains__(self, node_id: NodeId) -> bool:
-        """Whether a node is in the index."""
         with self._current():
             return node_id in self._slots
 

@@ -28,7 +28,6 @@ class Ranked(list[tuple[NodeId, float]]):
     """
 
     def __init__(self, nodes: Iterable[tuple[NodeId, float]] = (), missing: str = "") -> None:
-        """Take the nodes in order."""
         super().__init__(nodes)
         self.missing = missing
 

@@ -7,6 +7,7 @@ from collections.abc import Collection, Iterable
 
 import networkx as nx
 
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import decided, reason_of
 from mapweave.merge.pose_graph.links import Link
@@ -53,10 +54,6 @@ def partings(
 def joinings(before: Iterable[frozenset[MapId]], after: MergedMap) -> tuple[str, ...]:
     """What has become one map.
 
-    Args:
-        before: sets of maps that were one.
-        after: the merge now.
-
     Returns:
         For example `r1.1 and r3.1 are one map now, by 8 links`.
     """
@@ -82,7 +79,7 @@ def joinings(before: Iterable[frozenset[MapId]], after: MergedMap) -> tuple[str,
         while left:
             n = next((n for n in left if counts[n]), left[0])
             left.remove(n)
-            by = _links(counts[n]) if counts[n] else "way of others"
+            by = counted(counts[n], "link") if counts[n] else "way of others"
             out.append(f"{_briefly(joined)} and {_briefly(parts[n])} are one map now, by {by}")
             joined, counts = joined | parts[n], counts + ties.get((k, n), Counter())
     return tuple(out)
@@ -101,8 +98,7 @@ def _refused_now(part: frozenset[MapId], whole: frozenset[MapId], after: MergedM
         ends = {r.a.map in part, r.b.map in part}
         if r.link is not None and r.edge is None and len(ends) == 2 and {r.a.map, r.b.map} <= whole:
             reasons[r.reason] += 1
-    reasons_in_words = [f"{_links(count)} refused ({reason})" for reason, count in reasons.most_common(3)]
-    return "; ".join(reasons_in_words) or "no link joins them any more"
+    return "; ".join(_refused(reasons)) or "no link joins them any more"
 
 
 def _lost(part: frozenset[MapId], links: Collection[Link], after: MergedMap) -> str:
@@ -116,21 +112,23 @@ def _lost(part: frozenset[MapId], links: Collection[Link], after: MergedMap) -> 
         for pair, which in zip(pairs, away, strict=True)
         if which is None and (pair[0] not in after.poses or pair[1] not in after.poses)
     ]
-    reasons_in_words = [f"{_links(count)} refused ({reason})" for reason, count in reasons.most_common(3)]
+    reasons_in_words = _refused(reasons)
     whys = Counter(reason_of(constraint) for constraint in away if constraint is not None)
-    reasons_in_words += [f"{_links(count)} gone, since {why}" for why, count in sorted(whys.items())]
+    reasons_in_words += [f"{counted(count, 'link')} gone, since {why}" for why, count in sorted(whys.items())]
     if removed:
-        reasons_in_words.append(f"{_links(len(removed))} gone with a node")
+        reasons_in_words.append(f"{counted(len(removed), 'link')} gone with a node")
     seen = {r.pair for r in after.refused} | {*removed}
     seen |= {pair for pair, which in zip(pairs, away, strict=True) if which is not None}
     by_hand = [after.constraints.taken_back(*pair) for pair in pairs - seen]
     backs = Counter(decided(constraint) for constraint in by_hand if constraint is not None)
-    reasons_in_words += [f"{_links(count)} by hand taken back {how}" for how, count in sorted(backs.items())]
+    reasons_in_words += [
+        f"{counted(count, 'link')} by hand taken back {how}" for how, count in sorted(backs.items())
+    ]
     left = len(pairs) - sum(reasons.values()) - len(removed) - whys.total() - backs.total()
     if left > 0:
-        reasons_in_words.append(f"{_links(left)} no longer among the most similar pairs")
+        reasons_in_words.append(f"{counted(left, 'link')} no longer among the most similar pairs")
     return "; ".join(reasons_in_words) or "a map has fallen into pieces"
 
 
-def _links(count: int) -> str:
-    return "1 link" if count == 1 else f"{count} links"
+def _refused(reasons: Counter[str]) -> list[str]:
+    return [f"{counted(count, 'link')} refused ({reason})" for reason, count in reasons.most_common(3)]

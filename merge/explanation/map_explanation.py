@@ -17,6 +17,7 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.manual_constraint import reason_of, retired_words
 from mapweave.hybridmap.reachability import reachability_of
 from mapweave.merge.explanation.component_changes import joined_maps
+from mapweave.merge.explanation.map_standing import all_refused, only_similar
 from mapweave.merge.explanation.node_explanation import node_of
 from mapweave.merge.explanation.own_edges import reach_words
 from mapweave.merge.explanation.twin_maps import TWINS, are_twins
@@ -35,11 +36,6 @@ CLOSELY = 16
 
 def explain_maps(merged: MergedMap, first: MapId, second: MapId) -> MapsExplanation:
     """Explain two maps.
-
-    Args:
-        merged: the merged map.
-        first: a map.
-        second: another one.
 
     Raises:
         InvalidValue: the same map twice, or one that is not there.
@@ -194,17 +190,11 @@ def _why_apart(
             reason if count == len(refused) else f"{reason} ({count} of them)"
             for reason, count in reasons.most_common(2)
         ]
-        many = (
-            "1 link was found and refused"
-            if len(refused) == 1
-            else (f"{len(refused)} links were found and all refused")
-        )
         twins = f". They show the same places: {TWINS}" if are_twins(refused) else ""
-        return f"{head}: {many}: {'; '.join(reasons_in_words)}{twins}"
+        return f"{head}: {all_refused(len(refused))}: {'; '.join(reasons_in_words)}{twins}"
     if unverified:
         best = f"; nearest are {nearest[0].a} and {nearest[0].b}: {nearest[0].lacks}" if nearest else ""
-        many = "1 pair of nodes looks" if len(unverified) == 1 else f"{len(unverified)} pairs of nodes look"
-        return f"{head}: {many} similar and no two have a common pose{best}"
+        return f"{head}: {only_similar(len(unverified))}{best}"
     return f"{head}: no node of one shares enough similar features with any of the other to be compared"
 
 

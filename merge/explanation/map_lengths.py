@@ -14,11 +14,7 @@ MOST_NAMED = 3
 
 
 def length_words(merged: MergedMap) -> dict[MapId, str]:
-    """What is said of maps whose lengths the merge has corrected.
-
-    Args:
-        merged: the merged map.
-    """
+    """What is said of maps whose lengths the merge has corrected."""
     refused = [r.link for r in merged.refused if r.link is not None and r.edge is None]
     links = [link for link in (*merged.links, *refused) if not link.within]
     out = {}

@@ -13,6 +13,8 @@ from mapweave.merge.explanation.twin_maps import are_twins, twin_words
 from mapweave.merge.pose_graph.links import RefusedLink
 from mapweave.merge.pose_graph.merged_map import MergedMap
 
+UNLIKE = "none of its nodes looks like one of another map"
+
 
 class MapStanding(NamedTuple):
     """How one map stands in the merge.
@@ -59,10 +61,21 @@ def map_standings(merged: MergedMap) -> dict[MapId, MapStanding]:
                 (reason_of(constraint) if constraint is not None else "")
                 or accusations.get(map_id, "")
                 or "; ".join(filter(None, (twin.get(map_id), _refused(refused.get(map_id, Counter())))))
-                or _unverified(alike[map_id])
+                or (only_similar(alike[map_id]) if alike[map_id] else UNLIKE)
             )
         out[map_id] = MapStanding(max(nodes, default=None), links[map_id], apart)
     return out
+
+
+def all_refused(count: int) -> str:
+    """That this many links were found, and not one of them kept; the reasons are to follow."""
+    return "1 link was found and refused" if count == 1 else f"{count} links were found and all refused"
+
+
+def only_similar(count: int) -> str:
+    """That this many pairs of nodes are as near to a link as there is any."""
+    many = "1 pair of nodes looks" if count == 1 else f"{count} pairs of nodes look"
+    return f"{many} similar and no two have a common pose"
 
 
 def _ordered(one: MapId, other: MapId) -> tuple[MapId, MapId]:
@@ -85,12 +98,4 @@ def _refused(reasons: Counter[str]) -> str:
     if not reasons:
         return ""
     (reason, count), total = reasons.most_common(1)[0], reasons.total()
-    many = "1 link was found and refused" if total == 1 else f"{total} links were found and all refused"
-    return f"{many}: {reason}{'' if count == total else f' ({count} of them)'}"
-
-
-def _unverified(count: int) -> str:
-    if not count:
-        return "none of its nodes looks like one of another map"
-    many = "1 pair of nodes looks" if count == 1 else f"{count} pairs of nodes look"
-    return f"{many} similar and no two have a common pose"
+    return f"{all_refused(total)}: {reason}{'' if count == total else f' ({count} of them)'}"

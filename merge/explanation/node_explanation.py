@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.constraint_subject import Linked
+from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.explanation import LinkAgreement, Misfit, PairExplanation, Standing
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -38,13 +39,6 @@ def explain_nodes(
     consistency: ConsistencySettings | None = None,
 ) -> PairExplanation:
     """Explain two nodes.
-
-    Args:
-        merged: the merged map.
-        a: a node.
-        b: another one.
-        verification: as in the merge.
-        consistency: as in the merge.
 
     Raises:
         InvalidValue: the same node twice, or one that is not there.
@@ -189,8 +183,9 @@ def _by_hand_in_words(merged: MergedMap, linked: Linked) -> str:
 
 
 def _other_links_in_words(count: int) -> str:
-    more = "1 more link" if count == 1 else f"{count} more links"
-    return f"and {more} between the same pieces of map agree{'s' if count == 1 else ''}"
+    return (
+        f"and {counted(count, 'more link')} between the same pieces of map agree{'s' if count == 1 else ''}"
+    )
 
 
 def _judged(merged: MergedMap, link: Link, kept: bool) -> tuple[Misfit | None, float | None]:

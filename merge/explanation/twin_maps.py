@@ -24,11 +24,7 @@ def is_twin_reason(reason: str) -> bool:
 
 
 def are_twins(refused: Iterable[RefusedLink]) -> bool:
-    """Whether two maps show several of the same places and cannot be one.
-
-    Args:
-        refused: links between the two.
-    """
+    """Whether two maps show several of the same places and cannot be one."""
     pairs = [r.pair for r in refused if r.link is not None and is_twin_reason(r.reason)]
     return min((len({pair[k] for pair in pairs}) for k in (0, 1)), default=0) >= LEAST_NODES
 

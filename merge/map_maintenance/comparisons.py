@@ -18,7 +18,6 @@ class Comparisons:
     """What was found of pairs of nodes, as long as the two are known just so."""
 
     def __init__(self) -> None:
-        """Nothing is compared yet."""
         self._cache: dict[tuple[NodeId, NodeId], tuple[Node, Node, Link | None]] = {}
 
     def link(self, a: Node, b: Node, least: int) -> Link | None:

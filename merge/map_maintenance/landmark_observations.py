@@ -87,13 +87,7 @@ BEFORE = 0.8
 
 
 def expected(old: Node, new: Node, old_from_new: Pose2) -> NDArray[np.bool_]:
-    """(N,) which landmarks of a node another view should show.
-
-    Args:
-        old: the node.
-        new: the view.
-        old_from_new: relative pose.
-    """
+    """(N,) which landmarks of a node another view should show."""
     projection = ProjectedView.of(old, new, old_from_new, MARGIN_PX, SCALE, ASIDE)
     shown, candidates = projection.fits, np.flatnonzero(projection.fits)
     if len(candidates):

@@ -83,11 +83,6 @@ class NodeSuperseder:
         self,
         reaches: ReachabilityCache | None = None,
     ) -> None:
-        """Begin with nothing superseded.
-
-        Args:
-            reaches: cache of reachability; it is filled.
-        """
         self._comparisons = Comparisons()
         self._reaches = reaches or ReachabilityCache()
         self._superseded: dict[NodeId, Superseded] = {}

@@ -175,7 +175,6 @@ class ForeignEdges:
     """Edges that lead out of their own maps: drives among others' nodes. A map is read once."""
 
     def __init__(self) -> None:
-        """Start with no maps."""
         self._cache: dict[MapId, tuple[HybridMap, tuple[Edge, ...]]] = {}
 
     def of(self, maps: Mapping[MapId, HybridMap]) -> list[Edge]:

@@ -106,7 +106,6 @@ class TrajectoryCache:
     """The trajectories of fragments, read once. Fragments are never changed, only replaced."""
 
     def __init__(self) -> None:
-        """Start empty."""
         self._entries: dict[NodeId, tuple[Fragment, tuple[RobotTrajectory, ...]]] = {}
 
     def trajectories(self, fragment: Fragment, hybrid_map: HybridMap) -> tuple[RobotTrajectory, ...]:

@@ -45,7 +45,6 @@ class VisibilityInterval:
     lengths: Array
 
     def __len__(self) -> int:
-        """How many observations."""
         return len(self.moments)
 
     def __add__(self, other: VisibilityInterval) -> VisibilityInterval:

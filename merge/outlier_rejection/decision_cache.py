@@ -25,7 +25,6 @@ class DecisionCache:
     """Fragments by map, and sorted groups of links by fragments. For merges with the same settings."""
 
     def __init__(self) -> None:
-        """Nothing is known yet."""
         self._maps: dict[MapId, tuple[HybridMap, list[Fragment]]] = {}
         self._groups: dict[Key, LinkGroup] = {}
         self._weighed: dict[Key, tuple[Link, Link]] = {}

@@ -100,11 +100,6 @@ class WrongGeometrySearch:
     """Finds maps with wrong geometry. What was found out of maps and links that did not change is kept."""
 
     def __init__(self, consistency: ConsistencySettings) -> None:
-        """Nothing is known yet.
-
-        Args:
-            consistency: when links agree.
-        """
         self._s = consistency
         self._memory = DecisionCache()
         self._ties: dict[MapPair, _Tie] = {}

@@ -95,7 +95,6 @@ class Factors:
         return Factors(*(np.concatenate([getattr(part, name) for part in parts]) for name in columns))
 
     def __len__(self) -> int:
-        """How many measurements."""
         return len(self.a)
 
     def take(self, index: NDArray[np.bool_] | Rows, row_of: Rows | None = None) -> Factors:

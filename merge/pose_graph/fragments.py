@@ -41,7 +41,6 @@ class Fragment:
         return Factors.of(self.measurements, a, b)
 
     def __len__(self) -> int:
-        """How many nodes."""
         return len(self.graph.nodes)
 
 

@@ -119,7 +119,6 @@ class MapScales:
     """Finds the factors; what was found out of pieces and links that did not change is kept."""
 
     def __init__(self) -> None:
-        """Nothing is known yet."""
         self._derivatives: WeakKeyDictionary[Link, tuple[Node, Node, Array | None]] = WeakKeyDictionary()
         self._corrected: WeakKeyDictionary[Link, tuple[Logs, Link]] = WeakKeyDictionary()
         self._ratios: dict[MapPair, tuple[Used, int, LengthRatio | None]] = {}

@@ -46,7 +46,6 @@ class NodePoses(Mapping[NodeId, Placement]):
     """The poses of all nodes of some solved components, worked out when they are asked for."""
 
     def __init__(self, graphs: Sequence[PoseGraph]) -> None:
-        """Take the components, largest first."""
         self._graphs = tuple(graphs)
         self._numbers: dict[tuple[str, int], list[int]] = {}
         for number, graph in enumerate(self._graphs):
@@ -87,7 +86,6 @@ class NodePoses(Mapping[NodeId, Placement]):
         }
 
     def __contains__(self, node: object) -> bool:
-        """Whether a node is there."""
         return isinstance(node, NodeId) and self.number(node) is not None
 
     def __iter__(self) -> Iterator[NodeId]:
@@ -95,7 +93,6 @@ class NodePoses(Mapping[NodeId, Placement]):
         return (node for graph in self._graphs for node in graph.nodes)
 
     def __len__(self) -> int:
-        """How many nodes."""
         return sum(len(graph.nodes) for graph in self._graphs)
 
 

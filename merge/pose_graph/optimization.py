@@ -56,12 +56,7 @@ def optimized(factors: Factors, means: Array, free: Rows, held: Rows) -> Array:
 
 
 def add_measurements(graph: Any, part: Factors) -> None:
-    """Put measurements into a GTSAM graph; its keys are their rows.
-
-    Args:
-        graph: a NonlinearFactorGraph.
-        part: the measurements.
-    """
+    """Put measurements into a GTSAM graph; its keys are their rows."""
     # W = R' R
     import gtsam
 

@@ -38,7 +38,6 @@ class PinnedFrames:
     """Keeps what it has moved: a component that did not change is the same object the next time."""
 
     def __init__(self) -> None:
-        """Nothing is moved yet."""
         self._moved: dict[int, tuple[PoseGraph, Pin, PoseGraph]] = {}
 
     def moved(self, merged: MergedMap, pins: Sequence[Pin]) -> MergedMap:

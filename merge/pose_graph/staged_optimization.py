@@ -54,7 +54,6 @@ class StagedOptimization:
     """Keeps what it has solved: a component that did not change is the same object the next time."""
 
     def __init__(self) -> None:
-        """Nothing is solved yet."""
         self._solved: dict[int, Staged] = {}
 
     def solved(

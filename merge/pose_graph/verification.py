@@ -31,11 +31,6 @@ def verify(a: Node, b: Node, settings: RecognitionSettings | None = None) -> Lin
     The answer depends on the two nodes alone: they are put in the order of their ids, and the ids seed the
     estimator's random numbers, so neither order of arrival nor other nodes matter.
 
-    Args:
-        a: one node.
-        b: another one.
-        settings: when they are linked.
-
     Returns:
         A link, or why there is none.
     """

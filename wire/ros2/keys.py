@@ -72,7 +72,6 @@ class CommandKeys:
     """
 
     def __init__(self, link: Ros2Link) -> None:
-        """Take the domain."""
         self._root = f"mapweave_driver/{'bridge' if link.bridge else link.domain_id()}"
 
     def robot_drivers_of(self, topic: str) -> str:
