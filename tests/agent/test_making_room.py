@@ -1,7 +1,5 @@
 """A robot that has done its mission drives out of another one's way; no other does."""
 
-from __future__ import annotations
-
 import pytest
 
 from mapweave.agent.exploration.behaviours import Phase

@@ -11,16 +11,13 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from mapweave import Command, MapId, Odometry, Pose2, read_camera
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mission import Carried
-from mapweave.agent.observation import Command, Odometry
 from mapweave.agent.pipeline import Pipeline
-from mapweave.agent.recordings.camera_file import read_camera
 from mapweave.agent.recordings.opening import open_recording
 from mapweave.agent.recordings.options import RecordingOptions
 from mapweave.hybridmap.errors import DeviceError
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
 
 COUNT = 14
 TURNS = [0.0, *(0.01 * math.sin(k) for k in range(1, COUNT))]

@@ -6,15 +6,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapweave import MapId, NodeId, Pose2
 from mapweave.agent.mission import GoTo
 from mapweave.agent.pipeline import Pipeline
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodeRetired
-from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
-from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.wire.bus import Request
 from mapweave.wire.keys import Keys

@@ -24,16 +24,13 @@ def test_an_empty_image_is_refused(encoding: str, size: dict[str, int]):
         grey_of(image(encoding=encoding, **size))
 
 
-@pytest.mark.parametrize(
-    ("wrong", "words"),
-    [
-        (SimpleNamespace(format="h264", data=b"no image"), "of format 'h264': no JPEG, PNG, PGM or BMP file"),
-        (SimpleNamespace(format="", data=b""), "no JPEG, PNG, PGM or BMP file"),
-        (image(width=2**16, height=2**16), "65536x65536 px is too large"),
-        (image(step=2**32 - 1), "has 48 bytes"),
-        (image(encoding="32FC1"), "are not supported; mono8, .*bayer_rggb8, .* are"),
-    ],
-)
+@pytest.mark.parametrize(("wrong", "words"), [
+    (SimpleNamespace(format="h264", data=b"no image"), "of format 'h264': no JPEG, PNG, PGM or BMP file"),
+    (SimpleNamespace(format="", data=b""), "no JPEG, PNG, PGM or BMP file"),
+    (image(width=2**16, height=2**16), "65536x65536 px is too large"),
+    (image(step=2**32 - 1), "has 48 bytes"),
+    (image(encoding="32FC1"), "are not supported; mono8, .*bayer_rggb8, .* are"),
+])  # fmt: skip
 def test_what_is_no_image_is_refused_in_words(wrong: SimpleNamespace, words: str):
     with pytest.raises(DeviceError, match=words):
         grey_of(wrong)

@@ -167,18 +167,15 @@ def test_a_percentile_of_nothing_is_none():
     assert milliseconds(np.array([0.001, 0.002, np.inf]), 50) == 2.0
 
 
-@pytest.mark.parametrize(
-    ("change", "said", "status"),
-    [
-        ({}, SAID, 0),
-        ({}, {}, 0),
-        ({}, {**SAID, "flooding": ""}, 1),
-        ({"unacked": 1}, {}, 1),
-        ({"disturbers_unacked": 1}, SAID, 1),
-        ({"ack_p99_ms": 500.1}, {}, 1),
-        ({"relocalize_p95_ms": None}, {}, 1),
-    ],
-)
+@pytest.mark.parametrize(("change", "said", "status"), [
+    ({}, SAID, 0),
+    ({}, {}, 0),
+    ({}, {**SAID, "flooding": ""}, 1),
+    ({"unacked": 1}, {}, 1),
+    ({"disturbers_unacked": 1}, SAID, 1),
+    ({"ack_p99_ms": 500.1}, {}, 1),
+    ({"relocalize_p95_ms": None}, {}, 1),
+])  # fmt: skip
 def test_it_ends_with_1_unless_it_is_good_and_prints_json(
     change: Figures, said: dict[str, str], status: int, monkeypatch, capsys
 ):

@@ -7,10 +7,8 @@ import pytest
 from benchmarks.relocalize.distractors import Differences, Distractors
 from benchmarks.relocalize.places import TruePlace
 from benchmarks.relocalize_start.store import fill
+from mapweave import HybridMap, MapId, Pose2
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from synthetic.world import room, take_map
 

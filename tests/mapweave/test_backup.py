@@ -8,18 +8,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapweave import Fleet, HybridMap, MapId, maps_of
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.replicator import COMPACTED, Replicator
 from mapweave.cli import main
 from mapweave.exit_status import USAGE
-from mapweave.fleet import Fleet
 from mapweave.hybridmap.annotation import Annotations
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.sqlite_store import SqliteStore
-from mapweave.mapserver.own_maps import maps_of
 from mapweave.mapserver.plan_images import kept_images
 from mapweave.mapserver.retrieval.landmark_index import LandmarkIndexSettings
 from mapweave.opened_map import open_map

@@ -9,15 +9,12 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import Camera, MapFile, NodeId, Pose2, PoseGaussian, write_map_file
 from mapweave.agent.drivers.replay import Replay
 from mapweave.cli import main
 from mapweave.exit_status import INTERRUPTED
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import EdgePut, NodePut
-from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.storage.map_file import MapFile, write_map_file
 from tests.mapweave.command_line import complaint
 from tests.programs import mapweave
 

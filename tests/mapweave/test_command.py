@@ -15,18 +15,14 @@ from types import SimpleNamespace
 import pytest
 from rich.console import Console
 
+from mapweave import Fleet, NodeId, NotConnected, Pose2, read_map_file
 from mapweave.cli import main
 from mapweave.commands import status as status_command
 from mapweave.commands.status import COLUMNS, SPARE, cells, table
 from mapweave.exit_status import FAILED, INTERRUPTED, NO, USAGE
-from mapweave.fleet import Fleet
 from mapweave.hybridmap.agent_status import AgentStatus, FleetStatus, RobotEntry, Status
-from mapweave.hybridmap.errors import NotConnected
-from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
-from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.children import Children, free_port
-from mapweave.storage.map_file import read_map_file
 from mapweave.wire.bus import Request
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.keys import Keys

@@ -6,13 +6,11 @@ import time
 import numpy as np
 import pytest
 
+from mapweave import HybridMap, NodeId, Pose2
 from mapweave.demo.run import run_demo
 from mapweave.evaluation.map_score import pose_error, score_map
 from mapweave.fleet import send_order
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
-from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.children import Children, free_port
 from mapweave.scenarios.reports import Reports
 from mapweave.scenarios.run import TrialOptions

@@ -12,16 +12,14 @@ from pathlib import Path
 
 import pytest
 
+from mapweave import HybridMap, MapFile, MapId, write_map_file
 from mapweave.cli import main
 from mapweave.exit_status import FAILED, MISSING_EXTRA, NO, USAGE
 from mapweave.extras import MODULES
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
 from mapweave.hybridmap.manual_constraint import ManualConstraints
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.offline_merge import merge_parts
-from mapweave.storage.map_file import MapFile, write_map_file
 from synthetic.maps import looked_around
 from tests.mapweave.command_line import commands
 from tests.programs import python, ran

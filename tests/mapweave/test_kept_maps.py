@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapweave import AgentStatus, EdgeKind, HybridMap, MapId, MissionKind, NodeId, Pose2
 from mapweave.agent.drivers.messages import decode_step, encode_description, encode_observation
 from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.pipeline import TickResult
@@ -19,14 +20,8 @@ from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
 from mapweave.exit_status import NO, USAGE
-from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.node import EdgeKind
-from mapweave.hybridmap.pose import Pose2
 from mapweave.processes import agent_process
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.processes.agent_files import epochs_of_files

@@ -64,14 +64,10 @@ wheel_noise = {d.wheel_noise}
 
 
 @pytest.mark.timeout(560)
-@pytest.mark.parametrize(
-    ("kind", "least_nodes"),
-    # Sensors that reach 20 cm find no way from the start to another place.
-    [
-        pytest.param(Koala25InSimulation, 10, marks=(pytest.mark.slow, pytest.mark.waits)),
-        pytest.param(KoalaSilverInSimulation, 5, marks=pytest.mark.scenario),
-    ],
-)
+@pytest.mark.parametrize(("kind", "least_nodes"), [
+    pytest.param(Koala25InSimulation, 10, marks=(pytest.mark.slow, pytest.mark.waits)),
+    pytest.param(KoalaSilverInSimulation, 5, marks=pytest.mark.scenario),
+])  # fmt: skip
 def test_a_koala_maps_is_carried_off_and_parks(kind: type[InSimulation], least_nodes: int, tmp_path):
     keys, endpoint = Keys("serial"), f"tcp/127.0.0.1:{free_port()}"
     network = ["--fleet", "serial", "--connect", endpoint]

@@ -11,15 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapweave import Command, MissionKind, Observation, Odometry, Pose2, RobotDescription
 from mapweave.agent.calibration.correction import corrected, declaring, frame_change, geometry_of
 from mapweave.agent.calibration.learned import LearnedGeometry, LearnedParameter, intrinsics_of
 from mapweave.agent.drive_geometry import DriveGeometry, Parameter
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.agent.recordings.learned_file import read_learned, write_learned
 from mapweave.agent.settings import AgentSettings
 from mapweave.cli import main
-from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.pose import Pose2
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub

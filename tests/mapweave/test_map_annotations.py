@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 import mapweave
+from mapweave import MapFile, MapId, read_map_file
 from mapweave.cli import main
 from mapweave.editable_map import EditableMap
 from mapweave.exit_status import NO
 from mapweave.hybridmap.floor_plan import PlanImage
-from mapweave.hybridmap.ids import MapId
-from mapweave.storage.map_file import MapFile, read_map_file
 from mapweave.storage.plan_image import plan_file
 from synthetic.maps import looked_around, write_store
 

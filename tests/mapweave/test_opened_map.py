@@ -22,18 +22,14 @@ from hypothesis import strategies as st
 from websockets.sync.client import connect
 
 import mapweave
+from mapweave import Edge, EdgeKind, HybridMap, ManualConstraint, MapEvent, MapEventKind, Pose2, PoseGaussian
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
 from mapweave.hybridmap.annotation import Annotation, Place
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.constraint_subject import Apart, RetiredNodes
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
-from mapweave.hybridmap.manual_constraint import ManualConstraint
-from mapweave.hybridmap.map_event import MapEvent, MapEventKind
-from mapweave.hybridmap.node import Edge, EdgeKind
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.superseded import Superseded
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.sqlite_store import SqliteStore
@@ -361,20 +357,17 @@ def test_the_same_map_has_the_same_hash_however_it_is_written(shuffle: random.Ra
     assert content_hash(other) == expected == content_hash(unpack_map_file(pack_map_file(other)))
 
 
-@pytest.mark.parametrize(
-    "other",
-    [
-        replace(WHOLE, changes=WHOLE.changes[:-1]),
-        replace(WHOLE, changes=(*WHOLE.changes[:-1], EdgePut(replace(LINK, evidence={"inliers": 8.0})))),
-        replace(WHOLE, changes=(NodePut(replace(CONTENTS[0].node, stamp_ns=1)), *WHOLE.changes[1:])),  # type: ignore[union-attr]
-        replace(WHOLE, refused=WHOLE.refused[:1]),
-        replace(WHOLE, constraints=WHOLE.constraints[::-1]),
-        replace(WHOLE, annotations=WHOLE.annotations[::-1]),
-        replace(WHOLE, superseded={}),
-        replace(WHOLE, retired={NODES[6]: 0, NODES[7]: 1}),
-        replace(WHOLE, faded={NODES[0]: np.zeros(len(CONTENTS[0].node.landmarks), bool)}),  # type: ignore[union-attr]
-    ],
-)
+@pytest.mark.parametrize("other", [
+    replace(WHOLE, changes=WHOLE.changes[:-1]),
+    replace(WHOLE, changes=(*WHOLE.changes[:-1], EdgePut(replace(LINK, evidence={"inliers": 8.0})))),
+    replace(WHOLE, changes=(NodePut(replace(CONTENTS[0].node, stamp_ns=1)), *WHOLE.changes[1:])),  # type: ignore[union-attr]
+    replace(WHOLE, refused=WHOLE.refused[:1]),
+    replace(WHOLE, constraints=WHOLE.constraints[::-1]),
+    replace(WHOLE, annotations=WHOLE.annotations[::-1]),
+    replace(WHOLE, superseded={}),
+    replace(WHOLE, retired={NODES[6]: 0, NODES[7]: 1}),
+    replace(WHOLE, faded={NODES[0]: np.zeros(len(CONTENTS[0].node.landmarks), bool)}),  # type: ignore[union-attr]
+])  # fmt: skip
 def test_another_map_has_another_hash(other: MapFile):
     assert content_hash(other) != content_hash(WHOLE)
 

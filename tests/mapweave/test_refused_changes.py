@@ -6,12 +6,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from mapweave import Edge, EdgeKind, MapId, NodeId, Pose2, PoseGaussian, read_map_file, write_map_file
 from mapweave.cli import main
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.explanation import MARGINAL
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.base_map import BaseMap
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.entry import words_of
@@ -21,7 +19,6 @@ from mapweave.mapserver.own_maps import marginal_links
 from mapweave.mapserver.server import MapServer
 from mapweave.merge.pose_graph.links import Link
 from mapweave.opened_map import open_map
-from mapweave.storage.map_file import read_map_file, write_map_file
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 from synthetic.maps import LOG_ID, entries_of, fill_store, looked_around

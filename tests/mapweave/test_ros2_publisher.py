@@ -10,12 +10,10 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import pytest
 
+from mapweave import MissionKind, NodeId, Pose2
 from mapweave.agent.drivers.checked import CheckedRobot
 from mapweave.agent.mission import Carried
 from mapweave.commands.agent import open_robot, ros2_link
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.pose import Pose2
 from mapweave.processes import ros2_publisher
 from mapweave.processes.agent import AgentOptions
 from mapweave.processes.agent_process import run_agent

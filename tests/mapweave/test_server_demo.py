@@ -14,11 +14,8 @@ from urllib.request import Request, urlopen
 import pytest
 from websockets.sync.client import connect
 
-from mapweave.fleet import Fleet
+from mapweave import Fleet, MissionState, Node, NodeId
 from mapweave.hybridmap.change import NodePut
-from mapweave.hybridmap.ids import NodeId
-from mapweave.hybridmap.mission_order import MissionState
-from mapweave.hybridmap.node import Node
 from mapweave.mapserver.http.last_shown import NOTHING
 from mapweave.mapserver.http.live import NOT_THERE
 from mapweave.mapserver.merging.merger import Merger

@@ -13,12 +13,11 @@ from urllib.request import urlopen
 import pytest
 from websockets.sync.client import connect
 
+from mapweave import MapFile, MapId, write_map_file
 from mapweave.agent.replication.journal import Journal
 from mapweave.commands.server import summary_of
-from mapweave.hybridmap.ids import MapId
 from mapweave.mapserver.http.live import LOADING, NOT_THERE
 from mapweave.mapserver.log.sqlite_store import SqliteStore
-from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.wire.log_messages import Scalar
 from synthetic.maps import looked_around
 from tests.programs import going

@@ -24,16 +24,13 @@ from argcomplete.finders import CompletionFinder
 from rich.console import Console
 from rich.table import Table
 
-from mapweave import terminal
+from mapweave import HybridMap, MapFile, MapId, terminal, write_map_file
 from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.cheat_sheet import as_markdown
 from mapweave.cli import main, parser
 from mapweave.commands.completion import SHELLS
 from mapweave.commands.examples import EXAMPLES
 from mapweave.exit_status import FAILED, USAGE
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId
-from mapweave.storage.map_file import MapFile, write_map_file
 from mapweave.storage.os_errors import NO_ROOM
 from mapweave.terminal import EVERY, PLAIN_WIDTH, Bar, EventLog, plain_or_terminal, tracked
 from synthetic.maps import looked_around, write_store
@@ -416,15 +413,12 @@ def test_a_command_whose_stdout_is_closed_does_its_work():
     assert (done.stderr, done.returncode) == (b"", 0)
 
 
-@pytest.mark.parametrize(
-    ("name", "encoding", "printed"),
-    [
-        (b"B\xfcro.mapweave", "utf-8", r"B\udcfcro.mapweave"),
-        ("Büro.mapweave".encode(), "ascii", r"B\xfcro.mapweave"),
-        ("Büro.mapweave".encode(), "utf-8", "Büro.mapweave"),
-        ("Büro.mapweave".encode(), "ascii:surrogateescape", r"B\xfcro.mapweave"),  # as of the locale C
-    ],
-)
+@pytest.mark.parametrize(("name", "encoding", "printed"), [
+    (b"B\xfcro.mapweave", "utf-8", r"B\udcfcro.mapweave"),
+    ("Büro.mapweave".encode(), "ascii", r"B\xfcro.mapweave"),
+    ("Büro.mapweave".encode(), "utf-8", "Büro.mapweave"),
+    ("Büro.mapweave".encode(), "ascii:surrogateescape", r"B\xfcro.mapweave"),  # as of the locale C
+])  # fmt: skip
 def test_a_name_that_the_locale_cannot_show_is_shown_by_its_codes(
     name: bytes, encoding: str, printed: str, tmp_path
 ):

@@ -9,9 +9,8 @@ import sys
 import numpy as np
 import pytest
 
-from mapweave.agent.observation import Command
+from mapweave import Command, Pose2
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.pose import Pose2
 from mapweave.sim.body import BodySettings
 from mapweave.sim.robots import RobotSetup, camera_from_table
 from mapweave.sim.simulation import Simulation

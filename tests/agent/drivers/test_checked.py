@@ -9,9 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
+from mapweave import Camera, Command, Observation, Odometry, RobotDescription
 from mapweave.agent.drivers.checked import FIRST, CheckedRobot
-from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError
 
 DESCRIPTION = RobotDescription(
@@ -51,34 +50,31 @@ def good(**changes: Any) -> Observation:
     return replace(GOOD, **changes)
 
 
-@pytest.mark.parametrize(
-    ("seen", "words"),
-    [
-        (good(image=np.zeros((48, 64, 3), np.uint8)), "image has 3 channels; it must be grey"),
-        (good(image=np.zeros((48, 64), np.float32)), r"image must be \(H, W\) uint8, not .* float32"),
-        (good(image=np.zeros((480, 640), np.uint8)), "image is 640x480 px, but .* described as 64x48"),
-        (good(image="frame.png"), "image must be an array, not str"),
-        (good(stamp_ns=time.time()), "stamp_ns .* is float; it must be whole nanoseconds"),
-        (good(stamp_ns=round(NOW_S)), "stamp_ns 1795000000 are seconds since 1970; it must be nanoseconds"),
-        (good(stamp_ns=round(NOW_S * 1e3)), "stamp_ns .* are milliseconds since 1970"),
-        (good(stamp_ns=round(NOW_S * 1e6)), "stamp_ns .* are microseconds since 1970"),
-        (good(odometry=Odometry(math.nan, 0.0)), "odometry is not finite: nan m, 0 rad"),
-        (good(odometry=Odometry(0.0, math.inf)), "odometry is not finite"),
-        (good(proximity=np.ones(4)), r"proximity has 4 readings, but describe\(\) gives 5 ranger_bearings"),
-        (good(proximity=np.ones((5, 2))), "proximity must be an array of one distance for each bearing"),
-        (good(odometry=None), "odometry must be an Odometry, not None"),
-        (good(odometry=(0.1, 0.0)), "odometry must be an Odometry, not tuple"),
-        (good(odometry=Odometry("0.1", 0.0)), "odometry must be two numbers, m and rad, not '0.1' and 0.0"),  # type: ignore[arg-type]
-        (good(odometry=Odometry(1e300, 0.0)), "odometry is no motion in a tick: 1e\\+300 m, 0 rad"),
-        (good(bumped=None), "bumped must be True or False, not None"),
-        (good(kidnapped=1), "kidnapped must be True or False, not 1"),
-        (good(proximity=[1.0] * 5), "proximity must be an array, not list"),
-        (good(proximity=np.full(5, "1")), "proximity must be an array of one distance for each bearing"),
-        (good(battery=80), "battery is 80; it must be a share from 0 to 1, or None"),
-        (good(battery="full"), "battery is 'full'; it must be a share from 0 to 1, or None"),
-        ((GOOD,), r"sense\(\) must return an Observation or None, not tuple"),
-    ],
-)
+@pytest.mark.parametrize(("seen", "words"), [
+    (good(image=np.zeros((48, 64, 3), np.uint8)), "image has 3 channels; it must be grey"),
+    (good(image=np.zeros((48, 64), np.float32)), r"image must be \(H, W\) uint8, not .* float32"),
+    (good(image=np.zeros((480, 640), np.uint8)), "image is 640x480 px, but .* described as 64x48"),
+    (good(image="frame.png"), "image must be an array, not str"),
+    (good(stamp_ns=time.time()), "stamp_ns .* is float; it must be whole nanoseconds"),
+    (good(stamp_ns=round(NOW_S)), "stamp_ns 1795000000 are seconds since 1970; it must be nanoseconds"),
+    (good(stamp_ns=round(NOW_S * 1e3)), "stamp_ns .* are milliseconds since 1970"),
+    (good(stamp_ns=round(NOW_S * 1e6)), "stamp_ns .* are microseconds since 1970"),
+    (good(odometry=Odometry(math.nan, 0.0)), "odometry is not finite: nan m, 0 rad"),
+    (good(odometry=Odometry(0.0, math.inf)), "odometry is not finite"),
+    (good(proximity=np.ones(4)), r"proximity has 4 readings, but describe\(\) gives 5 ranger_bearings"),
+    (good(proximity=np.ones((5, 2))), "proximity must be an array of one distance for each bearing"),
+    (good(odometry=None), "odometry must be an Odometry, not None"),
+    (good(odometry=(0.1, 0.0)), "odometry must be an Odometry, not tuple"),
+    (good(odometry=Odometry("0.1", 0.0)), "odometry must be two numbers, m and rad, not '0.1' and 0.0"),  # type: ignore[arg-type]
+    (good(odometry=Odometry(1e300, 0.0)), "odometry is no motion in a tick: 1e\\+300 m, 0 rad"),
+    (good(bumped=None), "bumped must be True or False, not None"),
+    (good(kidnapped=1), "kidnapped must be True or False, not 1"),
+    (good(proximity=[1.0] * 5), "proximity must be an array, not list"),
+    (good(proximity=np.full(5, "1")), "proximity must be an array of one distance for each bearing"),
+    (good(battery=80), "battery is 80; it must be a share from 0 to 1, or None"),
+    (good(battery="full"), "battery is 'full'; it must be a share from 0 to 1, or None"),
+    ((GOOD,), r"sense\(\) must return an Observation or None, not tuple"),
+])  # fmt: skip
 def test_a_wrong_observation(seen: Any, words: str):
     with pytest.raises(DeviceError, match=f"^driver: {words}") as error:
         checked(seen).sense()
@@ -217,13 +213,10 @@ def at(tick: int, forward: float, turn: float = 0.0) -> Observation:
     return good(stamp_ns=NOW_NS + tick * 100_000_000, odometry=Odometry(forward, turn))
 
 
-@pytest.mark.parametrize(
-    ("motion", "words"),
-    [
-        (Odometry(30.0, 0.0), "30 m in 0.1 s, but .* at most 0.3 m/s"),  # millimetres
-        (Odometry(0.0, -4.5), "-4.5 rad in 0.1 s, but .* at most 0.8 rad/s"),  # degrees
-    ],
-)
+@pytest.mark.parametrize(("motion", "words"), [
+    (Odometry(30.0, 0.0), "30 m in 0.1 s, but .* at most 0.3 m/s"),  # millimetres
+    (Odometry(0.0, -4.5), "-4.5 rad in 0.1 s, but .* at most 0.8 rad/s"),  # degrees
+])  # fmt: skip
 def test_odometry_in_another_unit_shows_when_the_robot_first_moves(motion: Odometry, words: str):
     robot = checked(at(0, 0.0), *(at(k, 0.0) for k in range(1, 40)), replace(at(40, 0.0), odometry=motion))
     for _ in range(40):

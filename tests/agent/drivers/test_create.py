@@ -4,9 +4,8 @@ from typing import Any
 
 import pytest
 
+from mapweave import Command, Robot
 from mapweave.agent.drivers.create import CreateBase
-from mapweave.agent.drivers.robot import Robot
-from mapweave.agent.observation import Command
 from mapweave.hybridmap.errors import DeviceError
 from tests.agent.drivers.contract import RobotContract, drive, drive_until, drive_way, until
 from tests.agent.drivers.emulators import ArduinoSketch, Create2

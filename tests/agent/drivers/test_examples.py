@@ -75,7 +75,7 @@ def test_the_remote_base_answers_an_agent():
         router.close()
 
 
-def test_the_remote_base_without_a_router_ends_in_one_line() -> None:
+def test_the_remote_base_without_a_router_ends_in_one_line():
     """Zenoh's traceback named a file of its author's computer."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     ran = subprocess.run(

@@ -175,22 +175,19 @@ def test_settings_go_over_what_the_driver_knows():
     assert description.camera.mount_forward == 0.1
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (
-            "[robot.geometry]\naxle = -1",
-            "robot.toml: robot.geometry.axle must be a number, above 0; it is -1",
-        ),
-        (
-            "[robot.camera]\nwidth = 640\nheight = 480\nfx = 600.0\nfy = 600.0\ncx = 320.0\ncy = 240.0\n"
-            "height_m = 300\n",
-            "height_m is 300; it is in metres, from 0 to 10",
-        ),
-        ("[robot.geometry]\naxle = 150", "robot.toml: geometry: axle is 150; it is in metres, at most 10"),
-        ('[robot]\ndrivr = "koala"', "'drivr'; did you mean 'driver'"),
-    ],
-)
+@pytest.mark.parametrize(("text", "words"), [
+    (
+        "[robot.geometry]\naxle = -1",
+        "robot.toml: robot.geometry.axle must be a number, above 0; it is -1",
+    ),
+    (
+        "[robot.camera]\nwidth = 640\nheight = 480\nfx = 600.0\nfy = 600.0\ncx = 320.0\ncy = 240.0\n"
+        "height_m = 300\n",
+        "height_m is 300; it is in metres, from 0 to 10",
+    ),
+    ("[robot.geometry]\naxle = 150", "robot.toml: geometry: axle is 150; it is in metres, at most 10"),
+    ('[robot]\ndrivr = "koala"', "'drivr'; did you mean 'driver'"),
+])  # fmt: skip
 def test_wrong_values_are_one_line(text: str, words: str, tmp_path):
     (tmp_path / "robot.toml").write_text(text)
     with pytest.raises(SettingsError) as error:

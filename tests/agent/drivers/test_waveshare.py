@@ -13,11 +13,10 @@ from typing import Any
 
 import pytest
 
+from mapweave import Command, Robot
 from mapweave.agent.drivers.base import Wheels
-from mapweave.agent.drivers.robot import Robot
 from mapweave.agent.drivers.settings import CameraSettings, RobotSettings
 from mapweave.agent.drivers.waveshare import HttpLine, SerialLine, Waveshare, WaveshareBase
-from mapweave.agent.observation import Command
 from mapweave.hybridmap.errors import DeviceError, SettingsError
 from tests.agent.drivers.contract import RobotContract, drive, drive_until
 from tests.agent.drivers.waveshare_emulators import UgvHttp, UgvSerial

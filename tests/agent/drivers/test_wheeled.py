@@ -220,22 +220,19 @@ class Reads(EvenBase):
         self.read = read  # type: ignore[method-assign]
 
 
-@pytest.mark.parametrize(
-    ("read", "words"),
-    [
-        (lambda: None, r"read\(\) must return a BaseReading, not None"),
-        (lambda: BaseReading((0.0, 0.0)), r"read\(\): way must be Wheels, not tuple"),  # type: ignore[arg-type]
-        (lambda: BaseReading(Wheels("1", "2")), r"read\(\): way must be two finite numbers, not '1' and '2'"),  # type: ignore[arg-type]
-        (lambda: BaseReading(Wheels(), bumped=None), r"read\(\): bumped must be True or False, not None"),  # type: ignore[arg-type]
-        (
-            lambda: BaseReading(Wheels(), stamp_ns=1_700_000_000),
-            r"read\(\): stamp_ns is 1700000000; it must be",
-        ),
-        (lambda: BaseReading(Wheels(), stamp_ns=1.7e18), r"read\(\): stamp_ns is 1.7e\+18; it must be"),  # type: ignore[arg-type]
-        (lambda: 1 / 0, r".*test_wheeled.py, line \d+: ZeroDivisionError"),
-        (lambda: sys.exit("no board"), r".*test_wheeled.py, line \d+: SystemExit: no board"),
-    ],
-)
+@pytest.mark.parametrize(("read", "words"), [
+    (lambda: None, r"read\(\) must return a BaseReading, not None"),
+    (lambda: BaseReading((0.0, 0.0)), r"read\(\): way must be Wheels, not tuple"),  # type: ignore[arg-type]
+    (lambda: BaseReading(Wheels("1", "2")), r"read\(\): way must be two finite numbers, not '1' and '2'"),  # type: ignore[arg-type]
+    (lambda: BaseReading(Wheels(), bumped=None), r"read\(\): bumped must be True or False, not None"),  # type: ignore[arg-type]
+    (
+        lambda: BaseReading(Wheels(), stamp_ns=1_700_000_000),
+        r"read\(\): stamp_ns is 1700000000; it must be",
+    ),
+    (lambda: BaseReading(Wheels(), stamp_ns=1.7e18), r"read\(\): stamp_ns is 1.7e\+18; it must be"),  # type: ignore[arg-type]
+    (lambda: 1 / 0, r".*test_wheeled.py, line \d+: ZeroDivisionError"),
+    (lambda: sys.exit("no board"), r".*test_wheeled.py, line \d+: SystemExit: no board"),
+])  # fmt: skip
 def test_a_base_that_reads_wrongly_from_the_start(
     read: Callable[[], Any], words: str, camera: LateCamera, monkeypatch, opened
 ):

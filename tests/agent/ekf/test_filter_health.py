@@ -14,7 +14,7 @@ def asked(converged: bool, watch: FilterHealth) -> Health:
     return watch.health(lambda: converged)[0]
 
 
-def test_parallax_is_counted_from_where_landmarks_were_taken_up() -> None:
+def test_parallax_is_counted_from_where_landmarks_were_taken_up():
     watch = FilterHealth(focal=250.0)
     for x in (0.02, 0.04, 0.049):
         watch.moved(np.array([x, 0.0, 0.1]))
@@ -30,7 +30,7 @@ def test_parallax_is_counted_from_where_landmarks_were_taken_up() -> None:
     assert asked(False, watch) is Health.NO_PARALLAX
 
 
-def test_the_base_stays_where_it_is_under_a_new_anchor() -> None:
+def test_the_base_stays_where_it_is_under_a_new_anchor():
     watch = FilterHealth(focal=250.0)
     watch.took_up(np.array([0.3, 0.2, 0.0]))
     new = Pose2(0.34, 0.2, 2.0)
@@ -41,7 +41,7 @@ def test_the_base_stays_where_it_is_under_a_new_anchor() -> None:
     assert "40 mm" in watch.health(lambda: False)[1]
 
 
-def test_missing_images_are_reported_first() -> None:
+def test_missing_images_are_reported_first():
     watch = FilterHealth(focal=250.0)
     watch.saw(Health.FEW, "2 are left")
     watch.moved(np.zeros(3))
@@ -50,7 +50,7 @@ def test_missing_images_are_reported_first() -> None:
     assert watch.health(lambda: True) == (Health.NO_IMAGE, "no image for 2 steps")
 
 
-def test_refuted_wheels_get_more_noise_for_a_while() -> None:
+def test_refuted_wheels_get_more_noise_for_a_while():
     noise = WheelNoise(0.24, 0.02)
     trust = AdaptiveOdometryNoise(noise, 0.0)
     step, stands = Odometry(0.1, 0.0), Odometry(0.0, 0.0)

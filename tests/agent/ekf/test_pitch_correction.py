@@ -55,7 +55,7 @@ def error(run: MappingRun, filter_: MappingFilter) -> float:
 
 
 @pytest.mark.parametrize("pitch", [0.004, 0.02, -0.02])
-def test_the_pitch_correction_agrees_with_a_pitched_camera(pitch: float) -> None:
+def test_the_pitch_correction_agrees_with_a_pitched_camera(pitch: float):
     rng = np.random.default_rng(1)
     run = draw_run(rng, steps=1)
     still, nods = (seen_pitched(CAMERA, Pose2(), run.points, item) for item in (0.0, pitch))
@@ -70,7 +70,7 @@ def test_the_pitch_correction_agrees_with_a_pitched_camera(pitch: float) -> None
     np.testing.assert_allclose(result.offsets, innovations, atol=atol)
 
 
-def test_offsets_within_the_filters_covariance_are_no_pitch() -> None:
+def test_offsets_within_the_filters_covariance_are_no_pitch():
     slopes = np.random.default_rng(2).uniform(-0.4, 0.4, (20, 2))
     together = np.tile([0.0, 0.01], (20, 1))
     sure, unsure = 1e-6 * np.eye(40), 1e-6 * np.eye(40) + 0.01**2
@@ -80,7 +80,7 @@ def test_offsets_within_the_filters_covariance_are_no_pitch() -> None:
     assert pitch_offset(together[:few], sure[: 2 * few, : 2 * few], slopes[:few]) is None
 
 
-def test_landmarks_of_unknown_depth_hide_no_pitch() -> None:
+def test_landmarks_of_unknown_depth_hide_no_pitch():
     """New ones go up or down by themselves while the robot drives: what the sure ones show counts."""
     slopes = np.random.default_rng(3).uniform(-0.4, 0.4, (24, 2))
     innovations = np.tile([0.0, 0.01], (24, 1))
@@ -105,7 +105,7 @@ def on_a_slope(run: MappingRun, pitch: float, begin: int, end: int) -> MappingRu
 
 
 @pytest.mark.parametrize("pitch", [0.02, -0.02])
-def test_landmarks_from_before_and_from_after_a_bend_of_the_floor_agree(pitch: float) -> None:
+def test_landmarks_from_before_and_from_after_a_bend_of_the_floor_agree(pitch: float):
     """Those that come in after it are seen by a camera that looks elsewhere than those from before show.
 
     They were two parties that refused each other, one of which won: the other was lost, or the pose jumped.
@@ -133,7 +133,7 @@ def test_landmarks_from_before_and_from_after_a_bend_of_the_floor_agree(pitch: f
 
 
 @pytest.mark.parametrize("shape", first_quick(["arc", "weave"], 0))
-def test_a_filter_lives_through_nods(shape: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_filter_lives_through_nods(shape: str, monkeypatch):
     """Nods of 0.5 degrees, 2.4 px: as good within a half as without any, where it failed before."""
     errors = {"without": [], "nods": [], "unaware": []}
     failures = {"nods": 0, "unaware": 0}
@@ -155,7 +155,7 @@ def test_a_filter_lives_through_nods(shape: str, monkeypatch: pytest.MonkeyPatch
     assert rms["nods"] < 1.5 * rms["without"] + 0.005
 
 
-def test_without_pitch_nothing_changes(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pitch_nothing_changes(monkeypatch):
     runs = [draw_run(np.random.default_rng(seed), "arc", 120) for seed in range(6)]
     with_nods = [mapped(run)[0].pose.mean.vector for run in runs]
     monkeypatch.setattr(mapping_filter, "pitch_offset", lambda *_: None)

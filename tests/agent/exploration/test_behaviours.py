@@ -1,7 +1,5 @@
 """The moves of exploration, of a robot that moves just as commanded."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
@@ -61,7 +59,7 @@ class View:
         return True
 
 
-def test_a_robot_whose_wheels_are_stuck_stands_and_tries_again() -> None:
+def test_a_robot_whose_wheels_are_stuck_stands_and_tries_again():
     """Before, it turned for ever, and its motors with it."""
     view, first, longest = View(), *STUCK_PAUSE
     moves = ExplorationBehaviours(BODY, view, ExplorerSettings())  # type: ignore[arg-type]
@@ -96,7 +94,7 @@ def test_a_robot_whose_wheels_are_stuck_stands_and_tries_again() -> None:
     assert ticks <= 2
 
 
-def test_what_blocks_the_way_for_a_while_is_tried_again(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_blocks_the_way_for_a_while_is_tried_again(monkeypatch):
     """Before, a place before which a person stood was avoided for good, and the map remained without it."""
     goal, tried, view = np.array([4.0, 0.0]), list[float](), View(anchor_features=0)
 
@@ -137,7 +135,7 @@ def test_what_blocks_the_way_for_a_while_is_tried_again(monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("tick", [0.1, 0.05, 0.02])
-def test_a_drive_comes_back_and_a_turn_ends_at_any_rate_of_ticks(tick: float) -> None:
+def test_a_drive_comes_back_and_a_turn_ends_at_any_rate_of_ticks(tick: float):
     """Before, a drive had 64 ticks: at 20 Hz it ended half way, and no depth had converged."""
     body, view = replace(BODY, tick=tick), View()
     moves = ExplorationBehaviours(body, view, ExplorerSettings())  # type: ignore[arg-type]

@@ -1,7 +1,5 @@
 """Exploration: what others have mapped is not mapped again, and the paper's way by chance."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 
@@ -165,7 +163,7 @@ def test_where_it_was_moves_with_the_map_when_a_loop_closes(closed):
     assert explorer._own_views[0, :2] == pytest.approx(been[0])
 
 
-def test_a_loop_that_no_node_closes_is_closed_before_it_is_done(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_loop_that_no_node_closes_is_closed_before_it_is_done(monkeypatch):
     """Before, a robot that had seen all around a ring was complete, and its map had two open ends."""
     monkeypatch.setattr("mapweave.agent.exploration.explorer.next_viewpoint", lambda *_: [])
     (floor, *_) = drawn()

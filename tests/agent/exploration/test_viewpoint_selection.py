@@ -1,7 +1,5 @@
 """Room to move and places that are known, against counting by hand and brute force."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

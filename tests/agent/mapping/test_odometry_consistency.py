@@ -35,15 +35,12 @@ def test_slightly_wrong_wheels_are_accepted(moves, longer, wider):
     assert not disputed(dispute, true)
 
 
-@pytest.mark.parametrize(
-    ("wheels", "contradict"),
-    [
-        (lambda m: m, False),
-        (lambda m: Odometry(0.0, 0.0), True),  # dead encoders
-        (lambda m: Odometry(m.forward, 0.0), True),  # the room seems to turn, the wheels do not
-        (lambda m: Odometry(2.0 * m.forward, m.turn), True),  # wheels that spin
-    ],
-)
+@pytest.mark.parametrize(("wheels", "contradict"), [
+    (lambda m: m, False),
+    (lambda m: Odometry(0.0, 0.0), True),  # dead encoders
+    (lambda m: Odometry(m.forward, 0.0), True),  # the room seems to turn, the wheels do not
+    (lambda m: Odometry(2.0 * m.forward, m.turn), True),  # wheels that spin
+])  # fmt: skip
 def test_wheels_and_images_that_cannot_both_be_right(wheels, contradict):
     moves = [Odometry(0.02, 0.03)] * 40
     dispute, true = drive(moves, wheels)

@@ -1,7 +1,5 @@
 """How far tracks are from where the filter expects them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapweave.agent.mapping.tracking import PredictionOffset

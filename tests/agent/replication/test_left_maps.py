@@ -14,6 +14,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
+from mapweave import HybridMap, MapId, NodeId, Pose2
 from mapweave.agent.replication import left_maps
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.left_maps import LeftMaps
@@ -21,9 +22,6 @@ from mapweave.agent.replication.replicator import Replicator
 from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.hybridmap.change import ChangeBody, NodePut
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.log.ingest import Ingest
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.merging.pruning import DAY_NS

@@ -7,15 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from mapweave import Camera, Edge, EdgeKind, HybridMap, Landmarks, MapId, Node, NodeId, Pose2, PoseGaussian
 from mapweave.agent.replication.journal import Journal
 from mapweave.agent.replication.retained_map import RetainedMap
-from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.change import ChangeBody, EdgePut, EdgeRetired, NodePut, NodeRetired
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Edge, EdgeKind, Landmarks, Node
-from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.wire.codec import encode_body
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25)

@@ -8,15 +8,13 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import MapId, MissionKind, NodeId, Pose2
 from mapweave.agent.mapping.view import RawImage
 from mapweave.agent.replication import view_keeper
 from mapweave.agent.replication.view_keeper import MOST_WAITING, ViewKeeper
 from mapweave.agent.settings import AgentSettings
 from mapweave.hybridmap.change import NodeRetired
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage
-from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.mission_order import MissionKind
-from mapweave.hybridmap.pose import Pose2
 from mapweave.hybridmap.view_image import MAX_BYTES, ViewImage, ViewRequest
 from mapweave.processes.agent import Agent, AgentOptions
 from mapweave.storage.view_file import view_file

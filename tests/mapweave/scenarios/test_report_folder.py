@@ -11,14 +11,13 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave import HybridMap, read_map_file
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.scenarios.error_plot import _labels
 from mapweave.scenarios.expectations import check, parse_expectations
 from mapweave.scenarios.recording import TrialEvent
 from mapweave.scenarios.report_folder import write_folder
 from mapweave.scenarios.score import TrialResult, score
-from mapweave.storage.map_file import read_map_file
 from tests.mapweave.scenarios.conftest import stage, stage_events
 from tests.programs import python
 
