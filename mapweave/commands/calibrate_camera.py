@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
+from math import isfinite
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -91,7 +92,7 @@ def run(arguments: argparse.Namespace) -> int:
     if not collection.views:
         raise Refused(
             f"{a.images or f'camera {source}'}: no view shows the target ({collection.detector.target}); "
-            "is it this one?"
+            "is it this one, whole and sharp?"
         )
     found = collection.done or calibrate_camera(collection.views, model)
     _print(found, console)
@@ -220,7 +221,8 @@ def _print(found: CameraCalibration, console: Console) -> None:
     console.print(table)
     console.print(bars(found.coverage))
     for model, error in found.compared.items():
-        console.print(f"views held out, {model}: corners {error:.2f} px off")
+        if isfinite(error):
+            console.print(f"views held out, {model}: corners {error:.2f} px off")
     console.print(
         f"{found.coverage.views} views, {found.outliers} corners left out, noise of a corner "
         f"{fit.sigma_px:.2f} px; "
@@ -235,8 +237,13 @@ def _report(found: CameraCalibration, written: bool) -> dict[str, Any]:
         "views": found.coverage.views,
         "outliers": found.outliers,
         "corner_sigma_px": found.fit.sigma_px,
-        "uncertainty_px": found.worst_px,
-        "held_out_px": {str(model): error for model, error in found.compared.items()},
+        "uncertainty_px": _or_null(found.worst_px),
+        "held_out_px": {str(model): _or_null(error) for model, error in found.compared.items()},
         "problems": list(found.problems),
         "written": written,
     }
+
+
+def _or_null(value: float) -> float | None:
+    """The value; None if it is infinite, which JSON has no number for."""
+    return value if isfinite(value) else None

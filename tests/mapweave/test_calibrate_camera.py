@@ -110,6 +110,16 @@ def test_images_become_settings_that_an_agent_reads(name, true, frames, capfd, t
     assert np.linalg.norm(off[seen] - np.median(off[seen], axis=0), axis=1).mean() < 0.4
 
 
+def test_of_three_images_the_report_is_json_and_says_what_is_missing(frames, capfd, tmp_path):
+    """No part of so few can be held out: that error was Infinity, which no other program reads."""
+    images = folder_of(frames["pinhole"][::12][:3], tmp_path / "views")
+    assert main(["calibrate", "camera", str(images), "--height", "0.25", "--json", *OPTIONS]) == NO
+    output = capfd.readouterr()
+    report = json.loads(output.out.splitlines()[-1], parse_constant=pytest.fail)
+    assert set(report["held_out_px"].values()) == {None}
+    assert "px off" not in output.err and "show the board at least 4 times" in output.err
+
+
 class EmulatedCamera:
     """Gives the frames one by one, each twice, as a person holds the board still."""
 

@@ -22,6 +22,8 @@ MOST_VIEWS = 50
 """More add time, not accuracy."""
 FOLDS = 5
 """Parts into which the views are cut; each is held out once."""
+LEAST_VIEWS = 4
+"""Two parts of two views."""
 MUCH_BETTER = 0.9
 """An equidistant lens is taken if it explains held out views with less than this of the other's error."""
 MOST_ERROR = 0.7
@@ -130,9 +132,9 @@ def held_out_error(
         judged: for each view, (N,) which corners count.
     """
     used = [k for k, kept in enumerate(judged) if kept.any()]
-    folds = min(FOLDS, len(used) // 2)
-    if folds < 2:
+    if len(used) < LEAST_VIEWS:
         return math.inf
+    folds = min(FOLDS, len(used) // 2)
     squares, count = 0.0, 0
     for part in range(folds):
         held = used[part::folds]
@@ -189,7 +191,9 @@ def _problems(
             f"projections are uncertain by {worst:.2f} px in the {place}, {limit:.2g} px are "
             "good: more views there, near and tilted"
         )
-    if not held_out <= limit:
+    if math.isinf(held_out):
+        problems.append(f"none of so few views can be held out: show the board at least {LEAST_VIEWS} times")
+    elif not held_out <= limit:
         problems.append(
             f"corners of views held out are {held_out:.2f} px off, {limit:.2g} px are good: is "
             "the board flat and still, the image sharp, and the lens of this kind?"

@@ -135,6 +135,9 @@ def test_sets_that_cannot_be_right_are_refused() -> None:
     uncertain = refused(corner_views(rng, PINHOLE, 15, 0.4))
     assert "projections are uncertain by" in uncertain and "more views there" in uncertain
     views = corner_views(rng, PINHOLE, 12, 0.1)
+    few = refused(views[:3])
+    assert "none of so few views can be held out: show the board at least 4 times" in few
+    assert "inf" not in few and "is the board flat" not in few
     with pytest.raises(InvalidValue, match="2 views of the target; three are the least"):
         calibrate_camera(views[:2])
     with pytest.raises(InvalidValue, match="images of different sizes: 320x240, 640x480"):
