@@ -43,8 +43,13 @@ def test_a_wrong_use_is_one_line_that_names_the_help(arguments, capfd):
     ("serve", "did you mean `mapweave server`?"),
     ("map shw office.mapweave", "did you mean `mapweave map show`?"),
     ("fly", "`mapweave --help` lists them"),
+    ("server --store maps.sqlite", "a file needs no --store: it is in the folder of --data"),
+    ("place add hall r0.1.1 --radius nan", "--radius nan: give metres, more than 0 and less than 10000"),
+    ("place add hall r0.1.1 --radius -1", "--radius -1: give metres, more than 0 and less than 10000"),
+    ("go r0 1.0 0.5", "goal '1.0': this is a map; a position has a comma and no blank, as 3.1,-2.0"),
+    ("go r0 r1.3", "goal 'r1.3': this is a map: give one of its nodes, r1.3.1 for example"),
 ])  # fmt: skip
-def test_a_command_that_is_none_is_refused_with_the_nearest(arguments, meant, capfd):
+def test_what_is_wrong_is_answered_with_what_is_right(arguments, meant, capfd):
     assert complaint(capfd, *arguments.split(), status=USAGE).endswith(meant)
 
 
@@ -91,17 +96,6 @@ def test_scenarios_that_cannot_be_run(arguments, words, capfd, closed, tmp_path)
         status = FAILED if words.endswith("no such file") else USAGE
         assert words in complaint(capfd, "sim", what[0], *arguments, *what[1:], status=status)
     assert not (tmp_path / "out" / "agents").exists()
-
-
-@pytest.mark.parametrize(("arguments", "words"), [
-    ("server --store maps.sqlite", "a file needs no --store: it is in the folder of --data"),
-    ("place add hall r0.1.1 --radius nan", "--radius nan: give metres, more than 0 and less than 10000"),
-    ("place add hall r0.1.1 --radius -1", "--radius -1: give metres, more than 0 and less than 10000"),
-    ("go r0 1.0 0.5", "goal '1.0': this is a map; a position has a comma and no blank, as 3.1,-2.0"),
-    ("go r0 r1.3", "goal 'r1.3': this is a map: give one of its nodes, r1.3.1 for example"),
-])  # fmt: skip
-def test_a_wrong_value_is_answered_with_what_is_right(arguments, words, capfd):
-    assert complaint(capfd, *arguments.split(), status=USAGE).endswith(words)
 
 
 @pytest.mark.slow

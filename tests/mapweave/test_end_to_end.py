@@ -43,10 +43,8 @@ def test_two_robots_map_and_one_finds_its_way_back(tmp_path, opened):
     bus = opened(ZenohBus(BusSettings(mode="client", endpoints=(endpoint,))))
     network = ["--fleet", "e2e", "--connect", endpoint]
     with Children(tmp_path / "logs") as children:
-        children.start(
-            "server",
-            ["server", "--fleet", "e2e", "--listen", endpoint, "--data", str(tmp_path / "server")],
-        )
+        data = str(tmp_path / "server")
+        children.start("server", ["server", "--fleet", "e2e", "--listen", endpoint, "--data", data])
         wait_for(bus.connected, 30, children, "no router")
         reports, control = Reports(bus, keys), SimControl(bus, "e2e")
         children.start("sim", ["sim", "serve", "office", "--set", "robots=2", "--seed", "11", *network])

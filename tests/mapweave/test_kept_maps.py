@@ -5,6 +5,7 @@ import sqlite3
 import threading
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
 
@@ -76,17 +77,12 @@ def network(tmp_path: Path) -> Iterator[tuple[Children, ZenohBus, str]]:
     """A server process with its router, a body, and an endpoint."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with Children(tmp_path / "logs") as children:
-        children.start(
-            "server", ["server", "--fleet", "kept", "--listen", endpoint, "--data", str(tmp_path / "server")]
-        )
-        bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
-        try:
-            asked = KEYS.server_status("s0")
+        data, asked = str(tmp_path / "server"), KEYS.server_status("s0")
+        children.start("server", ["server", "--fleet", "kept", "--listen", endpoint, "--data", data])
+        with closing(ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))) as bus:
             eventually(lambda: any(not reply.error for reply in bus.ask(asked, b"", 1.0)), PATIENCE)
             Body(bus)
             yield children, bus, endpoint
-        finally:
-            bus.close()
 
 
 @pytest.mark.slow

@@ -4,7 +4,7 @@ import json
 import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -374,15 +374,12 @@ def serving(folder: Path, port: int) -> Iterator[None]:
     endpoint = f"tcp/127.0.0.1:{port}"
     with Children(folder / "logs") as children:
         children.start("server", ["server", "--fleet", "why", "--listen", endpoint, "--data", str(folder)])
-        bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
-        try:
+        with closing(ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))) as bus:
             end = time.monotonic() + 90
             while not bus.connected():
                 children.check()
                 assert time.monotonic() < end
                 time.sleep(0.05)
-        finally:
-            bus.close()
         yield
         children.end("server")
 

@@ -1,5 +1,6 @@
 """`mapweave server --map FILE`: real agents begin anywhere, and their maps join the one that is loaded."""
 
+from contextlib import closing
 from pathlib import Path
 
 import pytest
@@ -24,11 +25,9 @@ def test_an_agent_begins_a_new_map_which_joins_the_loaded_one(tmp_path, capfd):
         endpoint = f"tcp/127.0.0.1:{free_port()}"
         at = ["--fleet", "kept", "--connect", endpoint]
         with Children(tmp_path / f"logs-{robot}") as children:
-            children.start(
-                "server", ["server", "--fleet", "kept", "--listen", endpoint, "--data", str(data), *more]
-            )
-            bus = ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))
-            try:
+            words = ["--fleet", "kept", "--listen", endpoint, "--data", str(data), *more]
+            children.start("server", ["server", *words])
+            with closing(ZenohBus(BusSettings(mode="client", endpoints=(endpoint,)))) as bus:
 
                 def ask(key: str) -> bytes | None:
                     children.check()
@@ -56,8 +55,6 @@ def test_an_agent_begins_a_new_map_which_joins_the_loaded_one(tmp_path, capfd):
                 said = capfd.readouterr().out
                 children.end("server")
                 return said
-            finally:
-                bus.close()
 
     mapped("r0", tmp_path / "first")
     loaded = tmp_path / "first" / "r0.1.mapweave"

@@ -25,6 +25,13 @@ class Rover:
 """
 
 
+WHEELED = """
+from mapweave.agent.drivers.wheeled import WheeledRobot
+class Rover(WheeledRobot):
+    def __init__(self, settings): self.settings = settings
+"""
+
+
 def test_shipped_drivers_are_listed_with_what_they_drive():
     listed = {robot.name: robot for robot in listing()}
     assert {"koala", "create", "waveshare", "arduino", "remote"} <= listed.keys()
@@ -107,40 +114,19 @@ def test_a_class_that_tells_no_signature(tmp_path):
     ("\n\nraise ValueError('no')\n", "Rover", "line 3: ValueError: no"),
     (CLASS.replace("act", "move"), "Rover", "lacks act"),
     ("Rover = 7\n", "Rover", "needs a class"),
+    (CLASS.replace("self, settings", "self"), "Rover",
+     r"^driver .*rover.py:Rover: __init__ must take one argument, the settings$"),
+    (CLASS.replace("self.settings = settings", "self.settings = settings.options['gate']"), "Rover",
+     r"^driver: .*rover.py, line \d+: KeyError: 'gate'$"),
+    (WHEELED, "Rover", r"^driver .*rover.py:Rover: __init__ must call super\(\).__init__\(base, settings\)"),
 ])  # fmt: skip
 def test_a_file_that_is_no_driver(text: str | None, name: str, words: str, tmp_path):
     path = tmp_path / "rover.py"
     if text is not None:
         path.write_text(text)
     with pytest.raises(DeviceError, match=words) as error:
-        find_driver(f"{path}:{name}")
+        find_driver(f"{path}:{name}")(RobotSettings())
     assert "\n" not in str(error.value)
-
-
-@pytest.mark.parametrize(("text", "words"), [
-    (CLASS.replace("self, settings", "self"),
-     r"^driver .*rover.py:Rover: __init__ must take one argument, the settings$"),
-    (CLASS.replace("self.settings = settings", "self.settings = settings.options['gate']"),
-     r"^driver: .*rover.py, line \d+: KeyError: 'gate'$"),
-])  # fmt: skip
-def test_a_constructor_that_fails(text: str, words: str, tmp_path):
-    path = tmp_path / "rover.py"
-    path.write_text(text)
-    with pytest.raises(DeviceError, match=words):
-        find_driver(f"{path}:Rover")(RobotSettings())
-
-
-def test_a_wheeled_robot_without_the_constructor_of_its_base_class(tmp_path):
-    """Before, the agent ended with a traceback from its `close`."""
-    path = tmp_path / "rover.py"
-    path.write_text(
-        "from mapweave.agent.drivers.wheeled import WheeledRobot\n"
-        "class Rover(WheeledRobot):\n"
-        "    def __init__(self, settings): self.settings = settings\n"
-    )
-    words = r"^driver .*rover.py:Rover: __init__ must call super\(\).__init__\(base, settings\)"
-    with pytest.raises(DeviceError, match=words):
-        find_driver(f"{path}:Rover")(RobotSettings())
 
 
 def test_the_example_says_which_option_it_lacks():

@@ -1,6 +1,7 @@
 """Which drives are measurements, and how precise: for a robot whose pose is given, with noise."""
 
 import math
+from typing import Any
 
 import numpy as np
 import pytest
@@ -36,13 +37,15 @@ class Landmarks(NodeLocalizer):
 
 
 class Drive:
-    """A robot on its way from A, whose wheels slip."""
+    """A robot on its way, whose wheels slip, after legs: what `by` takes."""
 
-    def __init__(self, seed: int = 0) -> None:
+    def __init__(self, *legs: tuple[Any, ...], seed: int = 0, begin: Pose2 = NODES[A]) -> None:
         self.rng = np.random.default_rng(seed)
         self.recorder = TraverseRecorder(ROBOT)
-        self.pose = NODES[A]
+        self.pose = begin
         self.measured: list[Traverse] = []
+        for leg in legs:
+            self.by(*leg)
 
     def by(self, node: NodeId | None, steps: int, odometry: Odometry = STEP, count: int = 12) -> None:
         """Drive some steps with a node's landmarks in sight; without any, by wheels alone."""
@@ -69,9 +72,7 @@ class Drive:
 
 
 def test_a_traverse_is_reported_when_the_next_node_is_reached():
-    drive = Drive()
-    drive.by(A, 20)
-    drive.by(B, 10)
+    drive = Drive((A, 20), (B, 10))
     assert not drive.ends, "the next node is in sight, but far"
     drive.by(B, 60)
     assert drive.ends == [(A, B)]
@@ -82,18 +83,13 @@ def test_traverse_errors_match_the_covariance(monkeypatch):
     monkeypatch.setattr(traverse, "FLOOR", (0.0, 0.0))
     nees = []
     for seed in range(60):
-        drive = Drive(seed)
-        drive.by(A, 20)
-        drive.by(None, 10)
-        drive.by(B, 60)
-        [measured] = drive.measured
+        [measured] = Drive((A, 20), (None, 10), (B, 60), seed=seed).measured
         nees.append(measured.start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[B]))
     assert 1.0 < np.mean(nees) < 4.0
 
 
 def test_a_node_that_was_not_come_near_is_passed_over():
-    drive = Drive()
-    drive.by(A, 20)
+    drive = Drive((A, 20))
     drive.by(B, 5, count=7)
     drive.by(C, 130)
     [traverse] = drive.measured
@@ -102,34 +98,22 @@ def test_a_node_that_was_not_come_near_is_passed_over():
 
 
 def test_without_a_node_nearby_no_traverse_begins():
-    drive = Drive()
-    drive.pose = Pose2(-0.8)
-    drive.by(A, 10)
-    drive.by(B, 130)
-    assert not drive.ends
+    assert not Drive((A, 10), (B, 130), begin=Pose2(-0.8)).ends
 
 
 @pytest.mark.parametrize(("steps", "ends"), [(20, [(A, B)]), (30, [])])
 def test_a_gap_without_landmarks_must_be_short(steps, ends):
-    drive = Drive()
-    drive.by(A, 10)
-    drive.by(None, steps)
-    drive.by(B, 60)
-    assert drive.ends == ends
+    assert Drive((A, 10), (None, steps), (B, 60)).ends == ends
 
 
 def test_a_node_that_was_glimpsed_is_no_node():
-    drive = Drive()
-    drive.by(A, 10)
-    drive.by(B, 2)
-    drive.by(C, 130)
+    drive = Drive((A, 10), (B, 2), (C, 130))
     assert drive.ends == [(A, C)]
     assert drive.measured[0].start_from_end.mahalanobis2(NODES[A].inverse() @ NODES[C]) < CERTAIN
 
 
 def test_a_robot_lost_in_between_may_have_been_carried():
-    drive = Drive()
-    drive.by(A, 10)
+    drive = Drive((A, 10))
     drive.see(None)
     drive.pose = Pose2(1.5, 0.1)
     drive.by(B, 10)
@@ -139,16 +123,9 @@ def test_a_robot_lost_in_between_may_have_been_carried():
 
 
 def test_a_detour_does_not_measure_the_straight_way():
-    drive = Drive()
-    drive.by(A, 10)
-    drive.by(B, 60, Odometry(0.05, 2 * math.pi / 60))
-    drive.by(B, 80)
-    assert not drive.ends
+    assert not Drive((A, 10), (B, 60, Odometry(0.05, 2 * math.pi / 60)), (B, 80)).ends
 
 
 def test_imprecise_traverses_are_not_reported(monkeypatch):
     monkeypatch.setattr(traverse, "WIDEST", 0.015)
-    drive = Drive()
-    drive.by(A, 20)
-    drive.by(B, 60)
-    assert not drive.ends
+    assert not Drive((A, 20), (B, 60)).ends

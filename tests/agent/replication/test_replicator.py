@@ -65,6 +65,11 @@ class Agent:
         self.replicator = Replicator(self.bus, KEYS, self.journal, self.map, servers, QUICK)
         self.log_id = self.journal.log_id(self.map)
 
+    def commit(self, first: int, last: int) -> None:
+        """Changes that are on its disk then."""
+        self.replicator.submit(bodies(first, last), 0)
+        assert self.replicator.flush(30)
+
     def close(self) -> None:
         self.replicator.close()
         self.bus.close()
@@ -185,8 +190,7 @@ def test_a_flood_of_acknowledgements_holds_up_no_change_and_fills_no_memory(agen
 
 def test_a_server_that_lies_fills_no_log_and_no_memory(agent: Agent, hub: MemoryHub, caplog):
     """Garbage, refusals of changes that there are not, a new store each time, and any number of names."""
-    agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 3)
     liar, state = MemoryBus(hub), agent.replicator._logs[MAP]
     refusals = tuple(Refusal(sequence, "no") for sequence in range(4, 12))
     with caplog.at_level(logging.WARNING):
@@ -207,8 +211,7 @@ def test_a_server_that_lies_fills_no_log_and_no_memory(agent: Agent, hub: Memory
 
 def test_a_server_that_says_that_the_disk_was_put_back_is_believed(agent: Agent, hub: MemoryHub):
     """Its word alone ends that a map is sent; what is mapped reaches the own disk all the same."""
-    agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 3)
     liar = MemoryBus(hub)
     liar.publish(KEYS.ack("s0", "r0"), Ack(MAP, agent.log_id, 3, stored=StoredChange(3, 7)).encode())
     eventually(lambda: "begin a fresh map" in agent.replicator.status().failure)
@@ -246,8 +249,7 @@ def test_a_full_disk_that_takes_no_acknowledgement_either_is_one_line(
     agent: Agent, server: HandServer, monkeypatch, caplog
 ):
     """A server says again and again what it has, until the robot has noted it."""
-    agent.replicator.submit(bodies(1, 2), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 2)
     tries: list[int] = []
 
     def full(*_: object, **__: object) -> None:
@@ -319,8 +321,7 @@ def test_who_waits_for_acknowledgements_does_not_wait_for_beacons(agent: Agent, 
         time.sleep(20 * QUICK.beacon_interval)
         server.acknowledge(agent.log_id, sequence)
         assert agent.replicator.wait_acknowledged(30)
-    agent.replicator.submit(bodies(4, 4), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(4, 4)
     before = len(server.heads)
     began = time.monotonic()
     assert not agent.replicator.wait_acknowledged(30 * QUICK.beacon_interval)
@@ -331,8 +332,7 @@ def test_who_waits_for_acknowledgements_does_not_wait_for_beacons(agent: Agent, 
 
 def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: HandServer):
     agent = Agent(hub, path, ("s0", "s1"))
-    agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 3)
     assert not agent.replicator.wait_acknowledged(0.05)
     server.acknowledge(agent.log_id, 3)
     other = HandServer(hub, "s1")
@@ -348,8 +348,7 @@ def test_acknowledgements_are_waited_for(hub: MemoryHub, path: Path, server: Han
 
 
 def test_acknowledgements_are_waited_for_while_that_is_worthwhile(agent: Agent, server: HandServer):
-    agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 3)
     before, looks = len(server.heads), iter([True, True, False])
     began = time.monotonic()
     assert not agent.replicator.wait_acknowledged(30, lambda: next(looks))
@@ -363,16 +362,14 @@ def test_acknowledgements_are_waited_for_while_that_is_worthwhile(agent: Agent, 
 
 def test_without_required_servers_any_will_do(hub: MemoryHub, path: Path, server: HandServer, opened):
     agent = opened(Agent(hub, path, ()))
-    agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 3)
     assert not agent.replicator.wait_acknowledged(0.05)
     server.acknowledge(agent.log_id, 3)
     assert agent.replicator.wait_acknowledged(30)
 
 
 def test_old_and_foreign_acknowledgements_change_nothing(agent: Agent, server: HandServer):
-    agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 3)
     server.acknowledge(agent.log_id, 2)
     server.acknowledge(agent.log_id, 1)
     server.acknowledge(agent.log_id + 1, 3)
@@ -387,8 +384,7 @@ def test_a_server_that_has_lost_its_store_lacks_everything_again(
     hub: MemoryHub, path: Path, server: HandServer, again: bool, caplog
 ):
     agent = Agent(hub, path)
-    agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 3)
     server.acknowledge(agent.log_id, 3, store=5)
     server.acknowledge(agent.log_id, 1, store=5)
     assert agent.replicator.wait_acknowledged(30)
@@ -410,8 +406,7 @@ def test_a_late_acknowledgement_of_a_store_that_is_lost_says_nothing(
 ):
     """The robot would drop retirements that the new store has never had."""
     agent = opened(Agent(hub, path))
-    agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 3)
     server.acknowledge(agent.log_id, 3, store=5)
     assert agent.replicator.wait_acknowledged(30)
     server.acknowledge(agent.log_id, 1, store=6)
@@ -431,8 +426,7 @@ def test_a_late_acknowledgement_of_a_store_that_is_lost_says_nothing(
 
 
 def test_a_server_that_has_more_than_the_disk(agent: Agent, server: HandServer, caplog):
-    agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 3)
     with caplog.at_level(logging.WARNING):
         server.acknowledge(agent.log_id, 9)
         eventually(lambda: "begin a fresh map" in agent.replicator.status().failure)
@@ -441,8 +435,7 @@ def test_a_server_that_has_more_than_the_disk(agent: Agent, server: HandServer, 
 
 
 def test_refusals_are_logged_once(agent: Agent, server: HandServer, caplog):
-    agent.replicator.submit(bodies(1, 3), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 3)
     with caplog.at_level(logging.WARNING):
         for _ in range(3):
             server.acknowledge(agent.log_id, 3, Refusal(2, "landmark 9 is not there"))
@@ -457,8 +450,7 @@ def test_refusals_are_logged_once(agent: Agent, server: HandServer, caplog):
 
 
 def test_the_log_answers_for_ranges(agent: Agent, server: HandServer):
-    agent.replicator.submit(bodies(1, 30), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 30)
     answer = server.ask(4, 6)
     assert (answer.log_id, answer.first, answer.covered) == (agent.log_id, 4, 6)
     assert [(s, decode_change(data).sequence) for s, data in answer.changes] == [(4, 4), (5, 5), (6, 6)]
@@ -470,8 +462,7 @@ def test_the_log_answers_for_ranges(agent: Agent, server: HandServer):
 
 def test_the_log_answers_in_pieces(agent: Agent, server: HandServer):
     """Not more than 256 changes, and not more than the settings' bytes."""
-    agent.replicator.submit(bodies(1, 600), 0)
-    assert agent.replicator.flush(30)
+    agent.commit(1, 600)
     collected: list[int] = []
     while len(collected) < 600:
         answer = server.ask(len(collected) + 1, 600)
