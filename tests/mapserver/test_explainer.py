@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -78,16 +79,16 @@ class Asker:
         (reply,) = self.bus.ask(key, payload, 20.0)
         return reply
 
+    def explained(self, request: ExplainRequest, kind: type[Any]) -> Any:
+        return decode(self.ask(KEYS.explain("s0"), encode(request)).payload, kind)
+
     def maps(self) -> MapsExplanation:
-        request = encode(ExplainRequest((A, B)))
-        (explanation,) = decode(self.ask(KEYS.explain("s0"), request).payload, FleetExplanation).maps
+        (explanation,) = self.explained(ExplainRequest((A, B)), FleetExplanation).maps
         return explanation
 
     def constrain(self, ends: Ends, apart: bool = True) -> Reply:
-        return self.ask(
-            KEYS.constrain("s0"),
-            encode(ConstraintRequest(ManualConstraint(Apart(ends), apart, "anna", 10**18, "two kitchens"))),
-        )
+        constraint = ManualConstraint(Apart(ends), apart, "anna", 10**18, "two kitchens")
+        return self.ask(KEYS.constrain("s0"), encode(ConstraintRequest(constraint)))
 
     def status(self) -> dict[str, object]:
         return dict(decode_record(self.ask(KEYS.server_status("s0"), b"").payload))
@@ -97,15 +98,14 @@ class Asker:
 
 
 @contextmanager
-def serving(path: Path) -> Iterator[Asker]:
-    hub = MemoryHub()
-    bus, asker = MemoryBus(hub), MemoryBus(hub)
-    try:
-        with MapServer(bus, KEYS, path, "s0", schedule=LockstepSchedule()):
-            yield Asker(asker)
-    finally:
-        asker.close()
-        bus.close()
+def serving(path: Path, settings: ServerSettings | None = None) -> Iterator[Asker]:
+    hub, settings = MemoryHub(), settings or ServerSettings()
+    with (
+        closing(MemoryBus(hub)) as bus,
+        closing(MemoryBus(hub)) as asker,
+        MapServer(bus, KEYS, path, "s0", settings, LockstepSchedule()),
+    ):
+        yield Asker(asker)
 
 
 def links(content: MapFile) -> set[tuple[NodeId, NodeId]]:
@@ -121,27 +121,20 @@ def same(first: MergedMap, second: MergedMap) -> None:
     for node, place in first.poses.items():
         other = second.poses[node]
         assert place.component == other.component
-        assert np.allclose(
-            place.merged_from_robot.mean.vector, other.merged_from_robot.mean.vector, atol=1e-5
-        )
-        assert np.allclose(
-            place.merged_from_robot.covariance, other.merged_from_robot.covariance, rtol=1e-3, atol=1e-8
-        )
+        one, two = place.merged_from_robot, other.merged_from_robot
+        assert np.allclose(one.mean.vector, two.mean.vector, atol=1e-5)
+        assert np.allclose(one.covariance, two.covariance, rtol=1e-3, atol=1e-8)
 
 
 def test_a_link_explains_itself_over_the_bus(path: Path) -> None:
     with serving(path) as asker:
         content = asker.merged()
         pair = min(pair for pair in links(content) if pair[0].map != pair[1].map)
-        reply = asker.ask(KEYS.explain("s0"), encode(ExplainRequest(pair)))
-        result = decode(reply.payload, PairExplanation)
+        result = asker.explained(ExplainRequest(pair), PairExplanation)
         assert result.standing is Standing.LINKED and (result.a.id, result.b.id) == pair
         assert len(result.shared) == result.evidence["inliers"] and result.other_links
         assert asker.maps().joined
-        everything = decode(
-            asker.ask(KEYS.explain("s0"), encode(ExplainRequest())).payload, FleetExplanation
-        ).maps
-        assert everything == (asker.maps(),)
+        assert asker.explained(ExplainRequest(), FleetExplanation).maps == (asker.maps(),)
         unknown = ExplainRequest((NodeId("z", 1, 1), pair[0]))
         reply = asker.ask(KEYS.explain("s0"), encode(unknown))
         assert "there is no map z.1; known are: a.1, b.1" in reply.error
@@ -152,20 +145,17 @@ def test_blocked_edges_are_used_in_route_explanations(path: Path) -> None:
     with serving(path) as asker:
 
         def way() -> RouteExplanation:
-            request = encode(ExplainRequest((node_id, two), route=True))
-            return decode(asker.ask(KEYS.explain("s0"), request).payload, RouteExplanation)
+            return asker.explained(ExplainRequest((node_id, two), route=True), RouteExplanation)
 
         free = way()
         assert free.found and not free.gaps and [hop.b for hop in free.hops] == [two]
         blocked = encode(RouteRequest(node_id, two, ((node_id, two),)))
         assert not asker.ask(KEYS.route("s0"), blocked).error
         result = way()
-        assert result.found and any(
-            "recently could not get through" in hop.words for hop in (*result.hops, *result.gaps)
-        )
-        assert [hop.b for hop in result.gaps] == [two] and sum(h.cost for h in result.hops) > free.hops[
-            0
-        ].cost
+        said = [hop.words for hop in (*result.hops, *result.gaps)]
+        assert result.found and any("recently could not get through" in words for words in said)
+        assert [hop.b for hop in result.gaps] == [two]
+        assert sum(hop.cost for hop in result.hops) > free.hops[0].cost
 
 
 def test_undone_links_stay_undone_after_a_restart(path: Path, caplog: pytest.LogCaptureFixture) -> None:
@@ -283,13 +273,9 @@ def test_other_links_use_the_gate_of_the_merge(path: Path) -> None:
     with serving(path) as asker:
         pair = min(links(asker.merged()))
     strict = ServerSettings(merge=MergeSettings(ConsistencySettings(gate=1e-9)))
-    hub = MemoryHub()
-    bus, asking = MemoryBus(hub), MemoryBus(hub)
-    with MapServer(bus, KEYS, path, "s0", strict, LockstepSchedule()):
-        reply = Asker(asking).ask(KEYS.explain("s0"), encode(ExplainRequest(pair)))
-        assert not any(link.agrees for link in decode(reply.payload, PairExplanation).other_links)
-    asking.close()
-    bus.close()
+    with serving(path, strict) as asker:
+        result = asker.explained(ExplainRequest(pair), PairExplanation)
+        assert not any(link.agrees for link in result.other_links)
 
 
 def test_an_unreadable_constraint_costs_only_itself(path: Path, caplog: pytest.LogCaptureFixture) -> None:

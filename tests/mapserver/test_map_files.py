@@ -27,14 +27,9 @@ def test_opening_a_map_solves_for_no_covariance_that_is_not_asked_for(
     for node, placement in merged.poses.items():
         expected = before[node]
         assert placement.component == expected.component
-        difference = placement.merged_from_robot.mean.vector - expected.merged_from_robot.mean.vector
-        assert np.abs(difference).max() < 1e-3
-        assert np.allclose(
-            placement.merged_from_robot.covariance,
-            expected.merged_from_robot.covariance,
-            rtol=0.05,
-            atol=1e-9,
-        )
+        one, other = placement.merged_from_robot, expected.merged_from_robot
+        assert np.abs(one.mean.vector - other.mean.vector).max() < 1e-3
+        assert np.allclose(one.covariance, other.covariance, rtol=0.05, atol=1e-9)
 
 
 def test_a_large_map_is_written_without_solving_for_each_node(monkeypatch: pytest.MonkeyPatch) -> None:

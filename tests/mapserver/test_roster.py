@@ -149,15 +149,15 @@ def test_a_robot_that_makes_no_node_hears_how_rarely_to_report(
                 eventually(lambda: replicator.status_period == 0.0)
                 others_come()
             wanted = 1001 / STATUSES_PER_S
-            eventually(
-                lambda: (
-                    (
-                        wanted / (1.0 + STAGGER) < replicator.status_period < wanted / (1.0 - STAGGER)
-                        and replicator.status_period != FIRST_STATUS_PERIOD
-                    )
-                    or (comes_first and link.report(Status("standing", "", 1, 0, Pose2(), False), 1))
-                )
-            )
+
+            def heard() -> bool:
+                if comes_first:
+                    link.report(Status("standing", "", 1, 0, Pose2(), False), 1)
+                period = replicator.status_period
+                within = wanted / (1.0 + STAGGER) < period < wanted / (1.0 - STAGGER)
+                return within and period != FIRST_STATUS_PERIOD
+
+            eventually(heard)
             link.close()
             replicator.close()
 

@@ -211,18 +211,13 @@ def test_a_map_that_only_loops_hold_together_falls_apart_and_that_is_said_before
 def test_a_retirement_that_is_taken_back_says_what_others_still_retire(merger: Merger) -> None:
     seconds = 10**9
     (corner,) = ids(B, 1)
+    outline = Area(corner, ((1.6, -0.5), (2.25, -0.5), (2.25, 0.5), (1.6, 0.5)))
+    subjects = [
+        *(RetiredNodes(some) for some in (ids(A, 7, 15), ids(A, 7), ids(B, 11))),
+        RetiredWindow(A, 15 * seconds, 30 * seconds), RetiredMap(B), RetiredArea(outline),
+    ]  # fmt: skip
     first, second, third, window, whole, area = (
-        ManualConstraint(about, True, "anna", k, f"reason {k}")
-        for k, about in enumerate(
-            (
-                RetiredNodes(ids(A, 7, 15)),
-                RetiredNodes(ids(A, 7)),
-                RetiredNodes(ids(B, 11)),
-                RetiredWindow(A, 15 * seconds, 30 * seconds),
-                RetiredMap(B),
-                RetiredArea(Area(corner, ((1.6, -0.5), (2.25, -0.5), (2.25, 0.5), (1.6, 0.5)))),
-            )
-        )
+        ManualConstraint(about, True, "anna", k, f"reason {k}") for k, about in enumerate(subjects)
     )
 
     def said(taken_back: ManualConstraint, *made: ManualConstraint) -> str:

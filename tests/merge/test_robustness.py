@@ -117,15 +117,12 @@ def test_many_links_of_one_place_make_no_refused_link_likelier(side: float) -> N
         MapId(agent, 1): _drive(agent, [*place, Pose2(side, 0.0, 0.0), Pose2(side, side, 0.0)])
         for agent in "ab"
     }
-    links = [
-        Link(
-            NodeId("a", 1, j),
-            NodeId("b", 1, k),
-            PoseGaussian.from_sigmas(place[j].inverse() @ place[k], 0.01, 0.003),
-        )
-        for j in range(10)
-        for k in range(10)
-    ]
+
+    def link(j: int, k: int) -> Link:
+        between = PoseGaussian.from_sigmas(place[j].inverse() @ place[k], 0.01, 0.003)
+        return Link(NodeId("a", 1, j), NodeId("b", 1, k), between)
+
+    links = [link(j, k) for j in range(10) for k in range(10)]
     sigmas = np.array([0.06, 0.12, 0.03])
     # 4.6 standard deviations from where everything else has it: 99.9 % of right links are within four.
     off = Pose2.from_vector(sigmas * 4.6 / np.sqrt(3.0) * [1.0, -1.0, 1.0])

@@ -76,10 +76,8 @@ def test_nothing_is_written_over_and_nothing_half_done_stays(notes: Database, tm
     write(notes, 10)
     there = tmp_path / "there"
     there.write_text("mine")
-    with (
-        pytest.raises(InvalidFile, match="there: is there already, and is not written over"),
-        copying(notes.path, there),
-    ):
+    words = "there: is there already, and is not written over"
+    with pytest.raises(InvalidFile, match=words), copying(notes.path, there):
         pass
     late = tmp_path / "late"
     with pytest.raises(InvalidFile, match="is there already"), copying(notes.path, late):
@@ -88,17 +86,13 @@ def test_nothing_is_written_over_and_nothing_half_done_stays(notes: Database, tm
     for target in (tmp_path / "nowhere" / "copy", tmp_path):
         with pytest.raises(InvalidFile, match="cannot be written"), copying(notes.path, target):
             pass
-    with (
-        pytest.raises(InvalidFile, match="none: no such file"),
-        copying(tmp_path / "none", tmp_path / "copy"),
-    ):
+    none, copy = tmp_path / "none", tmp_path / "copy"
+    with pytest.raises(InvalidFile, match="none: no such file"), copying(none, copy):
         pass
     with pytest.raises(KeyboardInterrupt), copying(notes.path, tmp_path / "copy"):
         raise KeyboardInterrupt
-    assert {path.name for path in tmp_path.iterdir() if not path.name.startswith("notes")} == {
-        "there",
-        "late",
-    }
+    left = {path.name for path in tmp_path.iterdir() if not path.name.startswith("notes")}
+    assert left == {"there", "late"}
 
 
 def test_a_damaged_file_is_not_taken_for_a_backup(notes: Database, tmp_path: Path) -> None:
@@ -226,14 +220,9 @@ print(json.dumps(said))
 
 @pytest.mark.slow
 def test_full_disks_are_named_and_left_as_they_were(tmp_path: Path) -> None:
-    unshare = own_mounts()
-    ran = subprocess.run(
-        [*unshare, sys.executable, "-c", FULL, str(tmp_path)],
-        capture_output=True,
-        text=True,
-        timeout=120,
-        cwd=Path(__file__).parents[2],
-    )
+    command = [*own_mounts(), sys.executable, "-c", FULL, str(tmp_path)]
+    root = Path(__file__).parents[2]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=root)
     assert ran.returncode == 0, ran.stderr
     said = json.loads(ran.stdout)
     for name in ("small", "large"):

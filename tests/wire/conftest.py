@@ -82,11 +82,8 @@ def segments(draw: st.DrawFn, ranges: Ranges) -> TrajectorySegment:
     random = np.random.default_rng(draw(seeds))
     poses = random.uniform([-FURTHEST, -FURTHEST, -3.1], [FURTHEST, FURTHEST, 3.1], (count, 3))
     distances = np.minimum(random.uniform(0, 2 * ranges.reach, (count, len(ranges))), ranges.reach)
-    return (
-        TrajectorySegment(np.sort(random.uniform(-LONGEST, LONGEST, count)), poses, distances)
-        if count
-        else TrajectorySegment()
-    )
+    ages = np.sort(random.uniform(-LONGEST, LONGEST, count))
+    return TrajectorySegment(ages, poses, distances) if count else TrajectorySegment()
 
 
 @st.composite
@@ -96,17 +93,10 @@ def nodes(draw: st.DrawFn) -> Node:
     radius = draw(st.integers(0, 5000)) / 1000.0
     clock = draw(st.sampled_from(["", "utc", "sim-office-7"]))
     seen = draw(ranges())
-    return Node(
-        draw(node_ids),
-        stamp_ns,
-        draw(poses()),
-        camera,
-        draw(landmarks(camera)),
-        clock,
-        radius,
-        seen,
-        draw(segments(seen)),
+    element, pose, marks, segment = (
+        draw(one) for one in (node_ids, poses(), landmarks(camera), segments(seen))
     )
+    return Node(element, stamp_ns, pose, camera, marks, clock, radius, seen, segment)
 
 
 @st.composite
@@ -124,16 +114,9 @@ def edges(draw: st.DrawFn) -> Edge:
     )  # fmt: skip
 
 
-@st.composite
-def bodies(draw: st.DrawFn) -> ChangeBody:
-    return draw(
-        st.one_of(
-            st.builds(NodePut, nodes()),
-            st.builds(EdgePut, edges()),
-            st.builds(NodeRetired, node_ids),
-            st.builds(EdgeRetired, node_ids),
-        )
-    )
+def bodies() -> st.SearchStrategy[ChangeBody]:
+    puts = st.builds(NodePut, nodes()), st.builds(EdgePut, edges())
+    return st.one_of(*puts, st.builds(NodeRetired, node_ids), st.builds(EdgeRetired, node_ids))
 
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25, 0.05)

@@ -176,12 +176,8 @@ def test_a_relocalization_that_cannot_be_sent() -> None:
 
 
 def test_a_route(some: SimpleNamespace) -> None:
-    request = RouteRequest(
-        NodeId("r0", 1, 2),
-        NodeId("r2", 1, 9),
-        ((NodeId("r0", 1, 2), NodeId("r1", 1, 1)),),
-        Pose2(0.1, 0.2, -3),
-    )
+    start, goal = NodeId("r0", 1, 2), NodeId("r2", 1, 9)
+    request = RouteRequest(start, goal, ((start, NodeId("r1", 1, 1)),), Pose2(0.1, 0.2, -3))
     assert decode(encode(request), RouteRequest) == request
     assert decode(encode(RouteRequest(request.start, request.goal)), RouteRequest).blocked == ()
     node = some.node(9)

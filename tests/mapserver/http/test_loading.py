@@ -123,18 +123,9 @@ def test_a_robot_that_no_common_node_places_is_shown_without_a_place() -> None:
     merged = two_maps()
     graph = merged.graphs[0]
     kept = [row for row, node in enumerate(graph.nodes) if node.agent == "r1"]
-    apart = replace(
-        merged,
-        graphs=(
-            PoseGraph(
-                graph.nodes[kept[0]],
-                tuple(graph.nodes[row] for row in kept),
-                graph.means[kept],
-                sparse.identity(3 * len(kept), format="csc"),
-            ),
-        ),
-    )
-    (_, entry) = before().fleet(elsewhere, apart)
+    nodes = tuple(graph.nodes[row] for row in kept)
+    alone = PoseGraph(nodes[0], nodes, graph.means[kept], sparse.identity(3 * len(kept), format="csc"))
+    (_, entry) = before().fleet(elsewhere, replace(merged, graphs=(alone,)))
     assert entry["robot"] == "r1" and entry["alive"]
     assert (entry["merged_from_robot"], entry["component"]) == (None, -1)
 
@@ -142,18 +133,12 @@ def test_a_robot_that_no_common_node_places_is_shown_without_a_place() -> None:
 @pytest.mark.parametrize("there", [False, True])
 def test_what_a_server_waits_for_is_said(there: bool) -> None:
     shown, loading = before() if there else NOTHING, LoadingServer()
-    loading.wait("waiting: no database")
+    words = "waiting: no database"
+    loading.wait(words)
     with Web(("127.0.0.1", 0), loading, before=shown) as web, viewer(web) as person:
-        assert answer(web, "/status") == (
-            200,
-            {
-                "summary": "waiting: no database",
-                "loading": True,
-                "settled": False,
-                "event": "waiting: no database",
-            },
-        )
-        assert person.until("state")["server"]["summary"].startswith("waiting: no database")
+        said = {"summary": words, "loading": True, "settled": False, "event": words}
+        assert answer(web, "/status") == (200, said)
+        assert person.until("state")["server"]["summary"].startswith(words)
         loading.wait("")
         eventually(lambda: person.until("state")["server"]["summary"] == (NOT_THERE if shown else "loading"))
 

@@ -281,24 +281,14 @@ def test_landmarks_without_depths_are_in_no_region() -> None:
     nodes = here_and_there()
     recognition = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
     assert recognition is not None
-    for blind, result in (
-        ({0}, Certainty.FOUND),
-        ({0, 1, 2}, Certainty.FOUND),
-        ({1, 2}, Certainty.AMBIGUOUS),
-    ):
-        fewer = [
-            replace(
-                one,
-                landmarks=replace(
-                    one.landmarks,
-                    depths=np.full_like(one.landmarks.depths, np.nan),
-                    depth_sigmas=np.full_like(one.landmarks.depths, np.nan),
-                ),
-            )
-            if k in blind
-            else one
-            for k, one in enumerate(nodes)
-        ]
+
+    def without_depths(node: Node) -> Node:
+        unknown = np.full_like(node.landmarks.depths, np.nan)
+        return replace(node, landmarks=replace(node.landmarks, depths=unknown, depth_sigmas=unknown))
+
+    found, ambiguous = Certainty.FOUND, Certainty.AMBIGUOUS
+    for blind, result in (({0}, found), ({0, 1, 2}, found), ({1, 2}, ambiguous)):
+        fewer = [without_depths(one) if k in blind else one for k, one in enumerate(nodes)]
         service = asked(fewer, joined(fewer))
         answer = concluded(service, NodeMatch(nodes[0].id, recognition), [(nodes[0].id, 2.0)])
         assert answer.certainty is result

@@ -13,7 +13,7 @@ from scipy.optimize import minimize
 
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
-from mapweave.hybridmap.node import Edge, Node
+from mapweave.hybridmap.node import Edge, Landmarks, Node
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.merge.merging import merge_maps
 from mapweave.merge.outlier_rejection.segmentation import fragments_of
@@ -38,16 +38,12 @@ def longer(content: Content, way: float, depth: float) -> Content:
     def moved(pose: PoseGaussian) -> PoseGaussian:
         return PoseGaussian(Pose2(way * pose.mean.x, way * pose.mean.y, pose.mean.heading), pose.covariance)
 
+    def deeper(marks: Landmarks) -> Landmarks:
+        depths, sigmas = ((depth * one).astype(np.float32) for one in (marks.depths, marks.depth_sigmas))
+        return replace(marks, depths=depths, depth_sigmas=sigmas)
+
     nodes = [
-        replace(
-            node,
-            map_from_robot=moved(node.map_from_robot),
-            landmarks=replace(
-                node.landmarks,
-                depths=(depth * node.landmarks.depths).astype(np.float32),
-                depth_sigmas=(depth * node.landmarks.depth_sigmas).astype(np.float32),
-            ),
-        )
+        replace(node, map_from_robot=moved(node.map_from_robot), landmarks=deeper(node.landmarks))
         for node in content[0]
     ]
     return nodes, [replace(edge, a_from_b=moved(edge.a_from_b)) for edge in content[1]]
@@ -163,14 +159,14 @@ def test_what_is_no_factor_of_all_lengths_is_left(fleet: Fleet, way: float, dept
 def test_false_links_make_no_factor(fleet: Fleet) -> None:
     maps = fleet.maps()
     rng = np.random.default_rng(SEED)
-    links = [
-        link
-        if rng.random() < 0.5
-        else replace(
-            link, a_from_b=PoseGaussian(Pose2.from_vector(rng.uniform(-3, 3, 3)), link.a_from_b.covariance)
-        )
-        for link in fleet.links(maps)
-    ]
+
+    def perhaps_false(link: Link) -> Link:
+        if rng.random() < 0.5:
+            return link
+        anywhere = Pose2.from_vector(rng.uniform(-3, 3, 3))
+        return replace(link, a_from_b=PoseGaussian(anywhere, link.a_from_b.covariance))
+
+    links = [perhaps_false(link) for link in fleet.links(maps)]
     found = MapScales().of(maps, fragments_of(maps, ConsistencySettings()), links)
     assert not any(scale.undone for scale in found.values())
 
