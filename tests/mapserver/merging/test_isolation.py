@@ -30,6 +30,7 @@ from synthetic.maps import changes_of
 from synthetic.world import room, take_map
 
 Log = list[tuple[MapId, ChangeBody]]
+Logs = dict[MapId, Log]
 R0, R1, BAD, WORSE = (MapId(agent, 1) for agent in ("r0", "r1", "bad", "worse"))
 
 pairs = st.lists(st.lists(st.integers(0, 9), min_size=1, max_size=3, unique=True), max_size=4)
@@ -73,7 +74,7 @@ def test_a_failure_without_any_map_sets_no_map_apart() -> None:
 
 
 @pytest.fixture(scope="module")
-def logs() -> dict[MapId, Log]:
+def logs() -> Logs:
     """Two sound robots in one room, and two more of which the second has mapped another one."""
     rng = np.random.default_rng(1)
     here, elsewhere = room(0, 0, 5, 4, 600, rng), room(0, 0, 5, 4, 600, rng)
@@ -85,7 +86,7 @@ def logs() -> dict[MapId, Log]:
     }
 
 
-def merger_of(result: dict[MapId, Log], *maps: MapId) -> Merger:
+def merger_of(result: Logs, *maps: MapId) -> Merger:
     merger = Merger()
     merger.read(item for map_id in maps for item in result[map_id])
     return merger
@@ -127,7 +128,7 @@ def said(merged: MergedMap, *maps: MapId) -> tuple[object, ...]:
 
 
 def test_a_map_with_which_it_fails_is_set_apart_and_the_others_are_as_without_it(
-    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
+    logs: Logs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alone = merger_of(logs, R0, R1).merged()
     assert len(alone.links) > 2
@@ -143,7 +144,7 @@ def test_a_map_with_which_it_fails_is_set_apart_and_the_others_are_as_without_it
 
 
 def test_a_server_that_runs_goes_on_when_a_map_comes_with_which_it_fails(
-    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    logs: Logs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     alone_fails(monkeypatch, BAD)
     merger = merger_of(logs, R0)
@@ -158,7 +159,7 @@ def test_a_server_that_runs_goes_on_when_a_map_comes_with_which_it_fails(
 
 
 def test_two_maps_that_fail_only_together_cost_the_smaller_one_alone(
-    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
+    logs: Logs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     together_fail(monkeypatch, R1, WORSE)
     small = {**logs, WORSE: logs[WORSE][:3]}
@@ -174,7 +175,7 @@ def test_two_maps_that_fail_only_together_cost_the_smaller_one_alone(
 
 
 def test_a_map_set_apart_is_tried_again_after_a_change(
-    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    logs: Logs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     merger = merger_of(logs, R0, R1, WORSE)
     node = logs[WORSE][0][1]
@@ -197,7 +198,7 @@ def test_a_map_set_apart_is_tried_again_after_a_change(
     assert said(merged, R0, R1, WORSE) == said(merger_of(logs, R0, R1, WORSE).merged(), R0, R1, WORSE)
 
 
-def test_a_merged_map_that_breaks_its_users_is_set_apart(logs: dict[MapId, Log]) -> None:
+def test_a_merged_map_that_breaks_its_users_is_set_apart(logs: Logs) -> None:
     merger = merger_of(logs, R0, R1, BAD)
 
     def use(merged: MergedMap) -> None:
@@ -208,7 +209,7 @@ def test_a_merged_map_that_breaks_its_users_is_set_apart(logs: dict[MapId, Log])
 
 
 def test_a_retired_map_breaks_nothing_and_is_not_set_apart(
-    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
+    logs: Logs, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     alone_fails(monkeypatch, BAD)
     merger = merger_of(logs, R0, R1, BAD)
@@ -217,20 +218,12 @@ def test_a_retired_map_breaks_nothing_and_is_not_set_apart(
     merged = merger.merged()
     assert not merged.set_apart and BAD in merged.maps
     assert said(merged, R0, R1) == said(merger_of(logs, R0, R1).merged(), R0, R1)
-    merger.constrain(
-        ManualConstraints(
-            [
-                ManualConstraint(RetiredMap(BAD), True, "anna", 1),
-                ManualConstraint(RetiredMap(BAD), False, "anna", 2),
-            ]
-        )
-    )
+    back = ManualConstraint(RetiredMap(BAD), False, "anna", 2)
+    merger.constrain(ManualConstraints([*merged.constraints.made, back]))
     assert merger.merged().set_apart.keys() == {BAD}
 
 
-def test_a_bad_map_is_left_out_before_comparing(
-    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_bad_map_is_left_out_before_comparing(logs: Logs, monkeypatch: pytest.MonkeyPatch) -> None:
     alone_fails(monkeypatch, BAD)
     merger = merger_of(logs, BAD, R0, R1)
     apart = merger.apart()
@@ -238,7 +231,7 @@ def test_a_bad_map_is_left_out_before_comparing(
 
 
 def test_nodes_that_cannot_be_compared_are_not_linked(
-    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+    logs: Logs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     import mapweave.mapserver.merging.node_comparisons as module
 
@@ -257,9 +250,7 @@ def test_nodes_that_cannot_be_compared_are_not_linked(
     assert "cannot be compared" in caplog.text and caplog.records[0].levelno == logging.ERROR
 
 
-def test_a_node_whose_search_fails_holds_up_no_other(
-    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_node_whose_search_fails_holds_up_no_other(logs: Logs, monkeypatch: pytest.MonkeyPatch) -> None:
     merger = merger_of(logs, BAD, R0, R1)
     real = merger.places.overlaps
 
@@ -274,7 +265,7 @@ def test_a_node_whose_search_fails_holds_up_no_other(
     assert said(merged, R0, R1) == said(merger_of(logs, R0, R1).merged(), R0, R1)
 
 
-def test_a_map_of_which_nodes_lie_beyond_all_messages_is_set_apart(logs: dict[MapId, Log]) -> None:
+def test_a_map_of_which_nodes_lie_beyond_all_messages_is_set_apart(logs: Logs) -> None:
     """Each edge is within its bounds, and all together they are not."""
     far = PoseGaussian.from_sigmas(Pose2(9.9e4), 0.1, 0.01)
     node, edge = (
@@ -291,9 +282,7 @@ def test_a_map_of_which_nodes_lie_beyond_all_messages_is_set_apart(logs: dict[Ma
     assert said(merged, R0, R1) == said(merger_of(logs, R0, R1).merged(), R0, R1)
 
 
-def test_files_are_merged_with_all_maps_or_not_at_all(
-    logs: dict[MapId, Log], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_are_merged_with_all_maps_or_not_at_all(logs: Logs, monkeypatch: pytest.MonkeyPatch) -> None:
     """Else the map would be missing in what is written."""
     alone_fails(monkeypatch, BAD)
     maps = {item: HybridMap(body for _, body in logs[item]) for item in (R0, BAD)}

@@ -1,7 +1,8 @@
-"""When a server that leads hands its merges over, and what those that follow hear of it."""
+"""When a server that leads hands its merges over, and how long what has come waits for a merge."""
 
 from __future__ import annotations
 
+import random
 from types import SimpleNamespace
 from typing import Any, cast
 
@@ -10,6 +11,7 @@ import pytest
 from mapweave.mapserver.merging.merge_handover import SHARE, MergeHandover
 from mapweave.mapserver.merging.merge_sharing import MergeSharing
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.unmerged import MOST, STEP, Unmerged
 from tests.clock import Clock
 
 
@@ -102,3 +104,32 @@ def test_a_merge_that_cannot_be_written_is_said_until_one_can(
     followed.fails = False
     hand_over(handover, 2)
     assert followed.said[-1] == ""
+
+
+def test_the_oldest_that_is_not_merged_counts_to_a_second() -> None:
+    draw, clock = random.Random(5), Clock()
+    unmerged, came, merged = Unmerged(clock), list[float](), 0
+    for _ in range(2000):
+        clock.now += draw.expovariate(2.0)
+        if draw.random() < 0.7:
+            came.append(clock.now)
+            unmerged.came(len(came))
+        elif draw.random() < 0.3:
+            merged = draw.randint(merged, len(came))
+            unmerged.merged(merged)
+        wanted = clock.now - came[merged] if merged < len(came) else 0.0
+        assert wanted <= unmerged.seconds <= wanted + (STEP if wanted else 0.0)
+
+
+def test_what_is_kept_is_bounded_and_the_oldest_is_right() -> None:
+    clock = Clock()
+    unmerged = Unmerged(clock)
+    for number in range(1, 3 * MOST):
+        clock.now += 2.0 * STEP
+        unmerged.came(number)
+    assert len(unmerged._steps) == MOST
+    assert unmerged.seconds == clock.now - 2.0 * STEP
+    unmerged.merged(3 * MOST - 2)
+    assert unmerged.seconds > 0.0
+    unmerged.merged(3 * MOST - 1)
+    assert unmerged.seconds == 0.0

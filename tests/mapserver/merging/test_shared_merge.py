@@ -213,8 +213,11 @@ def test_a_follower_has_the_leaders_map_and_goes_on_from_it(
             assert follower.merger.merged().pose(node).distance(merged.pose(node)) < 1e-6
 
 
+HandedOver = tuple[Results, list[Change]]
+
+
 @pytest.fixture(scope="module")
-def handed_over(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, list[Change]]:
+def handed_over(tmp_path_factory: pytest.TempPathFactory) -> HandedOver:
     """A merge of the first changes, to be looked at only."""
     results, changes = Results(), numbered(drives(1))[:24]
     leader = Leader(results, tmp_path_factory.mktemp("leader") / "s0")
@@ -223,13 +226,13 @@ def handed_over(tmp_path_factory: pytest.TempPathFactory) -> tuple[Results, list
     return results, changes
 
 
-def follower_of(handed_over: tuple[Results, list[Change]]) -> Follower:
+def follower_of(handed_over: HandedOver) -> Follower:
     results = Results()
     results.values = dict(handed_over[0].values)
     return Follower(results)
 
 
-def test_time_without_a_store_is_no_time_without_a_leader(handed_over: tuple[Results, list[Change]]) -> None:
+def test_time_without_a_store_is_no_time_without_a_leader(handed_over: HandedOver) -> None:
     follower = follower_of(handed_over)
     follower.results.values[MERGE] = b""
     assert not follower.look() and follower.adoption.reason.endswith("is incomplete or damaged")
@@ -242,7 +245,7 @@ def test_time_without_a_store_is_no_time_without_a_leader(handed_over: tuple[Res
 
 
 def test_a_follower_that_has_not_all_waits_longer_than_one_with_other_maps(
-    handed_over: tuple[Results, list[Change]],
+    handed_over: HandedOver,
 ) -> None:
     changes, lacking, other = handed_over[1], follower_of(handed_over), follower_of(handed_over)
     lacking.take(changes[:-1])
@@ -259,9 +262,7 @@ def test_a_follower_that_has_not_all_waits_longer_than_one_with_other_maps(
 
 
 @pytest.mark.parametrize("taken", [0, 5, 24])
-def test_changes_that_could_not_be_taken_in_are_not_lost(
-    handed_over: tuple[Results, list[Change]], taken: int
-) -> None:
+def test_changes_that_could_not_be_taken_in_are_not_lost(handed_over: HandedOver, taken: int) -> None:
     """Those of a merge, of which some are in the map, and those behind it."""
     changes = handed_over[1]
     later = numbered(drives(1))[24:30]
@@ -283,7 +284,7 @@ def test_changes_that_could_not_be_taken_in_are_not_lost(
 
 
 def test_a_follower_gives_up_at_once_and_tries_the_next_merge_later(
-    handed_over: tuple[Results, list[Change]], tmp_path: Path
+    handed_over: HandedOver, tmp_path: Path
 ) -> None:
     changes, follower = handed_over[1], follower_of(handed_over)
     follower.take(changes)
@@ -307,9 +308,7 @@ def test_a_follower_gives_up_at_once_and_tries_the_next_merge_later(
 
 @pytest.mark.parametrize("name", [MERGE, MERGE_MARK, PART.format(0)])
 @pytest.mark.parametrize("how", ["missing", "empty", "cut", "flipped"])
-def test_what_is_damaged_is_not_adopted(
-    handed_over: tuple[Results, list[Change]], name: str, how: str
-) -> None:
+def test_what_is_damaged_is_not_adopted(handed_over: HandedOver, name: str, how: str) -> None:
     follower = follower_of(handed_over)
     value, values = follower.results.values.pop(name), follower.results.values
     if how != "missing":
@@ -324,7 +323,7 @@ def test_what_is_damaged_is_not_adopted(
 
 
 def test_merges_with_other_settings_or_of_another_version_are_not_adopted(
-    handed_over: tuple[Results, list[Change]], monkeypatch: pytest.MonkeyPatch
+    handed_over: HandedOver, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     follower = Follower(handed_over[0], MergeSettings(exclusion=ExclusionSettings(doubt=0.01)))
     follower.take(handed_over[1])

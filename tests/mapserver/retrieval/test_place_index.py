@@ -21,9 +21,11 @@ from mapweave.mapserver.retrieval.place_index import SLOT_BITS, PlaceIndex, Plac
 from synthetic.world import CAMERA, World, random_vectors, room, take_map, take_view
 from tests.merge.pose_graph.all_pairs import overlaps
 
+Building = tuple[World, list[Node], list[Pose2]]
+
 
 @pytest.fixture(scope="module")
-def building() -> tuple[World, list[Node], list[Pose2]]:
+def building() -> Building:
     """Four rooms, six nodes in each."""
     rng = np.random.default_rng(1)
     rooms = [room(5.0 * k, 0, 5, 4, 500, rng) for k in range(4)]
@@ -56,7 +58,7 @@ def brute_force(nodes: list[Node], view: View, s: PlaceIndexSettings) -> dict[No
     return scores
 
 
-def test_scores_against_brute_force(building: tuple[World, list[Node], list[Pose2]]) -> None:
+def test_scores_against_brute_force(building: Building) -> None:
     world, nodes, tour = building
     few, s = nodes[:8], PlaceIndexSettings(votes=6)
     view, _ = take_view(world, tour[2], np.random.default_rng(2))
@@ -71,7 +73,7 @@ def test_scores_against_brute_force(building: tuple[World, list[Node], list[Pose
     )
 
 
-def test_the_right_place_comes_first(building: tuple[World, list[Node], list[Pose2]]) -> None:
+def test_the_right_place_comes_first(building: Building) -> None:
     world, nodes, tour = building
     index, rng = filled(nodes), np.random.default_rng(3)
     first = 0
@@ -81,7 +83,7 @@ def test_the_right_place_comes_first(building: tuple[World, list[Node], list[Pos
     assert first >= 22
 
 
-def test_overlaps_are_those_of_the_exhaustive_table(building: tuple[World, list[Node], list[Pose2]]) -> None:
+def test_overlaps_are_those_of_the_exhaustive_table(building: Building) -> None:
     _, nodes, _ = building
     table = overlaps(nodes)
     index = filled(nodes)
@@ -115,9 +117,7 @@ def test_nodes_with_equal_landmarks_cost_no_more_than_others() -> None:
     assert len(index.landmarks) == 2 * MOST_LANDMARKS
 
 
-def test_overlaps_of_compared_nodes_are_exact_in_a_large_fleet(
-    building: tuple[World, list[Node], list[Pose2]],
-) -> None:
+def test_overlaps_of_compared_nodes_are_exact_in_a_large_fleet(building: Building) -> None:
     _, nodes, _ = building
     table, known = overlaps(nodes), {node.id: node for node in nodes}
     landmarks = LandmarkIndexSettings(exact=600)
@@ -137,7 +137,7 @@ def test_overlaps_of_compared_nodes_are_exact_in_a_large_fleet(
     assert few.overlaps(nodes[0], {}.get) == {}
 
 
-def test_added_is_found_at_once_and_removed_never(building: tuple[World, list[Node], list[Pose2]]) -> None:
+def test_added_is_found_at_once_and_removed_never(building: Building) -> None:
     world, nodes, tour = building
     index = filled(nodes[:-1])
     view, _ = take_view(world, tour[-1], np.random.default_rng(4))
@@ -153,9 +153,7 @@ def test_added_is_found_at_once_and_removed_never(building: tuple[World, list[No
 
 
 @pytest.mark.parametrize("exact", [100_000, 600], ids=["all are compared", "cells are searched"])
-def test_what_another_robot_adds_changes_nothing_once_it_is_hidden(
-    building: tuple[World, list[Node], list[Pose2]], exact: int
-) -> None:
+def test_what_another_robot_adds_changes_nothing_once_it_is_hidden(building: Building, exact: int) -> None:
     """However many copies of a place it adds: all nearest landmarks are copies then."""
     world, nodes, tour = building
     index = filled(nodes, PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=exact)))
@@ -169,7 +167,7 @@ def test_what_another_robot_adds_changes_nothing_once_it_is_hidden(
     assert [index.query(view, 16, hidden) for view in views] == before
 
 
-def test_adding_again_replaces(building: tuple[World, list[Node], list[Pose2]]) -> None:
+def test_adding_again_replaces(building: Building) -> None:
     _, nodes, _ = building
     index = filled(nodes)
     before = len(index.landmarks)
@@ -177,7 +175,7 @@ def test_adding_again_replaces(building: tuple[World, list[Node], list[Pose2]]) 
     assert len(index.landmarks) == before and len(index) == len(nodes)
 
 
-def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[Node], list[Pose2]]) -> None:
+def test_large_indexes_search_cells_and_still_find(building: Building) -> None:
     world, nodes, tour = building
     index = filled(nodes, PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=1500)))
     assert index.landmarks.cells(len(index.landmarks)) > 0
@@ -193,9 +191,7 @@ def test_large_indexes_search_cells_and_still_find(building: tuple[World, list[N
 
 
 @pytest.mark.parametrize("named", ["its own", "some of them", "another's", "none"])
-def test_a_removed_node_stays_removed_despite_its_landmarks(
-    building: tuple[World, list[Node], list[Pose2]], named: str
-) -> None:
+def test_a_removed_node_stays_removed_despite_its_landmarks(building: Building, named: str) -> None:
     nodes = building[1]
     index = PlaceIndex(PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=100)))
     index.extend(nodes)
@@ -207,7 +203,7 @@ def test_a_removed_node_stays_removed_despite_its_landmarks(
     assert len(set(left.tolist())) == len(index)
 
 
-def test_nothing_is_found_in_nothing(building: tuple[World, list[Node], list[Pose2]]) -> None:
+def test_nothing_is_found_in_nothing(building: Building) -> None:
     world, nodes, tour = building
     view, _ = take_view(world, tour[0], np.random.default_rng(6))
     empty = View(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), CAMERA)
@@ -225,9 +221,7 @@ def everywhere() -> PlaceIndexSettings:
     return PlaceIndexSettings(landmarks=landmarks)
 
 
-def test_cells_of_which_all_are_searched_answer_like_no_cells(
-    building: tuple[World, list[Node], list[Pose2]],
-) -> None:
+def test_cells_of_which_all_are_searched_answer_like_no_cells(building: Building) -> None:
     world, nodes, tour = building
     plain, cells = filled(nodes), filled(nodes, everywhere())
     for index in (plain, cells):
@@ -241,7 +235,7 @@ def test_cells_of_which_all_are_searched_answer_like_no_cells(
         assert {node for node, _ in one[:3]} == {node for node, _ in two[:3]}
 
 
-def test_many_at_once_equal_one_by_one(building: tuple[World, list[Node], list[Pose2]]) -> None:
+def test_many_at_once_equal_one_by_one(building: Building) -> None:
     world, nodes, tour = building
     one, many = filled(nodes), PlaceIndex()
     many.extend([*nodes, nodes[2]])
@@ -271,7 +265,7 @@ def altered(nodes: list[Node], count: int) -> list[Node]:
     ids=["all are compared, but for what is hidden", "smaller cells are searched, but for what is hidden"],
 )
 def test_what_is_hidden_does_not_decide_which_cells_are_searched(
-    building: tuple[World, list[Node], list[Pose2]], settings: PlaceIndexSettings
+    building: Building, settings: PlaceIndexSettings
 ) -> None:
     world, nodes, tour = building
     index = filled(nodes, settings)
@@ -289,9 +283,7 @@ def test_what_is_hidden_does_not_decide_which_cells_are_searched(
     assert [index.query(view, 16, hidden) for view in views] == before
 
 
-def test_the_order_of_growth_and_questions_make_no_difference(
-    building: tuple[World, list[Node], list[Pose2]],
-) -> None:
+def test_the_order_of_growth_and_questions_make_no_difference(building: Building) -> None:
     world, nodes, tour = building
     at_once, grown = PlaceIndex(small_cells()), PlaceIndex(small_cells())
     at_once.extend(nodes)
@@ -310,7 +302,7 @@ def test_the_order_of_growth_and_questions_make_no_difference(
         assert dict(grown.query(view, 6)) == pytest.approx(dict(at_once.query(view, 6)), rel=1e-3)
 
 
-def test_all_landmarks_are_in_cells_of_another_size(building: tuple[World, list[Node], list[Pose2]]) -> None:
+def test_all_landmarks_are_in_cells_of_another_size(building: Building) -> None:
     """What comes and goes is in cells of all sizes that are kept; unused ones are dropped."""
     world, nodes, tour = building
     index = filled(nodes, small_cells(probes=20_000))
@@ -330,7 +322,7 @@ def test_all_landmarks_are_in_cells_of_another_size(building: tuple[World, list[
 
 
 def test_a_question_waits_while_cells_are_filled_for_another_one_and_finds_the_same(
-    building: tuple[World, list[Node], list[Pose2]],
+    building: Building,
 ) -> None:
     world, nodes, tour = building
     index = filled(nodes, small_cells())
@@ -351,9 +343,7 @@ def test_fewer_cells_are_searched_when_the_smallest_are_full() -> None:
     assert [index._probes(n, smallest) for n in (10**6, 6_553_600, 13_107_200, 10**8)] == [10, 10, 5, 2]
 
 
-def test_who_announces_a_node_does_not_wait_for_a_search(
-    building: tuple[World, list[Node], list[Pose2]],
-) -> None:
+def test_who_announces_a_node_does_not_wait_for_a_search(building: Building) -> None:
     _, nodes, _ = building
     index = filled(nodes[:5])
     with index.landmarks.lock.reading():
@@ -365,7 +355,7 @@ def test_who_announces_a_node_does_not_wait_for_a_search(
     assert index.overlaps(nodes[0], {}.get) == filled(nodes).overlaps(nodes[0], {}.get)
 
 
-def test_a_search_waits_for_no_other(building: tuple[World, list[Node], list[Pose2]]) -> None:
+def test_a_search_waits_for_no_other(building: Building) -> None:
     world, nodes, tour = building
     index, (view, _) = filled(nodes[:5]), take_view(world, tour[0], np.random.default_rng(4))
     index.announce(nodes[5])
@@ -376,7 +366,7 @@ def test_a_search_waits_for_no_other(building: tuple[World, list[Node], list[Pos
 
 
 def test_a_node_that_cannot_be_taken_in_spoils_no_search(
-    building: tuple[World, list[Node], list[Pose2]], caplog: pytest.LogCaptureFixture
+    building: Building, caplog: pytest.LogCaptureFixture
 ) -> None:
     _, nodes, _ = building
     index = filled(nodes[:5])
