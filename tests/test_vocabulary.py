@@ -25,6 +25,7 @@ PLAIN = {
     "heeds": "applies",
     "herald": "pose broadcast",
     "lately": "recently",
+    "lifeline": "parent watchdog",
     "living": "active",
     "lookalike": "alias",
     "lookalikes": "aliases",

@@ -8,7 +8,7 @@ import os
 import threading
 from collections.abc import Mapping
 
-NAME = "MAPWEAVE_LIFELINE"
+NAME = "MAPWEAVE_PARENT_WATCHDOG"
 """Set in the environment of a process with such a stdin; other processes ignore their stdin."""
 
 

@@ -112,7 +112,7 @@ def test_the_stdin_of_all_others_means_nothing(monkeypatch):
     stop = threading.Event()
     parent_watchdog.hold(stop)
     assert not stop.wait(0.2)
-    assert "lifeline" not in {thread.name for thread in threading.enumerate()}
+    assert "parent watchdog" not in {thread.name for thread in threading.enumerate()}
 
 
 def test_a_child_whose_output_finds_no_room_on_the_disk(tmp_path, monkeypatch):
