@@ -5,7 +5,6 @@ import socket
 from collections.abc import Iterator
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 
@@ -15,6 +14,7 @@ from synthetic.maps import looked_around, merger_of
 from tests.described import described_once
 from tests.examined import examined_once
 from tests.mapweave.command_line import CAMERA
+from tests.recordings import write_folder
 from tests.simulator import INSTALLED
 from tests.waiting import free_port
 
@@ -62,14 +62,8 @@ def closed() -> str:
 @pytest.fixture
 def recording(tmp_path: Path) -> Path:
     """Three grey images without a robot that moves."""
-    folder = tmp_path / "walk"
-    (folder / "images").mkdir(parents=True)
-    for k in range(3):
-        cv2.imwrite(str(folder / "images" / f"{k}.png"), np.full((48, 64), 90, np.uint8))
-    (folder / "camera.toml").write_text(CAMERA)
-    (folder / "times.txt").write_text("0.0\n0.1\n0.2\n")
-    (folder / "odometry.csv").write_text("forward_m,turn_rad\n" + "0,0\n" * 3)
-    return folder
+    images = [np.full((48, 64), 90, np.uint8)] * 3
+    return write_folder(tmp_path / "walk", images, [(0, 0)] * 3, CAMERA, timed=True)
 
 
 @pytest.fixture(scope="session")

@@ -37,6 +37,7 @@ from tests.agent.conftest import DESCRIPTION, PhotoWalls
 from tests.agent.drivers.emulators import ArduinoSketch
 from tests.mapweave.expired_key import EXPIRED, expired_key
 from tests.programs import python
+from tests.recordings import write_video
 from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[2]
@@ -162,13 +163,8 @@ def walls() -> PhotoWalls:
 
 def film(path: Path, walls: PhotoWalls, spoil=lambda image: image, moves: bool = True) -> Path:
     """A camera that moves a little, or repeats one image."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (WIDTH, HEIGHT))
-    for k in range(8):
-        image = spoil(walls.render(Pose2(0.01 * k if moves else 0.0)))
-        for _ in range(10):
-            writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
-    return path
+    images = [spoil(walls.render(Pose2(0.01 * k if moves else 0.0))) for k in range(8)]
+    return write_video(path, [image for image in images for _ in range(10)], 20.0)
 
 
 def robot_toml(folder: Path, video: Path, port: object, width: int = WIDTH) -> Path:

@@ -19,9 +19,9 @@ from mapweave.evaluation.photographs import evidence
 from mapweave.evaluation.verdict import JudgedAnswer, figures
 from mapweave.hybridmap.query import NO_COMPONENT, Certainty, RelocalizeAnswer, Whereabouts
 from tests.photo_walls import rendered, two_walls
+from tests.recordings import camera_toml, steps, write_folder
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
-CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
 
 
 def render(world_from_robot: Pose2, camera: Camera = CAMERA) -> np.ndarray:
@@ -33,11 +33,10 @@ def render(world_from_robot: Pose2, camera: Camera = CAMERA) -> np.ndarray:
 def drive(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """One robot drives ahead; another one later, next to it, then faces a blank wall behind."""
     folder = tmp_path_factory.mktemp("recordings") / "drive"
-    return recorded(folder, render, CAMERA_TOML)
+    return recorded(folder, render, camera_toml())
 
 
 SMALL = Camera(160, 120, 138.5, 138.5, 79.5, 59.5, mount_height=0.3)
-SMALL_TOML = "width = 160\nheight = 120\nfx = 138.5\nfy = 138.5\ncx = 79.5\ncy = 59.5\nheight_m = 0.3\n"
 WIDE = Camera(500, 400, 150.0, 150.0, 250.0, 200.0, mount_height=0.3)
 FISHEYE_TOML = (
     "width = 320\nheight = 240\nfx = 130.0\nfy = 130.5\ncx = 158.6\ncy = 120.9\nheight_m = 0.3\n"
@@ -54,22 +53,11 @@ def seen_by_fisheye(world_from_robot: Pose2) -> np.ndarray:
     return cv2.remap(render(world_from_robot, WIDE), at, None, cv2.INTER_LINEAR, borderValue=128)
 
 
-def recorded(folder: Path, see: Callable[[Pose2], np.ndarray], camera_toml: str) -> Path:
-    (folder / "images").mkdir(parents=True)
+def recorded(folder: Path, see: Callable[[Pose2], np.ndarray], camera: str) -> Path:
     first = [Pose2(0.03 * k, 0.0, 0.0) for k in range(36)]
     second = [Pose2(0.1 + 0.09 * k, 0.06, 0.02) for k in range(9)] + [Pose2(0.5, 0.0, math.pi)] * 3
-    with (folder / "odometry.csv").open("w") as odometry, (folder / "truth.csv").open("w") as truth:
-        odometry.write("forward_m,turn_rad\n")
-        truth.write("stamp_s,x_m,y_m,heading_rad\n")
-        before = first[0]
-        for k, pose in enumerate(first + second):
-            cv2.imwrite(str(folder / "images" / f"{k}.png"), see(pose))
-            moved = before.inverse() @ pose
-            odometry.write(f"{moved.x},{moved.heading}\n")
-            truth.write(f"{0.1 * k:.3f},{pose.x},{pose.y},{pose.heading}\n")
-            before = pose
-    (folder / "times.txt").write_text("".join(f"{0.1 * k:.3f}\n" for k in range(48)))
-    (folder / "camera.toml").write_text(camera_toml)
+    way = first + second
+    write_folder(folder, map(see, way), steps(way), camera, timed=True, truth=way)
     (folder / "splits.toml").write_text(
         '[[robot]]\nname = "a"\nfirst = 0\nlast = 35\n[[robot]]\nname = "b"\nfirst = 36\nlast = 47\n'
     )
@@ -131,7 +119,7 @@ def test_a_map_that_is_there_is_asked(drive: Path, capfd, tmp_path):
 
 
 @pytest.mark.parametrize(("see", "camera_toml"), [
-    pytest.param(lambda pose: render(pose, SMALL), SMALL_TOML, id="160x120", marks=pytest.mark.slow),
+    pytest.param(lambda pose: render(pose, SMALL), camera_toml(SMALL), id="160x120", marks=pytest.mark.slow),
     pytest.param(seen_by_fisheye, FISHEYE_TOML, id="fisheye", marks=pytest.mark.slow),
 ])  # fmt: skip
 def test_other_cameras_map_and_recognise_the_same_drive(see, camera_toml: str, capfd, tmp_path):
@@ -184,7 +172,7 @@ def test_photographs(walk: Path, capfd, tmp_path):
     # Two references changed over: what was right is wrong.
     table = (walk / "lap_truth.csv").read_text()
     (walk / "lap_truth.csv").write_text(table.replace("11,1,1,1", "11,2,2,2").replace("12,2,2,2", "12,1,1,1"))
-    (walk / "camera.toml").write_text(CAMERA_TOML)
+    (walk / "camera.toml").write_text(camera_toml())
     values = report(capfd, walk)
     assert (values["recall_at_1"], values["precision"]) == (pytest.approx(1 / 3, abs=1e-4),) * 2
 

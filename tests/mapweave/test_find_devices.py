@@ -15,6 +15,7 @@ from mapweave.doctor import camera, ports
 from mapweave.exit_status import NO
 from tests.agent.drivers.emulators import ArduinoSketch
 from tests.mapweave.command_line import complaint
+from tests.recordings import write_video
 
 
 @pytest.fixture(autouse=True)
@@ -110,17 +111,13 @@ def test_no_port_and_no_pull_are_one_line(plugged, monkeypatch, capfd, tmp_path)
 
 
 def video(path: Path, size: tuple[int, int], level: int) -> Path:
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 25.0, size)
     pattern = np.random.default_rng(1).integers(0, 256, (12, 16), np.uint8)
     image = (
         cv2.resize(pattern, size, interpolation=cv2.INTER_NEAREST)
         if level
         else np.zeros(size[::-1], np.uint8)
     )
-    for _ in range(70):
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
-    return path
+    return write_video(path, [image] * 70, 25.0)
 
 
 def test_a_frame_of_each_camera_is_saved(tmp_path, capfd):

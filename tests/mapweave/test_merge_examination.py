@@ -24,8 +24,7 @@ from mapweave.sim.renderer import Renderer
 from mapweave.sim.scene import Scene
 from mapweave.sim.world import PanelSet
 from mapweave.sim.worlds.catalog import make_world
-
-CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
+from tests.recordings import steps, write_folder
 
 
 def poses(count: int) -> list[Pose2]:
@@ -47,29 +46,20 @@ def short(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 def recorded(folder: Path, count: int) -> Path:
     """Images by the simulator's renderer, odometry that is 1 % too long, truth, two robots in splits.toml."""
-    (folder / "images").mkdir(parents=True)
     world = make_world("office", 5)
     corridor = next(room for room in world.plan.rooms if "corridor" in room.name)
     middle = Pose2(float(corridor.corners[:, 0].min()), float(corridor.corners[:, 1].mean()), 0.0)
     way = [middle @ pose for pose in poses(count)]
     renderer, scene = Renderer(WEBCAM, world.background), Scene([PanelSet.of(world.panels)])
     rng = np.random.default_rng(1)
-    before = way[0]
-    with (folder / "odometry.csv").open("w") as odometry, (folder / "truth.csv").open("w") as truth:
-        odometry.write("forward_m,turn_rad\n")
-        truth.write("stamp_s,x_m,y_m,heading_rad\n")
-        for k, pose in enumerate(way):
-            turn = np.eye(3)
-            turn[:2, :2] = pose.rotation
-            image = renderer.render(scene, turn, np.array([pose.x, pose.y, 0.0])).astype(float)
-            noisy = np.clip(image + rng.normal(0.0, 2.0, image.shape), 0, 255).astype(np.uint8)
-            cv2.imwrite(str(folder / "images" / f"{k}.png"), noisy)
-            moved = before.inverse() @ pose
-            odometry.write(f"{1.01 * moved.x},{moved.heading}\n")
-            truth.write(f"{0.1 * k:.3f},{pose.x},{pose.y},{pose.heading}\n")
-            before = pose
-    (folder / "times.txt").write_text("".join(f"{0.1 * k:.3f}\n" for k in range(len(way))))
-    (folder / "camera.toml").write_text(CAMERA_TOML)
+
+    def seen(pose: Pose2) -> np.ndarray:
+        turn = np.eye(3)
+        turn[:2, :2] = pose.rotation
+        image = renderer.render(scene, turn, np.array([pose.x, pose.y, 0.0])).astype(float)
+        return np.clip(image + rng.normal(0.0, 2.0, image.shape), 0, 255).astype(np.uint8)
+
+    write_folder(folder, map(seen, way), steps(way, 1.01), timed=True, truth=way)
     (folder / "splits.toml").write_text(
         f'[[robot]]\nname = "One"\nfirst = 0\nlast = {2 * count // 3 - 1}\n'
         f'[[robot]]\nname = "two"\nfirst = {count // 3}\nlast = {count - 1}\n'
@@ -103,14 +93,11 @@ def test_two_robots_of_one_walk_become_one_map(recording: Path, tmp_path, capsys
 def test_a_robot_that_cannot_localize_begins_another_map(recording: Path, tmp_path, monkeypatch):
     """After 60 images it stands in a world upside down, which it then drives through."""
     folder = tmp_path / "carried off"
-    (folder / "images").mkdir(parents=True)
     images = [cv2.imread(str(recording / "images" / f"{k}.png"), cv2.IMREAD_GRAYSCALE) for k in range(150)]
     shown = images[:60] + [np.flipud(images[60])] * 45 + [np.flipud(image) for image in images[60:]]
+    write_folder(folder, shown)
     rows = (recording / "odometry.csv").read_text().splitlines()
     (folder / "odometry.csv").write_text("\n".join(rows[:61] + ["0,0"] * 46 + rows[62:]) + "\n")
-    (folder / "camera.toml").write_text(CAMERA_TOML)
-    for k, image in enumerate(shown):
-        cv2.imwrite(str(folder / "images" / f"{k}.png"), image)
     monkeypatch.setattr(resumption, "TO_MAP", replace(TO_MAP, carried_views=3, carried_pause=0.1))
     made = [change for some in changes("one", Replay(folder), AgentSettings()) for change in some]
     maps = {epoch: [c for c in made if c.map == MapId("one", epoch)] for epoch in (1, 2)}

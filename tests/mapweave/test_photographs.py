@@ -20,6 +20,7 @@ from mapweave.sim.worlds.catalog import world_from_table
 from mapweave.storage.map_file import MapFile, read_map_file
 from mapweave.wire.codec import encode_body
 from tests.mapweave.command_line import complaint
+from tests.recordings import camera_toml
 
 COUNT, SPACING, PHONE = 6, 0.5, CAMERAS["phone"]
 
@@ -32,11 +33,7 @@ def stretch(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Pose2]
     taken = walk(world, PHONE, COUNT, SPACING, 4)
     for number, place in enumerate(taken):
         assert cv2.imwrite(str(folder / f"{number}.png"), place.image)
-    c = PHONE.intrinsics
-    (folder / "camera.toml").write_text(
-        f"width = {c.width}\nheight = {c.height}\nfx = {c.fx}\nfy = {c.fy}\ncx = {c.cx}\ncy = {c.cy}\n"
-        f"height_m = {c.mount_height}\ndistortion = {list(PHONE.distortion)}\n"
-    )
+    (folder / "camera.toml").write_text(camera_toml(PHONE.intrinsics, PHONE.distortion))
     return folder, [place.world_from_camera for place in taken]
 
 

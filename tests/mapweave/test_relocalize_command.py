@@ -28,9 +28,9 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.zenoh_bus import ZenohBus
 from synthetic.maps import write_store
 from tests.photo_walls import photograph, rendered
+from tests.recordings import camera_toml
 
 CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, mount_height=0.3)
-CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
 WALL = 2.4
 """Distance of the photographed wall from the node, m."""
 MOVED = Pose2(0.3, 0.1, 0.06)
@@ -75,7 +75,7 @@ def served(node: Node, tmp_path_factory: pytest.TempPathFactory) -> Iterator[str
 @pytest.fixture
 def photo(tmp_path: Path) -> Path:
     cv2.imwrite(str(tmp_path / "moved.png"), picture(MOVED))
-    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
+    (tmp_path / "camera.toml").write_text(camera_toml())
     return tmp_path / "moved.png"
 
 

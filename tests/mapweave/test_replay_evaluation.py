@@ -4,7 +4,6 @@ import json
 from dataclasses import replace
 from pathlib import Path
 
-import cv2
 import numpy as np
 import pytest
 from evo.core import metrics, sync
@@ -20,6 +19,7 @@ from mapweave.evaluation.replaying import errors, rows
 from mapweave.hybridmap.pose import Pose2
 from tests.agent.conftest import PhotoWalls
 from tests.mapweave.command_line import complaint
+from tests.recordings import steps, write_folder
 
 
 def trajectory(poses: np.ndarray) -> PoseTrajectory3D:
@@ -87,18 +87,8 @@ def test_a_geometry_that_is_declared_wrongly_is_named(recording: Path, tmp_path,
 def test_a_recording_is_scored_and_its_trajectory_is_read_by_evo(tmp_path, capfd):
     """A drive towards two walls, whose odometry is 3 % long."""
     walls, folder, out = PhotoWalls(), tmp_path / "walk", tmp_path / "out"
-    (folder / "images").mkdir(parents=True)
-    (folder / "camera.toml").write_text(
-        "width = 320\nheight = 240\nfx = 277\nfy = 277\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
-    )
-    odometry, truth = ["forward_m,turn_rad"], ["stamp_s,x_m,y_m,heading_rad"]
-    for k in range(30):
-        cv2.imwrite(str(folder / "images" / f"{k}.png"), walls.render(Pose2(0.025 * k)))
-        odometry.append(f"{0.02575 if k else 0.0},0")
-        truth.append(f"{0.1 * k},{0.025 * k},0,0")
-    (folder / "odometry.csv").write_text("\n".join(odometry) + "\n")
-    (folder / "truth.csv").write_text("\n".join(truth) + "\n")
-    (folder / "times.txt").write_text("".join(f"{0.1 * k:.1f}\n" for k in range(30)))
+    way = [Pose2(0.025 * k) for k in range(30)]
+    write_folder(folder, map(walls.render, way), steps(way, 1.03), timed=True, truth=way)
     assert main(["eval", "replay", str(folder), "--out", str(out), "--json"]) == 0
     report = json.loads(capfd.readouterr().out.splitlines()[-1])
     assert report["frames"] == 30 and report["maps"] == 1 and report["nodes"] >= 1
@@ -126,15 +116,8 @@ def test_a_corrected_geometry_makes_no_jump_in_the_trajectories(tmp_path, capfd,
     That it is found is tested with the calibration.
     """
     walls, folder, count, step = PhotoWalls(), tmp_path / "walk", 60, 0.02
-    (folder / "images").mkdir(parents=True)
-    (folder / "camera.toml").write_text(
-        "width = 320\nheight = 240\nfx = 277\nfy = 277\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
-    )
-    odometry = ["forward_m,turn_rad"]
-    for k in range(count):
-        cv2.imwrite(str(folder / "images" / f"{k}.png"), walls.render(Pose2(step * k)))
-        odometry.append(f"{step if k else 0.0},0")
-    (folder / "odometry.csv").write_text("\n".join(odometry) + "\n")
+    way = [Pose2(step * k) for k in range(count)]
+    write_folder(folder, map(walls.render, way), steps(way))
     changed = list[OnlineCalibration]()
 
     def watch(self: OnlineCalibration, *arguments: object) -> tuple[Cause, ...]:
@@ -161,17 +144,10 @@ def test_a_corrected_geometry_makes_no_jump_in_the_trajectories(tmp_path, capfd,
 def test_odometry_with_reversed_turns_is_named(times: float, words: str, tmp_path, capfd):
     """What else is named is tested with `OdometryConvention`."""
     walls, folder = PhotoWalls(), tmp_path / "walk"
-    (folder / "images").mkdir(parents=True)
-    (folder / "camera.toml").write_text(
-        "width = 320\nheight = 240\nfx = 277\nfy = 277\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
-    )
-    odometry, before = ["forward_m,turn_rad"], 0.0
-    for k in range(60):
-        heading = 0.25 * np.sin(0.15 * k)
-        cv2.imwrite(str(folder / "images" / f"{k}.png"), walls.render(Pose2(0.01 * k, 0.0, heading)))
-        odometry.append(f"{0.01 if k else 0.0},{times * (heading - before)}")
-        before = heading
-    (folder / "odometry.csv").write_text("\n".join(odometry) + "\n")
+    headings = 0.25 * np.sin(0.15 * np.arange(60))
+    turns = times * np.diff(headings, prepend=0.0)
+    images = (walls.render(Pose2(0.01 * k, 0.0, float(heading))) for k, heading in enumerate(headings))
+    write_folder(folder, images, [(0.01 if k else 0.0, turn) for k, turn in enumerate(turns)])
     for arguments in (
         ["replay", str(folder), "--offline", "--data", str(tmp_path / "data")],
         ["eval", "replay", str(folder), "--out", str(tmp_path / "out")],

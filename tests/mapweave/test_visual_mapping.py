@@ -17,6 +17,7 @@ from mapweave.sim.camera import CAMERAS
 from mapweave.sim.photographer import walk
 from mapweave.sim.worlds.catalog import world_from_table
 from tests.mapweave.command_line import complaint
+from tests.recordings import camera_toml, write_folder, write_video
 
 COUNT, SPACING, RATE, PHONE = 30, 0.1, 10.0, CAMERAS["phone"]
 
@@ -27,21 +28,9 @@ def video(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Pose2]]:
     folder = tmp_path_factory.mktemp("video")
     world = world_from_table({"kind": "office", "rooms": 2}, 4, Path())
     taken = walk(world, PHONE, COUNT, SPACING, 4)
-    write(folder / "walk.avi", [photograph.image for photograph in taken])
-    c = PHONE.intrinsics
-    (folder / "camera.toml").write_text(
-        f"width = {c.width}\nheight = {c.height}\nfx = {c.fx}\nfy = {c.fy}\ncx = {c.cx}\ncy = {c.cy}\n"
-        f"height_m = {c.mount_height}\ndistortion = {list(PHONE.distortion)}\n"
-    )
+    write_video(folder / "walk.avi", [photograph.image for photograph in taken], RATE)
+    (folder / "camera.toml").write_text(camera_toml(PHONE.intrinsics, PHONE.distortion))
     return folder / "walk.avi", [photograph.world_from_camera for photograph in taken]
-
-
-def write(path: Path, images: list[np.ndarray]) -> None:
-    height, width = images[0].shape
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE, (width, height), isColor=True)
-    for image in images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
 
 
 def frames(path: Path) -> list[np.ndarray]:
@@ -154,7 +143,9 @@ def test_a_cut_and_a_turn_on_the_spot_begin_another_map(video, tmp_path):
         matrix @ cv2.Rodrigues(np.array([0.0, 0.105 * k, 0.0]))[0] @ np.linalg.inv(matrix) for k in range(10)
     ]
     turning = [cv2.warpPerspective(images[14], turn, (c.width, c.height)) for turn in turns]
-    write(tmp_path / "cut.avi", [*images[:15], *turning, *(image[:, ::-1] for image in images[15:])])
+    write_video(
+        tmp_path / "cut.avi", [*images[:15], *turning, *(image[:, ::-1] for image in images[15:])], RATE
+    )
     files = replayed(tmp_path / "cut.avi", path.with_name("camera.toml"), tmp_path / "maps")
     assert [file.name for file in files] == ["cut.1.mapweave", "cut.2.mapweave"]
     first, second = (contents(file)[0] for file in files)
@@ -165,9 +156,8 @@ def test_a_cut_and_a_turn_on_the_spot_begin_another_map(video, tmp_path):
 def test_a_folder_of_images_without_odometry_is_mapped_as_the_video_is(made, video, tmp_path):
     path, _ = video
     folder = tmp_path / "walk"
-    (folder / "images").mkdir(parents=True)
-    for k, image in enumerate(frames(path)):
-        cv2.imwrite(str(folder / "images" / f"{k}.png"), image)
+    write_folder(folder, frames(path))
+    (folder / "camera.toml").unlink()
     (file,) = replayed(folder, path.with_name("camera.toml"), tmp_path / "maps")
     nodes, _ = contents(file)
     assert [node.stamp_ns for node in nodes] == [node.stamp_ns for node in contents(made)[0]]
@@ -182,7 +172,7 @@ def test_info_says_what_is_missing_and_damage_is_said(video, tmp_path, capfd):
     assert facts["images"] == COUNT and facts["driven_m"] is None
     assert "no scale" in facts["missing"][0]
     blank = tmp_path / "blank.avi"
-    write(blank, [np.full((240, 320), 90, np.uint8)] * 10)
+    write_video(blank, [np.full((240, 320), 90, np.uint8)] * 10, RATE)
     replayed(blank, camera, tmp_path / "none", status=1)
     output = capfd.readouterr().err.splitlines()
     assert output[-1].startswith(f"mapweave: {blank}: no two of its") and "Traceback" not in output
@@ -211,7 +201,7 @@ def test_an_evaluation_says_what_is_used_and_the_error_up_to_scale(video, tmp_pa
 def test_an_evaluation_counts_images_that_no_map_has(video, tmp_path, capfd):
     path, _ = video
     grey = [np.full((240, 320), 90, np.uint8)] * 6
-    write(tmp_path / "walk.avi", [*frames(path)[:12], *grey])
+    write_video(tmp_path / "walk.avi", [*frames(path)[:12], *grey], RATE)
     arguments = ["eval", "replay", tmp_path / "walk.avi", "--camera", path.with_name("camera.toml"), "--json"]
     assert main([str(one) for one in (*arguments, "--out", tmp_path / "out")]) == 0
     report = json.loads(capfd.readouterr().out.splitlines()[-1])

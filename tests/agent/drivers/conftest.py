@@ -4,10 +4,10 @@ from pathlib import Path
 
 import pytest
 
-from tests.agent.drivers.contract import write_video
+from tests.agent.drivers.contract import noise_video
 
 
 @pytest.fixture(scope="session")
 def video(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A minute of images for the camera."""
-    return write_video(tmp_path_factory.mktemp("video") / "noise.avi", 60.0)
+    return noise_video(tmp_path_factory.mktemp("video") / "noise.avi", 60)

@@ -13,7 +13,6 @@ from contextlib import closing
 from pathlib import Path
 from typing import Any, ClassVar
 
-import cv2
 import numpy as np
 import pytest
 
@@ -23,6 +22,7 @@ from mapweave.agent.drivers.settings import RobotSettings
 from mapweave.agent.observation import Command, Observation
 from mapweave.hybridmap.errors import InvalidValue
 from tests.programs import going
+from tests.recordings import write_video
 from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[3]
@@ -50,15 +50,11 @@ while True:
 """
 
 
-def write_video(path: Path, seconds: float) -> Path:
+def noise_video(path: Path, seconds: int) -> Path:
     """A video of noise at 20 frames a second."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (WIDTH, HEIGHT))
     noise = np.random.default_rng(0)
     frames = [noise.integers(0, 256, (HEIGHT, WIDTH, 3), dtype=np.uint8) for _ in range(4)]
-    for k in range(round(20 * seconds)):
-        writer.write(frames[k % 4])
-    writer.release()
-    return path
+    return write_video(path, frames * 5 * seconds, 20.0)
 
 
 def until(happened: Callable[[], bool], seconds: float) -> None:

@@ -14,6 +14,7 @@ from mapweave.agent.drivers.camera import Capture
 from mapweave.agent.drivers.settings import CameraSettings
 from mapweave.hybridmap.errors import DeviceError
 from tests.mjpeg_stream import MjpegStream
+from tests.recordings import write_video
 from tests.waiting import eventually
 
 WIDTH, HEIGHT = 64, 48
@@ -32,12 +33,8 @@ def shade(number: int) -> int:
 @pytest.fixture
 def clip(tmp_path: Path) -> str:
     """Frames that say their number."""
-    path = tmp_path / "clip.avi"
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), RATE, (WIDTH, HEIGHT))
-    for k in range(40):
-        writer.write(np.full((HEIGHT, WIDTH, 3), shade(k), np.uint8))
-    writer.release()
-    return str(path)
+    frames = [np.full((HEIGHT, WIDTH), shade(k), np.uint8) for k in range(40)]
+    return str(write_video(tmp_path / "clip.avi", frames, RATE))
 
 
 def test_a_file_plays_at_its_own_pace_and_gives_its_newest_frame(clip: str, opened):

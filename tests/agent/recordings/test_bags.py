@@ -37,6 +37,7 @@ from mapweave.cli import main
 from mapweave.exit_status import FAILED
 from mapweave.hybridmap.errors import DeviceError
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive, between
+from tests.recordings import write_folder
 
 STORE = get_typestore(Stores.ROS2_HUMBLE)
 STORE1 = get_typestore(Stores.ROS1_NOETIC)
@@ -505,18 +506,7 @@ def test_the_settings_name_the_topics_and_the_command_line_overrides_them(
 
 
 def test_a_recording_without_topics_does_without_those_of_the_settings(drive: Drive, tmp_path: Path) -> None:
-    folder = tmp_path / "walk"
-    (folder / "images").mkdir(parents=True)
-    c = drive.camera
-    (folder / "camera.toml").write_text(
-        f"width = {c.width}\nheight = {c.height}\nfx = {c.fx}\nfy = {c.fy}\ncx = {c.cx}\ncy = {c.cy}\n"
-        "height_m = 0.3\n"
-    )
-    for k, image in enumerate(drive.images):
-        cv2.imwrite(str(folder / "images" / f"{k}.png"), image)
-    (folder / "odometry.csv").write_text(
-        "forward_m,turn_rad\n" + "".join(f"{a},{b}\n" for a, b in drive.increments)
-    )
+    folder = write_folder(tmp_path / "walk", drive.images, drive.increments)
     options = RecordingOptions(settings=RecordingSettings(image_topic="/cam/image_raw"))
     assert len(open_recording(folder, options)) == COUNT
 

@@ -17,6 +17,7 @@ from mapweave.hybridmap.errors import DeviceError
 from mapweave.vision.equidistant import Equidistant
 from mapweave.vision.lens import NO_DISTORTION, Lens
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive
+from tests.recordings import camera_toml, write_video
 
 KNOWN = COUNT - 1
 """The odometry ends before the last image."""
@@ -75,7 +76,15 @@ def folder_with_poses(drive: Drive, folder: Path) -> None:
     (folder / "times.txt").write_text("".join(f"{s // 10**9}.{s % 10**9:09d}\n" for s in drive.stamps_ns))
 
 
-CAMERA_TOML = "width = 320\nheight = 240\nfx = 277.0\nfy = 277.0\ncx = 159.5\ncy = 119.5\nheight_m = 0.3\n"
+CAMERA_TOML = camera_toml()
+
+
+@pytest.fixture
+def camera(tmp_path: Path) -> Path:
+    """A camera file."""
+    path = tmp_path / "camera.toml"
+    path.write_text(CAMERA_TOML)
+    return path
 
 
 def test_what_a_camera_file_lacks_is_named_with_what_to_do(tmp_path):
@@ -92,12 +101,10 @@ def test_what_a_camera_file_lacks_is_named_with_what_to_do(tmp_path):
 @pytest.mark.parametrize(
     "write", [kitti, euroc, tum_rgbd, four_seasons, folder_with_poses], ids=lambda f: f.__name__
 )
-def test_a_drive_is_read_as_it_was(write, drive: Drive, poses_file: Path, tmp_path):
+def test_a_drive_is_read_as_it_was(write, drive: Drive, poses_file: Path, camera: Path, tmp_path):
     folder = tmp_path / "sequence"
     folder.mkdir()
     write(drive, folder)
-    camera = tmp_path / "camera.toml"
-    camera.write_text(CAMERA_TOML)
     if write is kitti:
         # Its times begin at 0.
         text = poses_file.read_text().splitlines()
@@ -160,15 +167,14 @@ def test_an_excerpt_of_kitti_has_the_times_that_its_images_are_named_by(drive: D
 )
 @pytest.mark.parametrize("text", [None, "intrinsics: [fx: 277.0]\nP0: 1\n"], ids=["missing", "another form"])
 def test_the_calibration_of_others_is_not_needed_beside_a_camera_file(
-    write, calibration: str, text: str | None, drive: Drive, poses_file: Path, tmp_path
+    write, calibration: str, text: str | None, drive: Drive, poses_file: Path, camera: Path, tmp_path
 ):
-    folder, camera = tmp_path / "sequence", tmp_path / "camera.toml"
+    folder = tmp_path / "sequence"
     folder.mkdir()
     write(drive, folder)
     (folder / calibration).unlink()
     if text is not None:
         (folder / calibration).write_text(text)
-    camera.write_text(CAMERA_TOML)
     with pytest.raises(NoOdometry) as found:
         open_recording(folder, RecordingOptions(camera=camera))
     assert found.value.recording.camera == drive.camera
@@ -262,13 +268,8 @@ def test_without_odometry_nothing_is_guessed(drive: Drive, tmp_path):
         open_recording(tmp_path, RecordingOptions(camera_height=0.3))
 
 
-def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, tmp_path):
-    path, camera = tmp_path / "walk.avi", tmp_path / "camera.toml"
-    camera.write_text(CAMERA_TOML)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 5.0, (320, 240), isColor=True)
-    for image in drive.images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
+def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, camera: Path, tmp_path):
+    path = write_video(tmp_path / "walk.avi", drive.images, 5.0)
     assert video_images(path).damage == ""
     with pytest.raises(DeviceError, match="video, 9 images, but no odometry"):
         open_recording(path, RecordingOptions(camera=camera))
@@ -288,14 +289,9 @@ def test_a_video_is_read_frame_by_frame_and_again_from_the_start(drive: Drive, t
     ("walk.webm", "VP80", 1.0, ""),
 ])  # fmt: skip
 def test_a_video_that_was_cut_off_says_so(
-    name: str, codec: str, share: float, says: str, drive: Drive, tmp_path
+    name: str, codec: str, share: float, says: str, drive: Drive, camera: Path, tmp_path
 ):
-    path, camera = tmp_path / name, tmp_path / "camera.toml"
-    camera.write_text(CAMERA_TOML)
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*codec), 1.0, (320, 240), isColor=True)
-    for image in drive.images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
+    path = write_video(tmp_path / name, drive.images, 1.0, codec)
     path.write_bytes(path.read_bytes()[: round(share * path.stat().st_size)])
     with pytest.raises(NoOdometry) as caught:
         open_recording(path, RecordingOptions(camera=camera))
@@ -307,18 +303,9 @@ def test_a_video_that_was_cut_off_says_so(
     )
 
 
-def written_avi(drive: Drive, path: Path) -> Path:
-    """The images of a drive, one a second, as Motion JPEG."""
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 1.0, (320, 240), isColor=True)
-    for image in drive.images:
-        writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
-    return path
-
-
 def test_a_video_that_ends_within_its_header_is_one_line(drive: Drive, tmp_path, capfd):
     """A second reader of OpenCV, which reads no more of it, added a line of its own."""
-    path = written_avi(drive, tmp_path / "walk.avi")
+    path = write_video(tmp_path / "walk.avi", drive.images, 1.0)
     path.write_bytes(path.read_bytes()[:300])
     with pytest.raises(DeviceError, match="no video that can be read"):
         video_images(path)
@@ -328,7 +315,7 @@ def test_a_video_that_ends_within_its_header_is_one_line(drive: Drive, tmp_path,
 
 def test_an_avi_whose_last_frames_cannot_be_read_says_how_long_it_should_be(drive: Drive, tmp_path):
     """As a card's bad sectors leave it: as long as it was, with an index."""
-    path = written_avi(drive, tmp_path / "walk.avi")
+    path = write_video(tmp_path / "walk.avi", drive.images, 1.0)
     data, half = path.read_bytes(), path.stat().st_size // 2
     path.write_bytes(data[:half] + bytes(len(data) - half))
     images = video_images(path)
@@ -339,16 +326,15 @@ def test_an_avi_whose_last_frames_cannot_be_read_says_how_long_it_should_be(driv
     )
 
 
-def test_a_camera_that_stops_is_named(drive: Drive, poses_file: Path, tmp_path):
+def test_a_camera_that_stops_is_named(drive: Drive, poses_file: Path, camera: Path, tmp_path):
     """The wheels go on for seven seconds. The map is of what was seen."""
     folder = tmp_path / "sequence"
     folder.mkdir()
     tum_rgbd(drive, folder)
-    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
     last = poses_file.read_text().splitlines()[-1].split(" ", 1)
     at = drive.stamps_ns[-1] / 1e9 + 7.0
     poses_file.write_text(poses_file.read_text() + f"{at:.9f} {last[1]}\n")
-    recording = open_recording(folder, RecordingOptions(camera=tmp_path / "camera.toml", odometry=poses_file))
+    recording = open_recording(folder, RecordingOptions(camera=camera, odometry=poses_file))
     assert len(recording) == COUNT
     assert recording.notes == ("the camera is silent for 7.0 s, 1.6 s after its first image",)
 
@@ -404,12 +390,13 @@ def test_wrong_poses_are_refused_in_one_line(text: str, words: str, drive: Drive
     assert words in str(error.value) and "\n" not in str(error.value)
 
 
-def test_poses_that_go_back_in_time_are_sorted_and_said(drive: Drive, poses_file: Path, tmp_path):
+def test_poses_that_go_back_in_time_are_sorted_and_said(
+    drive: Drive, poses_file: Path, camera: Path, tmp_path
+):
     folder = tmp_path / "sequence"
     folder.mkdir()
     tum_rgbd(drive, folder)
-    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
-    options = RecordingOptions(camera=tmp_path / "camera.toml", odometry=poses_file)
+    options = RecordingOptions(camera=camera, odometry=poses_file)
     before = open_recording(folder, options)
     comment, *lines = poses_file.read_text().splitlines()
     lines[4:6] = lines[5], lines[4], lines[4]
@@ -424,12 +411,11 @@ def test_poses_that_go_back_in_time_are_sorted_and_said(drive: Drive, poses_file
 
 
 @pytest.mark.parametrize("name", ["odometry.txt", "odometry.csv"])
-def test_poses_that_a_disk_has_damaged_are_used_up_to_there(name: str, drive: Drive, tmp_path):
+def test_poses_that_a_disk_has_damaged_are_used_up_to_there(name: str, drive: Drive, camera: Path, tmp_path):
     """As a loss of power leaves them: the last block is zero, or another file's."""
     folder = tmp_path / "sequence"
     folder.mkdir()
     tum_rgbd(drive, folder)
-    (tmp_path / "camera.toml").write_text(CAMERA_TOML)
     rows = [(stamp / 1e9, 0.1 * k) for k, stamp in enumerate(drive.stamps_ns)]
     lines = [f"{at:.3f} {x} 0 0 0 0 0 1" for at, x in rows]
     if name.endswith("csv"):
@@ -437,9 +423,7 @@ def test_poses_that_a_disk_has_damaged_are_used_up_to_there(name: str, drive: Dr
     whole = "\n".join(lines[:6]) + "\n"
     for rest in (bytes(512), b"17\xff\xfe" * 99):
         (tmp_path / name).write_bytes(whole.encode() + rest)
-        recording = open_recording(
-            folder, RecordingOptions(camera=tmp_path / "camera.toml", odometry=tmp_path / name)
-        )
+        recording = open_recording(folder, RecordingOptions(camera=camera, odometry=tmp_path / name))
         assert len(recording) in (5, 6)
         words = f"{tmp_path / name}: line 7: is no text; the poses before it are used"
         assert recording.damage == (words,)

@@ -3,15 +3,16 @@
 import math
 from collections.abc import Callable
 
-import cv2
 import numpy as np
 import pytest
 
+from mapweave import Camera
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.observation import Odometry
 from mapweave.agent.recordings.odometry_checks import contradiction
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array, Pose2
+from tests.recordings import camera_toml, write_folder
 
 
 def driven(seed: int, step: float = 0.02) -> Array:
@@ -64,13 +65,8 @@ def test_headings_that_were_never_filled_in_are_named(seed: int):
 
 
 def test_a_recording_with_headings_in_degrees_is_refused(tmp_path):
-    poses, folder = driven(0), tmp_path / "walk"
-    (folder / "images").mkdir(parents=True)
-    (folder / "camera.toml").write_text(
-        "width = 64\nheight = 48\nfx = 60\nfy = 60\ncx = 32\ncy = 24\nheight_m = 0.3\n"
-    )
-    for k in range(3):
-        cv2.imwrite(str(folder / "images" / f"{k}.png"), np.zeros((48, 64), np.uint8))
+    poses, camera = driven(0), Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.3)
+    folder = write_folder(tmp_path / "walk", [np.zeros((48, 64), np.uint8)] * 3, camera=camera_toml(camera))
     for times, refused in ((1.0, False), (math.degrees(1.0), True)):
         rows = [f"{0.1 * k},{x},{y},{times * heading}" for k, (x, y, heading) in enumerate(poses)]
         text = "\n".join(["stamp_s,x_m,y_m,heading_rad", *rows, ""])

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given
@@ -11,7 +10,7 @@ from hypothesis import strategies as st
 from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.recordings.odometry_checks import bridged
 from mapweave.hybridmap.pose import Array
-from tests.agent.conftest import CAMERA
+from tests.recordings import write_folder
 
 COUNT, AXLE = 80, 0.3
 STAMPS = 1_795_889_292_000_000_000 + 100_000_000 * np.arange(COUNT)
@@ -74,16 +73,8 @@ def test_an_image_that_is_late_makes_no_jump() -> None:
 
 
 def test_a_recording_with_a_wrap_is_read_without_it(tmp_path) -> None:
-    (tmp_path / "images").mkdir()
-    for k in range(COUNT):
-        cv2.imwrite(str(tmp_path / "images" / f"{k:03d}.png"), np.full((240, 320), k, np.uint8))
-    c = CAMERA
-    (tmp_path / "camera.toml").write_text(
-        f"width = 320\nheight = 240\nfx = {c.fx}\nfy = {c.fy}\ncx = {c.cx}\ncy = {c.cy}\nheight_m = 0.3\n"
-    )
-    (tmp_path / "times.txt").write_text("".join(f"{0.1 * k:.1f}\n" for k in range(COUNT)))
-    rows = "".join(f"{a!r},{b!r}\n" for a, b in wrapped(drive(), (40,), 5.59).tolist())
-    (tmp_path / "odometry.csv").write_text("forward_m,turn_rad\n" + rows)
-    replay = Replay(tmp_path)
+    images = (np.full((240, 320), k, np.uint8) for k in range(COUNT))
+    odometry = wrapped(drive(), (40,), 5.59).tolist()
+    replay = Replay(write_folder(tmp_path / "walk", images, odometry, timed=True))
     assert replay.damage == [] and ["jumps once" in note for note in replay.recording.notes] == [True]
     assert np.abs(replay.recording.increments[:, 0]).max() < 0.05
