@@ -21,7 +21,7 @@ PUT_BACK = "{} has changes of {} that this disk has lost: begin a fresh map (--f
 """Of a disk that was put back to an older state, as by a backup."""
 
 
-class Ranges:
+class SequenceRanges:
     """Changes of a log, as ranges of their numbers."""
 
     def __init__(self, last: int) -> None:
@@ -79,13 +79,13 @@ class LogState:
     stores: dict[str, int] = field(default_factory=dict)
     status_periods: dict[str, float] = field(default_factory=dict)
     left: dict[tuple[str, int], float] = field(default_factory=dict)
-    sent: Ranges = field(init=False)
+    sent: SequenceRanges = field(init=False)
     compared: bool = field(init=False)
     put_back: bool = False
 
     def __post_init__(self) -> None:
         """What is on the disk may have left before."""
-        self.sent = Ranges(self.newest)
+        self.sent = SequenceRanges(self.newest)
         self.compared = self.newest == 0
 
     @staticmethod

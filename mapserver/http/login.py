@@ -25,7 +25,7 @@ from mapweave.identities.logins import Login, Logins
 from mapweave.mapserver.http.body import JSON, read_body
 from mapweave.mapserver.http.reply import JsonLine
 from mapweave.mapserver.http.request_site import is_loopback
-from mapweave.mapserver.http.sessions import LIFE, Failures, Sessions
+from mapweave.mapserver.http.sessions import LIFE, FailedAttempts, Sessions
 from mapweave.wire.access_rules import COMMANDS, may_ask
 from mapweave.wire.conversion import json_value
 from mapweave.wire.credentials import Role
@@ -78,7 +78,7 @@ class RequestAuthorization:
         self._logins, self._patience = logins, patience
         self._sessions = Sessions()
         # Apart, so that a script with an old token does not keep its neighbour from logging in.
-        self._failed_logins, self._failed_tokens = Failures(), Failures()
+        self._failed_logins, self._failed_tokens = FailedAttempts(), FailedAttempts()
 
     def person(self, connection: HTTPConnection) -> Person:
         """Who asks.
@@ -191,7 +191,7 @@ class RequestAuthorization:
         reply.delete_cookie(name, path="/", secure=_secure(request), httponly=True, samesite="strict")
         return reply
 
-    def _checked(self, connection: HTTPConnection, token: str, failures: Failures) -> Login:
+    def _checked(self, connection: HTTPConnection, token: str, failures: FailedAttempts) -> Login:
         """Whose token it is; too many bad ones of an address are not looked at for a while."""
         assert self._logins is not None
         address = address_of(connection)

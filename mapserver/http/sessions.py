@@ -61,7 +61,7 @@ IPV6_NETWORK = 64
 """Bits: who has one address of IPv6 has all of this network."""
 
 
-class Failures:
+class FailedAttempts:
     """Failed attempts, by address; of IPv6 by network."""
 
     def __init__(self, clock: Clock = time.monotonic) -> None:

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from mapweave.agent.replication import replicator
 from mapweave.agent.replication.journal import Draft, Journal
-from mapweave.agent.replication.log_state import MOST_SERVERS, Ranges
+from mapweave.agent.replication.log_state import MOST_SERVERS, SequenceRanges
 from mapweave.agent.replication.replicator import ReplicationSettings, Replicator
 from mapweave.hybridmap.agent_status import FIRST_STATUS_PERIOD
 from mapweave.hybridmap.change import ChangeBody, NodeRetired
@@ -544,7 +544,7 @@ def test_what_later_changes_undo_leaves_the_disk_while_the_agent_runs(
 
 @given(st.integers(0, 20), st.lists(st.tuples(st.integers(1, 40), st.integers(0, 6))))
 def test_ranges_are_the_set_of_their_numbers(last: int, added: list[tuple[int, int]]):
-    ranges, numbers = Ranges(last), set(range(last + 1))
+    ranges, numbers = SequenceRanges(last), set(range(last + 1))
     for first, more in added:
         ranges.add(first, first + more)
         numbers |= set(range(first, first + more + 1))

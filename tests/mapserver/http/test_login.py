@@ -277,7 +277,7 @@ def test_failed_logins_are_limited_and_logged(keyed: Keyed, caplog: pytest.LogCa
 
 def test_what_failed_long_ago_is_forgotten() -> None:
     now = [0.0]
-    failures = sessions.Failures(lambda: now[0])
+    failures = sessions.FailedAttempts(lambda: now[0])
     for _ in range(sessions.MOST_FAILURES):
         failures.add("10.0.0.1")
     assert failures.wait("10.0.0.1") == sessions.WINDOW and failures.wait("10.0.0.2") == 0.0
@@ -290,7 +290,7 @@ def test_what_failed_long_ago_is_forgotten() -> None:
 
 def test_addresses_of_one_ipv6_network_are_one() -> None:
     """Each of a network's 2^64 addresses had ten attempts of its own, each a line of the log."""
-    failures = sessions.Failures(lambda: 0.0)
+    failures = sessions.FailedAttempts(lambda: 0.0)
     for number in range(sessions.MOST_FAILURES):
         failures.add(f"2001:db8:0:1::{number:x}")
     assert failures.wait("2001:db8:0:1:ffff::1") == sessions.WINDOW == failures.wait("2001:db8:0:1::0%eth0")
