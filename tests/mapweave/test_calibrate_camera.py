@@ -22,6 +22,7 @@ from mapweave.vision.calibration.target_pdf import target_pdf
 from mapweave.vision.lens import Lens
 from tests.mapweave.command_line import complaint
 from tests.quick import first_quick
+from tests.recordings import write_video
 from tests.vision.calibration.boards import bitmap, drawn_view, pixels_of, read_page
 
 SIZE = (320, 240)
@@ -192,13 +193,12 @@ def test_the_page_shows_the_camera_and_the_guidance(frames):
 
 
 def test_a_video_is_read_where_the_board_is_still(frames, capfd, tmp_path):
-    path = str(tmp_path / "board.avi")
-    writer = cv2.VideoWriter(path, cv2.VideoWriter_fourcc(*"FFV1"), 10.0, SIZE)
-    for image in frames["pinhole"][:12]:
-        for _ in range(2):
-            writer.write(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR))
-    writer.release()
-    assert main(["calibrate", "camera", path, "--lens", "radial-tangential", "--json", *OPTIONS]) in (0, NO)
+    twice = [image for image in frames["pinhole"][:12] for _ in range(2)]
+    path = write_video(tmp_path / "board.avi", twice, 10.0, "FFV1")
+    assert main(["calibrate", "camera", str(path), "--lens", "radial-tangential", "--json", *OPTIONS]) in (
+        0,
+        NO,
+    )
     report = json.loads(capfd.readouterr().out.splitlines()[-1])
     assert 8 <= report["views"] <= 12, "a view of each place: the frame after the board has stopped"
     assert report["fx"] == pytest.approx(280.0, rel=0.05)
