@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor, wait
 
 import cv2
 import numpy as np
@@ -152,13 +152,15 @@ def test_a_robot_that_hangs_holds_up_few_people(
     robot.bus.serve(KEYS.view("r0"), held.append)
     robot.bus.announce(KEYS.view("r0"))
     eventually(lambda: not views.why_none(NODE))
-    with ThreadPoolExecutor(node_views.MOST_ASKED) as people:
+    with ThreadPoolExecutor(node_views.MOST_ASKED + 1) as people:
         waiting = [people.submit(views.view, NODE) for _ in range(node_views.MOST_ASKED)]
         eventually(lambda: len(held) == node_views.MOST_ASKED)
-        with pytest.raises(Busy):
-            views.view(NODE)
+        one_more = people.submit(views.view, NODE)
+        refused = wait([one_more], 5.0).done
         for request in held:
             request.reply(encode(ViewImage(NODE, JPEG)))
+        assert refused, "one more waits for the robot as well"
+        assert isinstance(one_more.exception(), Busy)
         assert len({one.result(60.0) for one in waiting}) == 1
     assert views.view(NODE)
 

@@ -94,6 +94,20 @@ def test_names_and_keys_fill_no_memory(watching: Watching, monkeypatch: pytest.M
     eventually(lambda: watching.news[-1:] and watching.news[-1] == ("long/alive/1", True))
 
 
+def test_tokens_of_one_robot_leave_room_for_others(
+    watching: Watching, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(alive_keys, "MOST", 2 * alive_keys.MOST_OF_ONE)
+    for number in range(1000):
+        watching.note(f"r3/alive/{number}", True)
+    watching.note("r0/alive/1", True)
+    eventually(lambda: len(watching.news) > alive_keys.MOST_OF_ONE)
+    assert ("r0/alive/1", True) in watching.news
+    assert len(watching.news) == alive_keys.MOST_OF_ONE + 1
+    assert "512 liveliness tokens left out so far, the last of " in caplog.text
+    assert len(caplog.records) == 10, "a line at each power of two"
+
+
 def test_tokens_of_ros_2_are_no_robots(watching: Watching) -> None:
     for number in range(2 * alive_keys.MOST_OF_ONE):
         watching.keys.note(f"@ros2_lv/0/session/0/{number}/MP/%/%/node/%chatter", True)

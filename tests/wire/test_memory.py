@@ -10,6 +10,7 @@ import pytest
 
 from mapweave.hybridmap.errors import InvalidMessage, SettingsError
 from mapweave.hybridmap.ids import MapId
+from mapweave.wire import dispatch
 from mapweave.wire.bus import Reply, Request, Sample
 from mapweave.wire.bus_settings import BusSettings
 from mapweave.wire.dispatch import EVERY, Dispatcher, Failures
@@ -180,6 +181,15 @@ def test_what_a_robot_sends_wrong_fills_no_log() -> None:
     assert counted.count(keys.agent_status("r0")) == " (500 more of r0 within 60 s)"
     assert counted.count(keys.agent_status("r1")) == ""
     assert [counted.count(keys.server_status("s0")) for _ in range(3)] == [""] * 3, "a defect of its own"
+
+
+def test_names_of_robots_whose_messages_are_wrong_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(dispatch, "MOST_ROBOTS", 10)
+    failures = Failures(clock=lambda: 0.0)
+    for number in range(100):
+        assert failures.count_of(f"x{number}") == ""
+    assert len(failures._since) == 10
+    assert failures.count_of("x99") is None
 
 
 def test_a_flood_of_wrong_messages_is_one_line(hub: MemoryHub, caplog: pytest.LogCaptureFixture) -> None:
