@@ -131,6 +131,21 @@ def test_an_invalid_value_is_noticed():
         check_again(3, lambda value: bytes([value]), lambda data: data[0] + 1)
 
 
+@pytest.mark.parametrize(("begins", "ends", "hangs"), [(0.5, 0.0, 0), (0.0, 9.0, 1), (9.0, 0.0, 1)])
+def test_a_process_that_begins_late_is_no_hang_and_one_that_never_ends_is(
+    tmp_path, monkeypatch, begins: float, ends: float, hangs: int
+):
+    process = tmp_path / "process"
+    counts = '{"inputs": 1, "hangs": 0, "crashes": 0}'
+    process.write_text(f"#!/bin/sh\nsleep {begins}\necho '{counts}' > $4/counts.json\nexec sleep {ends}\n")
+    process.chmod(0o700)
+    monkeypatch.setattr(benchmark.sys, "executable", str(process))
+    monkeypatch.setattr(benchmark, "START", 2.0)
+    monkeypatch.setattr(benchmark, "GRACE", 0.2)
+    row = benchmark.fuzz_one("lines", tmp_path, 0.0, 1)
+    assert row["hangs"] == hangs and not row["crashes"]
+
+
 @pytest.mark.slow
 def test_the_command_prints_its_counts(capsys):
     status = benchmark.main(["--seconds", "1", "--targets", "lines", "poses", "--json"])
