@@ -90,9 +90,8 @@ def test_a_replay_is_read_back_as_it_was(drive: Path, tmp_path, capfd, signals: 
     clear, dots, *shapes = said["/landmarks"][-1][1].markers
     seen = np.array([(point.x, point.y, point.z) for point in dots.points])
     assert clear.action == clear.DELETEALL and len(seen) > 10 and (seen[:, 0] > 0.1).all()
-    assert len(shapes) > 10 and {(shape.type, shape.header.frame_id) for shape in shapes} == {
-        (SPHERE, "base_footprint")
-    }
+    assert len(shapes) > 10
+    assert {(shape.type, shape.header.frame_id) for shape in shapes} == {(SPHERE, "base_footprint")}
     assert said["/status"][-1][1].data.startswith("carried")
 
 

@@ -216,9 +216,8 @@ def test_an_event_is_one_line_whatever_is_in_it():
     console, file = plain()
     EventLog(console)("give [robot.options] a port,\nfor example [bold]" + 30 * " /dev/ttyUSB0")
     line = file.getvalue()
-    assert line.count("\n") == 1 and re.match(
-        STAMP + r"give \[robot.options\] a port, for example \[bold\] /dev", line
-    )
+    assert line.count("\n") == 1
+    assert re.match(STAMP + r"give \[robot.options\] a port, for example \[bold\] /dev", line)
 
 
 def test_progress_is_a_plain_line_now_and_then_where_there_is_no_terminal():
