@@ -83,13 +83,8 @@ def firefox(folder: Path) -> Iterator[Page]:
     """Firefox without a window, with a profile of its own in a folder."""
     port, opened, stack = free_port(), list[ClientConnection](), ExitStack()
     command = [
-        "firefox-esr",
-        "--headless",
-        "--no-remote",
-        "--profile",
-        folder,
-        f"--remote-debugging-port={port}",
-    ]
+        "firefox-esr", "--headless", "--no-remote", "--profile", folder, f"--remote-debugging-port={port}",
+    ]  # fmt: skip
     browser = subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
 
     def ready() -> bool:

@@ -81,13 +81,9 @@ def test_a_picture_of_the_page_is_drawn_when_the_page_shows_something_else(tmp_p
     path = tmp_path / "page.png"
     cv2.imwrite(str(path), np.full((4, 5, 3), 100, np.uint8))
     for words, grey, expected in (
-        ("live", 100, 100),
-        ("live", 140, 100),
-        ("87 nodes", 101, 100),
-        ("87 nodes", 140, 140),
-        ("live", 140, 140),
-        ("live", 100, 100),
-    ):
+        ("live", 100, 100), ("live", 140, 100), ("87 nodes", 101, 100), ("87 nodes", 140, 140),
+        ("live", 140, 140), ("live", 100, 100),
+    ):  # fmt: skip
         page_picture.keep(DrawnPage(words, grey), path)
         assert cv2.imread(str(path))[0, 0, 0] == expected, (words, grey)
         assert list(tmp_path.iterdir()) == [path]

@@ -213,13 +213,8 @@ def test_a_small_fleet_is_measured_as_a_whole():
     assert 4 <= row["acked_per_s"] * 12 <= 4 * 2 * 2
     assert 0.0 < row["ack_p50_ms"] <= row["ack_p99_ms"] and row["relocalize_p95_ms"] > 0.0
     for name in (
-        "connected_s",
-        "server_cpu",
-        "router_cpu",
-        "generator_cpu",
-        "server_rss_mb",
-        "burst_generator_ms",
-    ):
+        "connected_s", "server_cpu", "router_cpu", "generator_cpu", "server_rss_mb", "burst_generator_ms",
+    ):  # fmt: skip
         assert row[name] > 0.0, name
     # Of 40 changes these may take less than the 10 ms in which a process's time is counted.
     assert row["burst_server_ms"] >= 0.0 <= row["burst_router_ms"]

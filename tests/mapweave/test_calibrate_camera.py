@@ -75,22 +75,18 @@ def test_images_become_settings_that_an_agent_reads(name, true, frames, capfd, t
         '# a robot\n[robot]\ndriver = "koala"\n\n[robot.camera]\nsource = "2"  # front\n\n[agent]\n'
     )
     images = folder_of(frames[name], tmp_path / "views")
-    assert (
-        main(
-            [
-                "calibrate",
-                "camera",
-                str(images),
-                "--settings",
-                str(robot),
-                "--height",
-                "0.25",
-                "--json",
-                *OPTIONS,
-            ]
-        )
-        == 0
-    )
+    words = [
+        "calibrate",
+        "camera",
+        str(images),
+        "--settings",
+        str(robot),
+        "--height",
+        "0.25",
+        "--json",
+        *OPTIONS,
+    ]
+    assert main(words) == 0
     report = json.loads(capfd.readouterr().out.splitlines()[-1])
     assert report["written"] and report["uncertainty_px"] < 0.7
     assert min(report["held_out_px"].values()) < 0.3
@@ -221,11 +217,8 @@ def test_the_result_is_shown_where_it_is_not_written(frames, capfd, tmp_path):
     *_, why, width, height, fx, _, _, _, lens, distortion = capfd.readouterr().out.splitlines()
     assert why == "no --settings FILE: nothing is written. For [robot.camera], or a recording's camera.toml:"
     assert (width, height, fx[:8], lens) == (
-        "width = 320",
-        "height = 240",
-        "fx = 279",
-        'lens = "radial-tangential"',
-    )
+        "width = 320", "height = 240", "fx = 279", 'lens = "radial-tangential"',
+    )  # fmt: skip
     robot = tmp_path / "r0.toml"
     robot.write_text("robot = { camera = { height_m = 0.3 } }\n")
     again = ["--lens", "radial-tangential", "--settings", str(robot)]

@@ -82,12 +82,9 @@ def test_a_map_with_singular_and_huge_covariances_is_solved(tmp_path):
 def test_settings(tmp_path, capfd, recording):
     path = tmp_path / "robot.toml"
     for command in (
-        ["agent", "r0"],
-        ["server"],
-        ["sim", "run", "office"],
-        ["sim", "serve", "office"],
+        ["agent", "r0"], ["server"], ["sim", "run", "office"], ["sim", "serve", "office"],
         ["replay", recording, "--offline"],
-    ):
+    ):  # fmt: skip
         assert "no such file" in complaint(capfd, *command, "--settings", path.with_name("none.toml"))
         path.write_text("[netwrok]")
         assert "did you mean 'network'?" in complaint(capfd, *command, "--settings", path)

@@ -39,11 +39,8 @@ pytestmark = pytest.mark.usefixtures("signals", "simulator")
 def test_endpoints(endpoint, capfd, recording, tmp_path):
     picture = recording / "images" / "0.png"
     for command in (
-        ["agent", "r0"],
-        ["sim", "serve", "office"],
-        ["relocalize", picture],
-        ["replay", recording],
-    ):
+        ["agent", "r0"], ["sim", "serve", "office"], ["relocalize", picture], ["replay", recording],
+    ):  # fmt: skip
         assert "endpoint" in complaint(capfd, *command, "--connect", endpoint, status=USAGE)
     assert "endpoint" in complaint(capfd, "server", "--listen", endpoint, "--data", tmp_path, status=USAGE)
 

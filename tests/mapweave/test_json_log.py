@@ -88,11 +88,8 @@ def test_fields_are_those_of_the_message_and_those_that_are_given(lines: io.Stri
     first, second, third = objects(lines.getvalue())
     assert first["message"] == "two lines of r0.1.7 and r1.2"
     assert (first["node"], first["map"], first["robot"], first["reason"]) == (
-        "r0.1.7",
-        "r0.1",
-        "r0",
-        "ünknown",
-    )
+        "r0.1.7", "r0.1", "r0", "ünknown",
+    )  # fmt: skip
     assert second["robot"] == "r9" and "map" not in second
     assert "ValueError: cause" in third["exception"] and third["level"] == "error"
 

@@ -99,14 +99,8 @@ def test_a_link_is_explained_and_drawn(files: list[Path], said: Said, tmp_path):
     picture = tmp_path / "pictures" / "link.png"
     out = said("map", "explain", *pair, "--map", files[3], "--draw", picture)
     for word in (
-        "are linked: ",
-        "b seen from a",
-        "residuals",
-        "in the map",
-        "probability",
-        "other links",
-        "evidence",
-    ):
+        "are linked: ", "b seen from a", "residuals", "in the map", "probability", "other links", "evidence",
+    ):  # fmt: skip
         assert word in out
     image = cv2.imread(str(picture))
     assert image is not None and image.shape[1] > 1000
@@ -424,12 +418,8 @@ def test_a_restarted_server_keeps_manual_constraints(files: list[Path], said: Sa
         history = json.loads(said("map", "history", "--json", *at))["history"]
         # What the first server saw, too; a restarted server does not report joined maps again.
         assert [event["kind"] for event in history] == [
-            "joined",
-            "constrained",
-            "parted",
-            "constrained",
-            "joined",
-        ]
+            "joined", "constrained", "parted", "constrained", "joined",
+        ]  # fmt: skip
         assert "two kitchens" in history[1]["words"] and "two kitchens" in history[2]["words"]
         assert [event["stamp_ns"] for event in history] == sorted(event["stamp_ns"] for event in history)
         lines = said("map", "history", "--most", "2", *at).splitlines()

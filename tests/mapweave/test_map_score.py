@@ -182,12 +182,10 @@ def test_the_same_place_is_near_with_a_similar_heading_and_no_wall_between():
     here = np.array([[0.0, 0.0, math.radians(170)]])
     there = np.array(
         [
-            [0.9, 0, math.radians(-165)],
-            [1.1, 0, math.radians(170)],
-            [0, 0.9, math.radians(-155)],
+            [0.9, 0, math.radians(-165)], [1.1, 0, math.radians(170)], [0, 0.9, math.radians(-155)],
             [0, -0.9, 2.9],
         ]
-    )
+    )  # fmt: skip
     wall = Rectangle.spanning(-1, -0.5, 1, -0.4)
     assert same_place(here, there, []).tolist() == [[True, False, False, True]]
     assert same_place(here, there, [wall]).tolist() == [[True, False, False, False]]

@@ -42,12 +42,8 @@ def test_a_replay_is_read_back_as_it_was(drive: Path, tmp_path, capfd, signals: 
     stamps = [stamp for stamp, _ in said["/status"]]
     assert len(stamps) == COUNT and len(set(np.diff(stamps))) == 1
     for topic in (
-        "/camera/image/compressed",
-        "/camera/tracks",
-        "/camera/camera_info",
-        "/landmarks",
-        "/cmd_vel",
-    ):
+        "/camera/image/compressed", "/camera/tracks", "/camera/camera_info", "/landmarks", "/cmd_vel",
+    ):  # fmt: skip
         assert [stamp for stamp, _ in said[topic]] == stamps, topic
     # The image, but for what JPEG loses; the tracks are in it.
     for k in (0, COUNT - 1):

@@ -137,10 +137,7 @@ def test_drives_among_nodes_of_others_are_kept(tmp_path):
         return EdgePut(Edge(NodeId(*MAP, number), a, other, here, EdgeKind.DRIVEN))
 
     log = [
-        node(1),
-        node(2),
-        driven(3, NodeId(*MAP, 1)),
-        driven(4, NodeId(*MAP, 2)),
+        node(1), node(2), driven(3, NodeId(*MAP, 1)), driven(4, NodeId(*MAP, 2)),
         driven(5, NodeId("r1", 1, 3)),
-    ]
+    ]  # fmt: skip
     assert numbers(kept_of(tmp_path / "j", log, damage=(2,))) == [1, 3, 5]

@@ -42,11 +42,8 @@ class Fleet:
         self.folder = KeyFolder.create(folder, "demo", profile, [], "s0", port)
         self.endpoint = self.folder.catalogue.endpoints[0]
         for name, role in (
-            ("r0", Role.ROBOT),
-            ("r1", Role.ROBOT),
-            ("anna", Role.OPERATOR),
-            ("bob", Role.VIEWER),
-        ):
+            ("r0", Role.ROBOT), ("r1", Role.ROBOT), ("anna", Role.OPERATOR), ("bob", Role.VIEWER),
+        ):  # fmt: skip
             self.folder.add(name, role)
         self.router = ZenohBus(self.folder.router("s0", [self.endpoint]))
         self.open: list[ZenohBus] = []

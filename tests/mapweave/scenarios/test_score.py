@@ -275,12 +275,8 @@ def test_an_empty_trial_is_scored_without_dividing_by_nothing(staged):
     figures = score(replace(staged.recording(sim_s=0.0, wall_s=0.0), recoveries_s=(3.0, 8.0, 1.0)))
     assert (figures.components, figures.maps, figures.nodes, figures.links) == (0, 0, 0, 0)
     for name in (
-        "merged_ate_m",
-        "bytes_per_node",
-        "map_bytes_per_robot_minute",
-        "real_time_factor",
-        "link_recall",
-    ):
+        "merged_ate_m", "bytes_per_node", "map_bytes_per_robot_minute", "real_time_factor", "link_recall",
+    ):  # fmt: skip
         assert getattr(figures, name) is None
     assert figures.recovery_s == 8.0
     assert "nan" not in str(figures.as_dict()).lower()
