@@ -301,7 +301,7 @@ class Pipeline:
             given_up=navigator is not None and navigator.given_up,
             progress=0.0 if navigator is None else navigator.progress,
             located=not isinstance(self._mission, GoTo) and self._map_making.located,
-            tally=NOTHING_DRIVEN if self._navigator is None else self._navigator.tally,
+            drive=NOTHING_DRIVEN if self._navigator is None else self._navigator.statistics,
             passed=0 if drive is None else drive.passed,
             portal=None if drive is None else drive.portal,
             covariance=(float(c[0, 0]), float(c[0, 1]), float(c[1, 1]), float(c[2, 2])),

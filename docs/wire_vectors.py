@@ -218,7 +218,7 @@ def status() -> AgentStatus:
     """The status of a robot that drives to a goal."""
     pipeline = Status(
         "driving to the goal", "3 nodes to go", 17, 40, HERE.mean, False, "goto", NODE, Pose2(0.1, 0.0, 0.25),
-        5, progress=0.25, tally=DriveStatistics(4, 1, 1, 0), covariance=(0.25, 0.0, 0.25, 0.0625),
+        5, progress=0.25, drive=DriveStatistics(4, 1, 1, 0), covariance=(0.25, 0.0, 0.25, 0.0625),
     )  # fmt: skip
     return AgentStatus(
         pipeline,

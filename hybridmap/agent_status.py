@@ -60,7 +60,7 @@ class Status:
         located: whether `map_from_robot` comes from this observation.
         given_up: whether it stands, since the goal cannot be reached; `detail` is the reason.
         progress: share of the present route that is driven.
-        tally: statistics of the drive so far.
+        drive: statistics of the drive so far.
         passed: how many of the nodes that it must pass before its goal it has passed.
         portal: the portal at which it waits; None while it drives.
         covariance: of the pose by which the robot knows itself, in its own frame: xx, xy, yy, m^2, and of the
@@ -82,7 +82,7 @@ class Status:
     located: bool = False
     given_up: bool = False
     progress: Share = 0.0
-    tally: DriveStatistics = NOTHING_DRIVEN
+    drive: DriveStatistics = NOTHING_DRIVEN
     passed: Number = 0
     portal: PortalWait | None = None
     covariance: tuple[Amount, float, Amount, Amount] = (0.0, 0.0, 0.0, 0.0)

@@ -75,7 +75,7 @@ class Navigator:
         passed: nodes to pass before that it has passed.
         legs: nodes on the first route that was given.
         progress: share of the present route that is driven.
-        tally: statistics of the drive so far.
+        statistics: of the drive so far.
         losses: how often it did not see where it is for so long that it took itself for lost.
         traverse: from one node to another, if the last step has ended one.
         refined: a node of the own map that was refined by the last step, if any.
@@ -110,7 +110,7 @@ class Navigator:
         self._via = list(via)
         self.legs = 0
         self.progress = 0.0
-        self.tally = DriveStatistics()
+        self.statistics = DriveStatistics()
         self.losses = 0
         self.traverse: Traverse | None = None
         self.refined: Node | None = None
@@ -257,7 +257,7 @@ class Navigator:
         self.detail, self.fix = self._positioning.detail, fix
         self._trial.found(self._positioning.place)
         if fix is not None:
-            self.tally = self.tally.found()
+            self.statistics = self.statistics.found()
 
     def _get_route(self, fix: Fix, goal: NodeId) -> Generator[Command, None, RouteAnswer]:
         """Ask for a way."""
@@ -304,7 +304,7 @@ class Navigator:
             self.fix, self.stage = follower.fix, follower.progress
             self.detail = "; ".join(filter(None, (follower.detail, self._detour)))
             self.progress = follower.leg / len(route)
-            self.tally = self.tally.passed([follower.distance(k) for k in range(leg, follower.leg)])
+            self.statistics = self.statistics.passed([follower.distance(k) for k in range(leg, follower.leg)])
             if follower.fix.in_sight:
                 self._positioning.failed_views = 0
                 self._trial.saw(follower.fix.node)
@@ -346,7 +346,7 @@ class Navigator:
 
     def _reach(self) -> None:
         """The robot is where the route ends: at the goal, or at a portal on the way there."""
-        self.tally = self.tally.passed([0.0])
+        self.statistics = self.statistics.passed([0.0])
         if self._portal is not None:
             self._reach_stop()
             self.stage = NavigationStage.PORTAL
@@ -417,7 +417,7 @@ class Navigator:
             return
         self._trial.blocked()
         self._blocks.add(a, b, now, obstacle)
-        self.tally = self.tally.blocked()
+        self.statistics = self.statistics.blocked()
         where = f"between {a} and {b}" if a != b else f"on the way to {b}"
         self._patience.block(where, obstacle.robot if obstacle else "", now)
         self.stage, self.detail = NavigationStage.BLOCKED, f"{where}: {words}"

@@ -66,7 +66,7 @@ def main() -> None:
 def summary(outcomes: Sequence[NavigationOutcome]) -> Figures:
     """The figures of all drives. Errors and ratios are medians over the drives that said they had arrived."""
     there = [one for one in outcomes if one.status.finished]
-    tallies = [one.status.tally for one in outcomes]
+    drives = [one.status.drive for one in outcomes]
 
     def median(values: Sequence[float]) -> float | None:
         return round(statistics.median(values), 5) if values else None
@@ -79,10 +79,10 @@ def summary(outcomes: Sequence[NavigationOutcome]) -> Figures:
         "goal_error_m_max": round(max((one.error_m for one in there), default=0.0), 5) if there else None,
         "goal_error_deg_median": median([one.error_deg for one in there]),
         "collisions": sum(one.collisions for one in outcomes),
-        "edges_driven": sum(tally.edges for tally in tallies),
-        "nodes_skipped": sum(tally.skipped for tally in tallies),
-        "relocalizations": sum(tally.relocalizations for tally in tallies),
-        "blocks": sum(tally.blocks for tally in tallies),
+        "edges_driven": sum(one.edges for one in drives),
+        "nodes_skipped": sum(one.skipped for one in drives),
+        "relocalizations": sum(one.relocalizations for one in drives),
+        "blocks": sum(one.blocks for one in drives),
         "path_over_shortest": median([one.path_over_shortest for one in there]),
         "found_s_median": median([one.found_s for one in outcomes if one.found_s is not None]),
         "time_s_median": median([one.time_s for one in there]),
@@ -151,13 +151,13 @@ def _table(outcomes: Sequence[NavigationOutcome], seed: int) -> Table:
                  "lost", "blocked", "outcome"):  # fmt: skip
         table.add_column(name, justify="left" if name in ("goal", "outcome") else "right")
     for number, one in enumerate(outcomes, start=1):
-        tally = one.status.tally
+        drove = one.status.drive
         table.add_row(
             str(number), str(one.plot.goal), str(one.plot.edges),
             "-" if one.found_s is None else f"{one.found_s:.1f}",
             f"{one.time_s:.0f}", f"{one.error_m * 1000:.0f}", f"{one.error_deg:.2f}",
-            f"{one.path_over_shortest:.2f}", str(tally.edges), str(tally.skipped),
-            str(tally.relocalizations), str(tally.blocks), one.reason or "there",
+            f"{one.path_over_shortest:.2f}", str(drove.edges), str(drove.skipped),
+            str(drove.relocalizations), str(drove.blocks), one.reason or "there",
         )  # fmt: skip
     return table
 

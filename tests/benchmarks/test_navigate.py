@@ -109,7 +109,7 @@ def test_a_map_that_is_too_small_is_refused(mapped: Mapped, floor: FreeFloor):
 def outcome(mapped: Mapped, **other: object) -> NavigationOutcome:
     goal = max(mapped.truth)
     plot = Plot(Pose2(0.5, 0.5), goal, mapped.truth[goal], 5, 2.0)
-    status = Status("parked at the goal", "", 10, 0, Pose2(), True, tally=DriveStatistics(4, 1, 2, 0))
+    status = Status("parked at the goal", "", 10, 0, Pose2(), True, drive=DriveStatistics(4, 1, 2, 0))
     picture = np.zeros((4, 4), np.uint8)
     one = NavigationOutcome(
         plot, status, "", 1.0, 30.0, 0.004, 0.3, 0, 3.0, (), picture, picture, np.zeros((2, 2))
@@ -118,7 +118,7 @@ def outcome(mapped: Mapped, **other: object) -> NavigationOutcome:
 
 
 def test_figures_count_failures_as_such(mapped: Mapped):
-    away = Status("driving along the route", "", 10, 0, Pose2(), False, tally=DriveStatistics(1, 0, 1, 3))
+    away = Status("driving along the route", "", 10, 0, Pose2(), False, drive=DriveStatistics(1, 0, 1, 3))
     outcomes = [
         outcome(mapped),
         outcome(mapped, error_m=0.006, driven=2.2),

@@ -29,7 +29,7 @@ def test_bytes_are_those_of_today(tmp_path):
     node = NodeId("r0", 3, 17)
     doing = Status(
         "driving to the goal", "3 nodes to go", 17, 40, Pose2(1.25, -2.0, 0.5), False, "goto", node,
-        Pose2(0.1, 0.0, 0.25), 5, progress=0.25, tally=DriveStatistics(4, 1, 1, 0),
+        Pose2(0.1, 0.0, 0.25), 5, progress=0.25, drive=DriveStatistics(4, 1, 1, 0),
         covariance=(0.25, 0.0, 0.25, 0.0625),
     )  # fmt: skip
     order = MissionOrder("7f3a9c", "r0", MissionKind.GO, 1_700_000_000_123_456_789, "anna", node, "kitchen")

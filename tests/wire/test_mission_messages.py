@@ -33,7 +33,7 @@ statuses = st.builds(
     doing=words, detail=words, nodes=st.integers(0, 10**6), tracked=st.integers(0, 500),
     map_from_robot=st.builds(Pose2, finite, finite, finite), finished=st.booleans(), mission=words,
     fix_node=st.none() | node_ids, node_from_robot=st.builds(Pose2, finite, finite, finite),
-    legs=st.integers(0, 1000), tally=st.builds(DriveStatistics, counts, counts, counts, counts),
+    legs=st.integers(0, 1000), drive=st.builds(DriveStatistics, counts, counts, counts, counts),
 )  # fmt: skip
 
 

@@ -62,7 +62,7 @@ def test_it_drives_elsewhere_to_tell_two_places_apart(home):
     trial.run(60.0, lambda: trial.navigator.fix is not None)
     assert trial.navigator.fix is not None and trial.navigator.fix.node == A
     assert any("driving on to search from elsewhere" in detail for _, detail in trial.said)
-    assert trial.navigator.tally == DriveStatistics(relocalizations=1)
+    assert trial.navigator.statistics == DriveStatistics(relocalizations=1)
     turned = sum(abs(command.turn) for command in trial.commands) * BODY.tick
     assert turned > math.tau, "first it looked all around"
 
@@ -104,11 +104,11 @@ def test_two_similar_own_nodes_are_ambiguous(home):
     eyes = Eyes(home, TOUR[0])
     alone = Trial(navigator(eyes, HybridMap([NodePut(first)]), C), eyes, found)
     alone.run(2.0)
-    assert alone.navigator.tally.relocalizations, "one of them alone is recognised at once"
+    assert alone.navigator.statistics.relocalizations, "one of them alone is recognised at once"
     eyes = Eyes(home, TOUR[0])
     trial = Trial(navigator(eyes, alike, C), eyes, found)
     trial.run(2.0)
-    assert not trial.navigator.tally.relocalizations and trial.navigator.fix is None
+    assert not trial.navigator.statistics.relocalizations and trial.navigator.fix is None
     assert any(isinstance(question, WhereAmI) for question in trial.asked)
 
 
@@ -140,7 +140,7 @@ def test_a_place_with_a_twin_in_another_robots_map_is_not_accepted(home, own_map
         lambda question: found(question, here(min(own_map.nodes), Pose2()), here(B, Pose2())),
     )  # fmt: skip
     trial.run(30.0)
-    assert not trial.navigator.tally.relocalizations
+    assert not trial.navigator.statistics.relocalizations
 
 
 def test_the_fleet_has_priority_over_the_own_map(home, own_map):

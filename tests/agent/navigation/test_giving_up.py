@@ -1,7 +1,5 @@
 """A goal that does not exist, or that nothing leads to: the robot gives it up and says why."""
 
-from __future__ import annotations
-
 import pytest
 
 from mapweave.agent.motion_primitives import NO_ANSWER
@@ -38,7 +36,7 @@ def test_a_goal_that_does_not_exist_is_given_up_with_the_reason(home):
     """Before, the robot alternated for ever between waiting and looking: 56 relocalizations in 135 s."""
     trial = trial_without_a_route(home, RouteAnswer((), f"goal {UNKNOWN} is not in the merged map"))
     trial.run(135.0, lambda: trial.navigator.given_up)
-    assert trial.navigator.tally.relocalizations == 2, "its pose may be wrong: it looks once more"
+    assert trial.navigator.statistics.relocalizations == 2, "its pose may be wrong: it looks once more"
     assert trial.navigator.stage == NavigationStage.GIVEN_UP and not trial.navigator.arrived
     assert f"goal {UNKNOWN} is not in the merged map" in trial.navigator.detail
     asked = len(trial.asked)
@@ -50,7 +48,7 @@ def test_a_goal_that_does_not_exist_is_given_up_with_the_reason(home):
 def test_without_a_server_it_waits_for_one_before_it_gives_up(home):
     trial = trial_without_a_route(home, None, NavigatorSettings(patience=60.0))
     trial.run(50.0)
-    assert not trial.navigator.given_up and trial.navigator.tally.relocalizations <= 2
+    assert not trial.navigator.given_up and trial.navigator.statistics.relocalizations <= 2
     trial.run(20.0, lambda: trial.navigator.given_up)
     assert trial.navigator.given_up
     assert NO_ANSWER in trial.navigator.detail and "60 s" in trial.navigator.detail
@@ -77,4 +75,7 @@ def test_who_gets_on_does_not_give_up(home):
     settings = NavigatorSettings(patience=12.0, blind_distance=1e9)
     trial = Trial(navigator(eyes, NOWHERE, nodes[-1].id, settings), eyes, fleet)
     trial.run(36.0)
-    assert not trial.navigator.given_up and trial.navigator.tally.edges + trial.navigator.tally.skipped >= 7
+    assert (
+        not trial.navigator.given_up
+        and trial.navigator.statistics.edges + trial.navigator.statistics.skipped >= 7
+    )

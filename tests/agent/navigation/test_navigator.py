@@ -1,7 +1,5 @@
 """Blocked, alone and on the way: what the navigator says, asks and does; the fleet's answers are scripted."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 
@@ -75,13 +73,13 @@ def test_a_blocked_robot_reports_the_obstacle_and_waits(home):
     trial.run(1.0)
     assert trial.navigator.stage == NavigationStage.WAITING and "blocked" in trial.navigator.detail
     assert trial.navigator.fix is not None, "it still knows where it is"
-    assert trial.navigator.tally.blocks == 1 and trial.navigator.tally.relocalizations == 1
+    assert trial.navigator.statistics.blocks == 1 and trial.navigator.statistics.relocalizations == 1
 
 
 @pytest.mark.slow
 def test_a_block_is_forgotten_after_a_while_and_for_longer_each_time(home):
     trial, routes = blocked_trial(home, forget=5.0)
-    trial.run(200.0, lambda: trial.navigator.tally.blocks == 3)
+    trial.run(200.0, lambda: trial.navigator.statistics.blocks == 3)
     tries = [time for time, question in routes if not question.blocked]
     assert len(tries) >= 3
     begun = [time for time, question in routes if question.blocked and time > 0]
@@ -105,8 +103,8 @@ def test_it_goes_around_by_another_way(home):
     trial.run(40.0, lambda: len(answered) == 2)
     assert answered == [(A, B), (A, C, B)]
     trial.proximity, trial.held = FREE, False
-    trial.run(20.0, lambda: nav.tally.edges > 0)
-    assert nav.tally.edges == 1 and nav.tally.skipped == 0, "it drove to the node in between"
+    trial.run(20.0, lambda: nav.statistics.edges > 0)
+    assert nav.statistics.edges == 1 and nav.statistics.skipped == 0, "it drove to the node in between"
 
 
 def held_at_the_goal(
@@ -125,7 +123,7 @@ def test_endless_parking_is_retried_before_it_is_a_block(home, monkeypatch):
     """Almost at the goal, held there by nothing that could block another robot."""
     nav, routes = held_at_the_goal(home, monkeypatch)
     assert [question.blocked for question in routes] == [(), (), ((A, B),)], "no robot is informed at first"
-    assert nav.tally.blocks == 1 and nav.tally.relocalizations == 2, "then it finds itself rebuilt"
+    assert nav.statistics.blocks == 1 and nav.statistics.relocalizations == 2, "then it finds itself rebuilt"
 
 
 def test_what_is_near_at_the_goal_bars_no_other_way_to_it(home, monkeypatch):
@@ -254,7 +252,7 @@ def test_without_landmarks_it_drives_on_a_little_before_it_is_lost(home, monkeyp
     trial.run(60.0, lambda: nav.stage == NavigationStage.LOST and len(observations) > 3)
     assert observations[1:4] == pytest.approx([1.0, 1.5, 2.0], abs=0.1)
     assert nav.stage == NavigationStage.LOST and nav.fix is None
-    assert nav.tally.relocalizations == 1
+    assert nav.statistics.relocalizations == 1
 
 
 def test_a_look_that_shows_nothing_does_not_confirm_that_the_goal_is_reached(home, own_map):

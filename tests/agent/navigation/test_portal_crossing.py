@@ -1,7 +1,5 @@
 """A robot at a lift: it asks, is taken through or is not, and says where it is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -70,7 +68,7 @@ def lift(home: World, own_map: HybridMap) -> Lift:
     return Lift(home, own_map)
 
 
-def test_it_parks_asks_and_goes_on_from_where_it_sees_that_it_is(lift: Lift) -> None:
+def test_it_parks_asks_and_goes_on_from_where_it_sees_that_it_is(lift: Lift):
     nav = lift.trial.navigator
     lift.run_until_it_asks()
     assert lift.eyes.pose.distance(TOUR[1]) < 0.05, "it is parked as at a goal"
@@ -85,14 +83,14 @@ def test_it_parks_asks_and_goes_on_from_where_it_sees_that_it_is(lift: Lift) -> 
     lift.trial.run(1.0, lambda: nav.given_up)
     assert nav.stage == NavigationStage.PORTAL, "what it sees meanwhile is no reason to leave"
     lift.crossing.taken_through()
-    lift.trial.run(30.0, lambda: nav.progress == 1.0 or nav.tally.edges > 1)
+    lift.trial.run(30.0, lambda: nav.progress == 1.0 or nav.statistics.edges > 1)
     looks = [question for question in lift.trial.asked if isinstance(question, WhereAmI)]
     assert looks[-1].near == B, "it knows on which floor it is"
     assert nav.fix is not None and nav.fix.node == B and lift.crossing.wait is None
     assert nav.stage not in (NavigationStage.PORTAL, NavigationStage.LOST) and nav.legs > 0
 
 
-def test_said_too_early_it_finds_itself_on_its_own_floor_says_so_and_asks_again(lift: Lift) -> None:
+def test_said_too_early_it_finds_itself_on_its_own_floor_says_so_and_asks_again(lift: Lift):
     lift.run_until_it_asks()
     lift.crossing.taken_through()
     lift.run_until_it_asks(times=2)
@@ -104,7 +102,7 @@ def test_said_too_early_it_finds_itself_on_its_own_floor_says_so_and_asks_again(
     assert nav.fix is not None and nav.fix.node == B
 
 
-def test_where_nothing_is_known_it_asks_again_and_at_last_gives_up(home: World, own_map: HybridMap) -> None:
+def test_where_nothing_is_known_it_asks_again_and_at_last_gives_up(home: World, own_map: HybridMap):
     lift = Lift(home, own_map, patience=150.0)
     lift.run_until_it_asks()
     lift.carry()
@@ -118,7 +116,7 @@ def test_where_nothing_is_known_it_asks_again_and_at_last_gives_up(home: World, 
     assert nav.detail == "not taken through lift 'east lift' within 150 s: I cannot find myself on floor 2"
 
 
-def test_its_own_map_of_a_floor_that_looks_the_same_does_not_mislead_it(lift: Lift) -> None:
+def test_its_own_map_of_a_floor_that_looks_the_same_does_not_mislead_it(lift: Lift):
     lift.run_until_it_asks()
     lift.upstairs = lift.eyes.world
     lift.carry()
@@ -130,7 +128,7 @@ def test_its_own_map_of_a_floor_that_looks_the_same_does_not_mislead_it(lift: Li
 
 def test_a_robot_that_was_switched_off_at_a_portal_waits_there_and_looks_where_it_is(
     home: World, own_map: HybridMap
-) -> None:
+):
     lift = Lift(home, own_map, wait=True)
     lift.eyes.pose = TOUR[1]
     lift.run_until_it_asks()
@@ -142,7 +140,7 @@ def test_a_robot_that_was_switched_off_at_a_portal_waits_there_and_looks_where_i
     assert nav.fix is not None and nav.fix.node == B
 
 
-def test_a_robot_that_gets_lost_is_looked_for_on_its_floor_first(home: World) -> None:
+def test_a_robot_that_gets_lost_is_looked_for_on_its_floor_first(home: World):
     """It has a fix, and then sees nothing that anyone knows."""
     eyes, known = Eyes(home, Pose2(0.5, 2.0)), [True]
     nav = navigator(eyes, HybridMap(), C)
@@ -157,7 +155,7 @@ def test_a_robot_that_gets_lost_is_looked_for_on_its_floor_first(home: World) ->
     assert near.count(B) * 0.5 > 2.0 * np.pi, "after a whole turn without success it may be on any floor"
 
 
-def test_beyond_a_door_its_own_map_counts() -> None:
+def test_beyond_a_door_its_own_map_counts():
     portal = PortalStop("gate", PortalMeans.DOOR, NodeId("r0", 1, 1), NodeId("r1", 1, 5))
     crossing = PortalCrossing(MAP, wait=PortalWait(portal))
     assert not crossing.elsewhere and "the other side, node r1.1.5" in crossing.request
