@@ -75,18 +75,8 @@ def test_images_become_settings_that_an_agent_reads(name, true, frames, capfd, t
         '# a robot\n[robot]\ndriver = "koala"\n\n[robot.camera]\nsource = "2"  # front\n\n[agent]\n'
     )
     images = folder_of(frames[name], tmp_path / "views")
-    words = [
-        "calibrate",
-        "camera",
-        str(images),
-        "--settings",
-        str(robot),
-        "--height",
-        "0.25",
-        "--json",
-        *OPTIONS,
-    ]
-    assert main(words) == 0
+    words = ["--settings", str(robot), "--height", "0.25", "--json", *OPTIONS]
+    assert main(["calibrate", "camera", str(images), *words]) == 0
     report = json.loads(capfd.readouterr().out.splitlines()[-1])
     assert report["written"] and report["uncertainty_px"] < 0.7
     assert min(report["held_out_px"].values()) < 0.3
