@@ -164,12 +164,12 @@ class MappingFilter:
         if not len(measurement.slots):
             self._watch.saw(Health.BLIND, "no landmark of the filter is in view")
             return UpdateReport.blind(len(ids), "no landmark of the filter is in view")
-        by_wheels, nod = self._step, None
+        by_wheels, pitch = self._step, None
         self._step, innovations = measurement.compared(by_wheels, self._settled, self._noise.variances)
         if not innovations.worst <= self._gate:
-            nod = pitch_offset(innovations.innovations, self._spread(measurement.slots), measurement.slopes)
-            if nod is not None:
-                measurement = measurement._replace(slopes=measurement.slopes - nod.offsets)
+            pitch = pitch_offset(innovations.innovations, self._spread(measurement.slots), measurement.slopes)
+            if pitch is not None:
+                measurement = measurement._replace(slopes=measurement.slopes - pitch.offsets)
                 self._step, innovations = measurement.compared(
                     by_wheels, self._settled, self._noise.variances
                 )
@@ -179,10 +179,10 @@ class MappingFilter:
             nis, slip = self._correct(measurement, judged)
             if slip and health is Health.GOOD:
                 health, reason = Health.SLIP, slip
-            if nod is not None:
+            if pitch is not None:
                 # Landmarks that come in from now on are seen by the camera as it looks now; on a slope it
                 # does not look back.
-                self._settle(self.state.pitched(nod.pitch))
+                self._settle(self.state.pitched(pitch.pitch))
         else:
             # Rejected measurements must not choose the linearisation point either.
             self._step = by_wheels

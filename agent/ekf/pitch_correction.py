@@ -13,12 +13,12 @@ from mapweave.agent.arrays import median
 from mapweave.hybridmap.pose import Array
 
 LEAST = 8
-"""Landmarks that a nod is read off; fewer may be wrong together."""
+"""Landmarks that an offset is read off; fewer may be wrong together."""
 SIGMAS = 4.0
-"""A nod is evident if it is so many times what the filter expects the landmarks to move together."""
+"""An offset is evident if it is so many times what the filter expects the landmarks to move together."""
 
 
-class Nod(NamedTuple):
+class PitchOffset(NamedTuple):
     """By how much the camera looks further up than the filter's landmarks say.
 
     Attributes:
@@ -31,12 +31,12 @@ class Nod(NamedTuple):
     offsets: Array
 
 
-def pitch_offset(innovations: Array, covariance: Array, slopes: Array) -> Nod | None:
-    """What a nod of the camera has made of the innovations, if one is evident.
+def pitch_offset(innovations: Array, covariance: Array, slopes: Array) -> PitchOffset | None:
+    """What a pitch of the camera has added to the innovations, if one is evident.
 
     Args:
         innovations: (N, 2) slopes, measured minus expected.
-        covariance: (2N, 2N) of these, joint: what the filter takes to be possible without a nod.
+        covariance: (2N, 2N) of these, joint: what the filter takes to be possible without a pitch.
         slopes: (N, 2) as they are measured.
 
     Returns:
@@ -54,4 +54,4 @@ def pitch_offset(innovations: Array, covariance: Array, slopes: Array) -> Nod | 
     more = int(expected.argmin())
     surest = order[: LEAST + more]
     pitch = median(innovations[surest, 1] / by_pitch[surest, 1])
-    return Nod(pitch, pitch * by_pitch) if pitch**2 > SIGMAS**2 * float(expected[more]) else None
+    return PitchOffset(pitch, pitch * by_pitch) if pitch**2 > SIGMAS**2 * float(expected[more]) else None
