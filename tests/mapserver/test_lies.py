@@ -115,8 +115,8 @@ def test_the_others_keep_their_map_and_their_answers(name: str, map_id: MapId, t
         assert links and set(places) == {Certainty.FOUND}
         fleet.acks_of(map_id.agent)
         fleet.tell(map_id, messages(map_id, log))
-        eventually(lambda: said(fleet, words))
         assert fleet.server.settle(30)
+        assert said(fleet, words), [event.words for event in fleet.server.history()]
         assert sound_links(fleet) == links
         assert [where[0] for where in whereabouts(fleet.where())] == places
         fleet.bus.publish(KEYS.agent_status(map_id.agent), encode(status))
@@ -144,7 +144,8 @@ def test_no_log_is_as_long_as_the_greatest_number(tmp_path: Path, caplog: pytest
         eventually(lambda: f"change {MAX_NUMBER} is announced" in caplog.text)
         words = f"map {LAST} is implausible: change {MAX_NUMBER} is announced"
         fleet.tell(LAST, messages(LAST, views(LAST, Pose2(), STEP)))
-        eventually(lambda: said(fleet, words))
+        assert fleet.server.settle(30)
+        assert said(fleet, words), [event.words for event in fleet.server.history()]
     # Only the beacon has said it: the log on the disk shows nothing.
     with serving(tmp_path / "s0.sqlite") as fleet:
         assert fleet.server.settle(30)
