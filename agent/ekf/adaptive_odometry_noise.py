@@ -45,12 +45,12 @@ class AdaptiveOdometryNoise:
         return self._side_slip * way
 
     def refuted(self, odometry: Odometry, surprise: float) -> Array:
-        """The root for a step that its image refutes by so many sigmas; the next ones get more noise, too."""
+        """The root (2, 2) for a step that its image refutes by so many sigmas; the next get more noise."""
         self.increase()
         return self._noise.refuted_root(odometry, surprise, SLIP[0])
 
     def slipped(self) -> Array:
-        """The root for a step in which the wheels carry no information."""
+        """The root (2, 2) for a step in which the wheels carry no information."""
         return np.diag(SLIP)
 
     def increase(self) -> None:

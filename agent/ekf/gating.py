@@ -118,7 +118,16 @@ def select_inliers(innovations: Array, covariance: Array, gate: float) -> tuple[
 
 
 def remove_outliers(innovations: Array, covariance: Array, gate: float) -> tuple[Mask, Array, float]:
-    """The same where some do not agree with all the others."""
+    """The largest consistent set where some innovations do not agree with all the others.
+
+    Args:
+        innovations: (N, 2) slopes, measured minus expected.
+        covariance: (2N, 2N) of these, joint.
+        gate: of a chi-square with two degrees of freedom.
+
+    Returns:
+        (N,) which are accepted; the whitening of these, see `whiten`; the median of their distances.
+    """
     accepted = one_point_consensus(innovations, covariance, gate)
     while True:
         chosen = np.flatnonzero(np.repeat(accepted, 2))

@@ -55,7 +55,7 @@ def innovation_covariance(covariance: Array, slots: NDArray[np.intp], variances:
 
 
 def whiten(covariance: Array) -> Array:
-    """Inverse W of Cholesky's factor of S = L L^T, lower triangular.
+    """Inverse W, (n, n), of Cholesky's factor of the covariance S = L L^T, (n, n), lower triangular.
 
     W r are residuals of unit variance that know nothing of each other, and W^T W is the inverse of S.
 

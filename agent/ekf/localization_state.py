@@ -82,7 +82,7 @@ class LocalizationState:
         return self.pose_vector + step[:3], rays
 
     def corrected(self, step: Array, root: Array) -> LocalizationState:
-        """The state after an update by a step, whose gain takes `root root^T` off the covariance.
+        """The state after an update by a step (3 + 3n,), whose gain takes `root root^T` off the covariance.
 
         The slopes b do not follow, so the covariance among them stays as it is (Schmidt's consider filter);
         all else is as in the full filter.
@@ -125,7 +125,7 @@ class LocalizationState:
         )
 
     def kept(self, mask: NDArray[np.bool_]) -> LocalizationState:
-        """The state with only some of its landmarks."""
+        """The state with only some of its landmarks, by a mask (n,)."""
         index = np.concatenate([[0, 1, 2], 3 + np.flatnonzero(np.repeat(mask, 3))])
         return LocalizationState(
             self.pose_vector, self.rays[mask], self.first[mask], self.covariance[np.ix_(index, index)]

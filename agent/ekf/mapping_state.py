@@ -67,7 +67,7 @@ class MappingState:
         return MappingState(self.pose_vector, np.concatenate([self.rays, rays]), covariance)
 
     def kept(self, mask: NDArray[np.bool_]) -> MappingState:
-        """The state with only some of its landmarks."""
+        """The state with only some of its landmarks, by a mask (n,)."""
         index = np.concatenate([[0, 1, 2], 3 + np.flatnonzero(np.repeat(mask, 3))])
         return MappingState(self.pose_vector, self.rays[mask], self.covariance[np.ix_(index, index)])
 
@@ -188,7 +188,7 @@ class WheelStep:
         return Odometry(self.measured.forward + forward, self.measured.turn + turn), surprise
 
     def kept(self, mask: NDArray[np.bool_]) -> WheelStep:
-        """The step of only some of the landmarks."""
+        """The step of only some of the landmarks, by a mask (n,)."""
         if mask.all():
             return self
         return replace(self, before=self.before.kept(mask), rays=self.rays[mask], _after=None)

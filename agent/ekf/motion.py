@@ -58,6 +58,9 @@ class WheelNoise:
             odometry: the step.
             factor: by which the wheels err more than they should.
             lost: standard deviation of a wheel's way if its encoder reports none, m.
+
+        Returns:
+            (2, 2) root of the covariance of forward, m, and turn, rad.
         """
         sigmas = [
             factor * self.share * abs(way) if abs(way) > STANDS else lost for way in self.ways(odometry)
@@ -137,7 +140,7 @@ class RayMotion:
 
 
 def move_rays(rays: Array, odometry: Odometry, mount_forward: float, aside: float = 0.0) -> RayMotion:
-    """See landmarks after one step of the wheels, as `transform_rays`, with the Jacobians."""
+    """See landmarks (n, 3) after one step of the wheels, as `transform_rays`, with the Jacobians."""
     after, scale = transform_rays(rays, odometry, mount_forward, aside)
     u1, u2, m = odometry.forward, odometry.turn, mount_forward
     c, s, ch, sh = math.cos(u2), math.sin(u2), math.cos(0.5 * u2), math.sin(0.5 * u2)

@@ -105,7 +105,7 @@ class _Solver:
         self.largest_step = math.inf
 
     def expect(self, rays: Array, seen: NDArray[np.bool_]) -> tuple[Array, Array, Array]:
-        """Slopes right and down expected, and 1 / depth, 0 for observations that are not used."""
+        """(N, T) slopes right and down expected, and 1 / depth, 1/m; 0 for observations that are not used."""
         rotated = np.stack([np.ones(len(rays)), rays[:, 0], rays[:, 2]], axis=1)
         depth = rotated @ self.depth_by
         used = seen & (depth > NEAREST)

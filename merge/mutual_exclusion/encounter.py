@@ -105,7 +105,7 @@ class Encounter:
         return added, total
 
     def evidence(self, clear: Array, odds: Array, weights: Array) -> tuple[float, float]:
-        """The evidence by footprints and by mutual visibility, at the maximum."""
+        """Log odds by footprints and by mutual visibility, at their maximum; arguments as of `added`."""
         by_footprints = np.cumsum(self.by_footprints(clear))
         _, total = self.added(clear, odds, weights)
         most = int(np.argmax(total))

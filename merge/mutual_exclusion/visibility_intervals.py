@@ -54,7 +54,7 @@ class VisibilityInterval:
         return VisibilityInterval(**{name: np.concatenate(pair) for name, pair in pairs.items()})
 
     def take(self, mask: NDArray[np.bool_]) -> VisibilityInterval:
-        """Some of these observations."""
+        """Some of these observations, by a mask (M,)."""
         rays = ("looks", "directions", "lengths")
         of_rays = mask[self.looks]
         kept = {n: getattr(self, n)[of_rays if n in rays else mask] for n in self.__dataclass_fields__}

@@ -167,7 +167,7 @@ class _Sides:
         return np.array(pairs, np.int64).reshape(-1, 2)
 
     def meeting(self, i: int, j: int) -> tuple[NodeId, NDArray[np.int64], NDArray[np.int64]]:
-        """The node from which two sides go, and which of its landmarks each of them rests on."""
+        """The node from which two sides go, and (K,) and (L,) indices of its landmarks that each rests on."""
         count = len(self.links)
         links = self.links[i % count], self.links[j % count]
         columns = int(i >= count), int(j >= count)

@@ -41,7 +41,12 @@ another side sees past their edges in every map."""
 
 
 def more_than_usual(shares: Array, usual: Array) -> bool:
-    """Whether more nodes than by chance are seen through more than usual."""
+    """Whether more nodes than by chance are seen through more than usual.
+
+    Args:
+        shares: (N,) of the landmarks of each node that others refute, see `seen_through`.
+        usual: (M,) the same among nodes of one map, for comparison.
+    """
     from scipy.special import bdtrc
 
     if min(len(shares), len(usual)) < LEAST_NODES:

@@ -98,7 +98,7 @@ class Factors:
         return len(self.a)
 
     def take(self, index: NDArray[np.bool_] | Rows, row_of: Rows | None = None) -> Factors:
-        """Some of the measurements, between rows that have moved to `row_of`."""
+        """Some of the measurements, by mask or index; row r of the poses has moved to `row_of[r]`."""
         a, b = self.a[index], self.b[index]
         if row_of is not None:
             a, b = row_of[a], row_of[b]
