@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Mapping
 
+import networkx as nx
+
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.merge.pose_graph.candidates import LEAST_HOPS, LEAST_OVERLAP, MOST_PER_MAP, Pair
 
@@ -25,7 +27,7 @@ class PairTable:
         """
         self._most_per_map, self._least_hops = most_per_map, least_hops
         self._overlaps: dict[NodeId, dict[NodeId, float]] = {}
-        self._ways: dict[NodeId, Counter[NodeId]] = {}
+        self._edges: nx.MultiGraph = nx.MultiGraph()
         self._best: dict[NodeId, frozenset[Pair]] = {}
         self._votes: Counter[Pair] = Counter()
         self._stale: set[NodeId] = set()
@@ -64,20 +66,14 @@ class PairTable:
 
     def connect(self, a: NodeId, b: NodeId) -> None:
         """Make two nodes neighbours, by an edge."""
-        for first, second in ((a, b), (b, a)):
-            self._ways.setdefault(first, Counter())[second] += 1
+        self._edges.add_edge(a, b)
         self._stale |= self._around(a) | self._around(b)
 
     def disconnect(self, a: NodeId, b: NodeId) -> None:
         """Remove such an edge."""
         self._stale |= self._around(a) | self._around(b)
-        for first, second in ((a, b), (b, a)):
-            ways = self._ways[first]
-            ways[second] -= 1
-            if not ways[second]:
-                del ways[second]
-            if not ways:
-                del self._ways[first]
+        self._edges.remove_edge(a, b)
+        self._edges.remove_nodes_from([end for end in {a, b} if not self._edges[end]])
 
     def of(self, node: NodeId) -> list[Pair]:
         """The chosen pairs of one node, in the order of ids."""
@@ -139,13 +135,6 @@ class PairTable:
 
     def _around(self, node: NodeId) -> set[NodeId]:
         """Nodes that are few edges away, the node itself too."""
-        reached, ring = {node}, [node]
-        for _ in range(self._least_hops - 1):
-            ring = [
-                neighbour
-                for current in ring
-                for neighbour in self._ways.get(current, ())
-                if neighbour not in reached
-            ]
-            reached.update(ring)
-        return reached
+        if node not in self._edges:
+            return {node}
+        return {*nx.single_source_shortest_path_length(self._edges, node, self._least_hops - 1)}

@@ -3,7 +3,6 @@
 from dataclasses import replace
 from itertools import combinations
 
-import networkx as nx
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -183,19 +182,6 @@ def test_best_clique_against_brute_force(n: int, seed: int) -> None:
     greedy = best_clique(agree, weights, exact=0)
     assert all(agree[i, j] for i, j in combinations(greedy, 2))
     assert weights[greedy].sum() >= weights.max()
-
-
-@pytest.mark.parametrize("heaviest", [2, 1000])
-def test_best_clique_is_that_of_another_implementation(heaviest: int) -> None:
-    """Of several of one weight it is the same one: networkx searches in the same order."""
-    rng = np.random.default_rng(heaviest)
-    for _ in range(25):
-        n, share = int(rng.integers(10, 41)), rng.uniform(0.2, 0.95)
-        agree = np.triu(rng.random((n, n)) < share, 1)
-        agree, weights = agree | agree.T | np.eye(n, dtype=bool), rng.integers(1, heaviest, n)
-        graph = nx.from_numpy_array(agree & ~np.eye(n, dtype=bool))
-        nx.set_node_attributes(graph, dict(enumerate(weights.tolist())), "weight")
-        assert best_clique(agree, weights) == sorted(nx.max_weight_clique(graph)[0])
 
 
 def test_greedy_clique_finds_a_planted_one() -> None:
