@@ -23,6 +23,15 @@ const m = mapweave.model, box = mapweave.painter.canvas.getBoundingClientRect(),
 const [u, v] = mapweave.viewport.toScreen(m.x[row], m.y[row]);
 return [box.left + u, box.top + v];
 """
+FACTS = (
+    "return [...document.querySelectorAll('#selected dt')]"
+    ".map(dt => [dt, dt.nextSibling].map(c => c.textContent))"
+)
+AT_ROBOT = """
+const box = mapweave.painter.canvas.getBoundingClientRect(), robot = mapweave.painter.robots[0];
+const [u, v] = mapweave.viewport.toScreen(robot.x, robot.y);
+return [box.left + u, box.top + v];
+"""
 
 
 def logs() -> dict[MapId, list[ChangeBody]]:
@@ -47,6 +56,31 @@ class Person:
     def press(self, name: str) -> None:
         self.page.run(f"document.getElementById('{name}').click()")
 
+    def open(self, panel: str) -> None:
+        """That of the first robot is `selected`."""
+        if panel == "selected":
+            self.page.run("document.querySelector('#robots button').click()")
+        else:
+            self.press(f"tab-{panel}")
+
+    def stop(self) -> None:
+        """By the button of the robot that is selected."""
+        buttons = "[...document.querySelectorAll('#selected button')]"
+        self.page.run(f"{buttons}.find(one => one.textContent === 'Stop').click()")
+
+    def search(self, words: object) -> None:
+        self.fill("query", words)
+        self.page.run("document.getElementById('search').requestSubmit()")
+
+    def facts(self) -> dict[str, str]:
+        """What the panel says of what is selected, by name."""
+        return dict(self.page.run(FACTS))
+
+    def shows(self, heading: str) -> None:
+        """Wait until this is selected."""
+        shown = "return document.querySelector('#selected h2')?.textContent"
+        eventually(lambda: self.page.run(shown) == heading)
+
     def fill(self, name: str, value: object) -> None:
         self.page.run(
             f"const one = document.getElementById('{name}'); one.value = {json.dumps(str(value))};"
@@ -67,6 +101,11 @@ class Person:
             self.page.devtools(
                 "Input.dispatchKeyEvent", type=kind, key=key, **({"text": text} if kind == "keyDown" else {})
             )
+
+    def at_robot(self) -> tuple[float, float]:
+        """Where the first robot is drawn."""
+        x, y = self.page.run(AT_ROBOT)
+        return x, y
 
     def at(self, node: NodeId) -> tuple[float, float]:
         x, y = self.page.run(AT.format(node))

@@ -35,10 +35,6 @@ CONTROLS = {
     "tab", "tablist", "tabpanel", "textbox",
 }  # fmt: skip
 STATUS = "return document.getElementById('summary').textContent"
-FACTS = (
-    "return [...document.querySelectorAll('#selected dt')]"
-    ".map(dt => [dt, dt.nextSibling].map(c => c.textContent))"
-)
 PLANS = "return import('/static/plans.js').then(one => one.planNames().length)"
 KIND = "const answer = document.getElementById('answer'); return answer.dataset.certainty || answer.className"
 
@@ -99,9 +95,7 @@ def test_an_unknown_place_is_explained(page: Browser, services: StubServices, im
     assert "14 landmarks match, 9 agree on one pose; 10 are needed." in words
     assert "Turn by 34° to the left and try again." in words
     page.run("document.querySelector('#answer li button').click()")
-    eventually(
-        lambda: page.run("return document.querySelector('#selected h2')?.textContent") == "Node r0.1.3"
-    )
+    Person(page).shows("Node r0.1.3")
 
 
 @pytest.mark.parametrize(("matches", "inliers", "doubted"), [(77, 0, True), (14, 9, False), (31, 10, False)])
@@ -174,7 +168,7 @@ def test_robots_and_photos_are_named_in_coordinates_of_a_plan(
     eventually(lambda: page.run(PLANS) == 1)
     for number, words in ((1, "office 9.00, 7.00 m, 90°"), (0, None)):
         page.run(f"document.querySelectorAll('#robots button')[{number}].click()")
-        facts = dict(page.run(FACTS))
+        facts = Person(page).facts()
         assert facts["on the map"].startswith("2.00, 1.00 m") and facts.get("on the plan") == words
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "place")
@@ -192,16 +186,15 @@ def test_nodes_are_named_and_found_in_coordinates_of_a_plan(
     node = NodeId("r0", 1, 5)
     (at,) = (pose.mean for id_, (_, pose) in two_maps().poses.items() if id_ == node)
     words = f"ground floor {10.0 - at.y:.2f}, {5.0 + at.x:.2f}"
-    search = "document.getElementById('query').value = '{}';document.getElementById('search').requestSubmit()"
-    shown = "return document.querySelector('#selected h2')?.textContent"
+    person = Person(page)
     eventually(lambda: page.run(PLANS) == 1)
     for typed in (words, words.replace(", ", ",")):
-        page.run(search.format("r0.1.1"))
-        eventually(lambda: page.run(shown) == "Node r0.1.1")
-        page.run(search.format(typed))
-        eventually(lambda: page.run(shown) == f"Node {node}")
-    assert dict(page.run(FACTS))["on the plan"].startswith(f"{words} m, ")
-    page.run(search.format("ground floor 500,500"))
+        person.search("r0.1.1")
+        person.shows("Node r0.1.1")
+        person.search(typed)
+        person.shows(f"Node {node}")
+    assert person.facts()["on the plan"].startswith(f"{words} m, ")
+    person.search("ground floor 500,500")
     says = page.run("return document.getElementById('query').validationMessage")
     assert says == "Nothing is mapped within 2 m of ground floor 500,500."
     eventually(lambda: page.run("return document.querySelector('#robots button') !== null"))
@@ -232,17 +225,15 @@ def test_a_robot_passes_places_on_its_way(page: Browser, services: StubServices)
     eventually(lambda: "at east wing, floor ground" in page.run(text_of("robots")))
     eventually(lambda: "east wing" in page.run(text_of("names").replace("textContent", "innerHTML")))
     page.run("document.querySelector('#robots button').click()")
-    facts = page.run(
-        "return [...document.querySelectorAll('#selected dt, #selected dd')].map(one => one.textContent)"
-    )
-    assert facts[facts.index("place") + 1] == "east wing" and facts[facts.index("floor") + 1] == "ground"
+    facts = Person(page).facts()
+    assert (facts["place"], facts["floor"]) == ("east wing", "ground")
     page.type("#goal", "home")
     # A position also with a blank, as on a plan and in the shell.
     page.type("#via", "east wing, 3.1, -2.0 r0.1.1, east\n")
     eventually(lambda: services.ways == [("home", ("east wing", "3.1,-2.0", "r0.1.1", "east"))])
     eventually(lambda: "r0 stays where it is" in page.run(text_of("selected")))
     page.type("#mission-because", "a guest & a dog wait")
-    page.run("[...document.querySelectorAll('#selected button')].find(b => b.textContent === 'Stop').click()")
+    Person(page).stop()
     eventually(lambda: services.reasons == ["", "a guest & a dog wait"])
 
 
@@ -295,8 +286,7 @@ def test_labels_do_not_lie_on_each_other(
 def test_the_selected_node_has_its_name_at_every_scale(page: Browser) -> None:
     """Its neighbour's name lay in its ring, and its own was left out; from afar no node has a name."""
     eventually(lambda: page.run("return mapweave.model.rowOf('r0.1.3')") is not None)
-    page.run("document.getElementById('query').value = 'r0.1.3';"
-             "document.getElementById('search').requestSubmit()")  # fmt: skip
+    Person(page).search("r0.1.3")
     for scale in (20.0, 60.0, 200.0):
         texts, within = page.run(f"""
             const p = mapweave.painter, v = p.viewport, m = p.model, row = m.rowOf("r0.1.3");
@@ -351,11 +341,7 @@ def test_screen_readers_name_every_control(page: Browser, services: StubServices
     eventually(lambda: page.run("return document.querySelectorAll('#robots button').length"))
     seen, nameless = set(), []
     for panel in ("fleet", "selected", "why", "edit", "photo"):
-        page.run(
-            "document.querySelector('#robots button').click()"
-            if panel == "selected"
-            else f"document.getElementById('tab-{panel}').click()"
-        )
+        Person(page).open(panel)
         for node in page.devtools("Accessibility.getFullAXTree")["nodes"]:
             role = node.get("role", {}).get("value")
             if role in CONTROLS and not node["ignored"]:

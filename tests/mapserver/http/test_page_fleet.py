@@ -5,7 +5,6 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -123,21 +122,13 @@ def fleet(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Fleet]:
         bus.close()
 
 
-def facts(page: Browser) -> dict[str, Any]:
-    return dict(
-        page.run(
-            "return [...document.querySelectorAll('#selected dt')]"
-            ".map(one => [one.textContent, one.nextSibling.textContent])"
-        )
-    )
-
-
 @pytest.mark.slow
 @needs_simulator
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 @pytest.mark.timeout(600)
 def test_robots_that_drive_are_watched_and_sent(fleet: Fleet, browser: Browser) -> None:
     """They map, and move on the page; one is sent to a node, and parks there; the server starts again."""
+    person = Person(browser)
     person, goal = Person(browser), NodeId("r0", 1, 1)
     eventually(lambda: fleet.children.check() or serves(browser, fleet.http), PATIENCE)
     browser.look(1280, 800)
@@ -158,11 +149,11 @@ def test_robots_that_drive_are_watched_and_sent(fleet: Fleet, browser: Browser) 
     eventually(lambda: browser.run(in_view), PATIENCE)
 
     browser.run("document.querySelector('#robots button').click()")
-    eventually(lambda: facts(browser)["state"] == "alive")
-    assert facts(browser)["sees the server"] == "yes" and "explore" in facts(browser)["mission"]
+    eventually(lambda: person.facts()["state"] == "alive")
+    assert person.facts()["sees the server"] == "yes" and "explore" in person.facts()["mission"]
     browser.type("#goal", f"{goal}\n")
-    eventually(lambda: facts(browser)["mission"].startswith(f"go to {goal}, running"))
-    eventually(lambda: facts(browser)["mission"].startswith(f"go to {goal}, done: at the goal"), PATIENCE)
+    eventually(lambda: person.facts()["mission"].startswith(f"go to {goal}, running"))
+    eventually(lambda: person.facts()["mission"].startswith(f"go to {goal}, done: at the goal"), PATIENCE)
     assert browser.run("return window.ways.r0") == str(goal), "its way there was known while it drove"
     eventually(
         lambda: (

@@ -69,12 +69,8 @@ def test_places_and_positions_stand_for_nodes(person: Person, server: MapServer)
     name_place(person, "east wing", str(LAST))
     (x, y) = server.merged().pose(LAST).vector[:2]
     component = server.merged().component_of(LAST)
-    typed = [
-        ("east wing", [LAST]),
-        ("east", [FIRST]),
-        ("east wing, east", [LAST, FIRST]),
-        (f"{A}.1 east", None),
-    ]
+    typed = [("east wing", [LAST]), ("east", [FIRST]), ("east wing, east", [LAST, FIRST])]
+    typed.append((f"{A}.1 east", None))
     if component == 0:
         typed += [(f"{x:.3f},{y:.3f}", [LAST]), (f"{FIRST}, {x:.3f}, {y:.3f}", [FIRST, LAST])]
     for text, nodes in typed:
@@ -95,13 +91,9 @@ def test_places_and_positions_stand_for_nodes(person: Person, server: MapServer)
     person.fill("edit-nodes", "the hall")
     assert page.run("return mapweave.selection.area.anchor") == area["anchor"]
     # The search takes the same words.
-    person.fill("query", f"{x:.3f}, {y:.3f}" if component == 0 else "east wing")
-    page.run("document.getElementById('search').requestSubmit()")
-    eventually(
-        lambda: page.run("return document.querySelector('#selected h2')?.textContent") == f"Node {LAST}"
-    )
-    person.fill("query", "90,90")
-    page.run("document.getElementById('search').requestSubmit()")
+    person.search(f"{x:.3f}, {y:.3f}" if component == 0 else "east wing")
+    person.shows(f"Node {LAST}")
+    person.search("90,90")
     assert "Nothing is mapped within 2 m of 90,90" in person.text("announcement")
 
 
@@ -177,10 +169,8 @@ def test_floors_are_named_wherever_a_place_is_shown(person: Person, server: MapS
     assert annotation(server).name == str(LAST.map)
     eventually(lambda: f"{LAST.map} floor ground" in page.run(PLACES))
     eventually(lambda: "floor ground, " in person.text("components"))
-    page.run(f"document.getElementById('query').value = '{LAST}'")
-    page.run("document.getElementById('search').requestSubmit()")
-    facts = "return [...document.querySelectorAll('#selected dt, #selected dd')].map(one => one.textContent)"
-    eventually(lambda: page.run(facts)[2:4] == ["floor", "ground"])
+    person.search(LAST)
+    eventually(lambda: [*person.facts().items()][1:2] == [("floor", "ground")])
 
 
 def test_a_time_window_is_retired(person: Person, server: MapServer) -> None:

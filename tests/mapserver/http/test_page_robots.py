@@ -69,8 +69,8 @@ def person(browser: Browser, services: DrivenServices) -> Iterator[Person]:
 
 
 def select(person: Person) -> None:
-    person.page.run("document.querySelector('#robots button').click()")
-    eventually(lambda: "Robot r0" in person.text("selected"))
+    person.open("selected")
+    person.shows("Robot r0")
 
 
 def test_what_became_of_a_mission_replaces_what_was_said_when_it_was_given(
@@ -98,9 +98,7 @@ def test_what_has_not_reached_its_robot_is_not_shown_as_good(
     """Also a stop, after which it may be driving, was written in green."""
     services.answers_with = MissionState.SENT
     select(person)
-    person.page.run(
-        "[...document.querySelectorAll('#selected button')].find(b => b.textContent === 'Stop').click()"
-    )
+    person.stop()
     eventually(lambda: "sent" in str(person.page.run(SENT.format("textContent"))))
     assert person.page.run(SENT.format("className")) == "warn"
 
@@ -230,12 +228,8 @@ def test_a_robot_that_does_not_know_where_it_is_stays_where_it_was_last(
 
 def test_a_click_on_a_robot_moves_no_map(person: Person) -> None:
     before = person.page.run(VIEW)
-    at = person.page.run(
-        "const box = mapweave.painter.canvas.getBoundingClientRect(), robot = mapweave.painter.robots[0];"
-        "const [u, v] = mapweave.viewport.toScreen(robot.x, robot.y); return [box.left + u, box.top + v]"
-    )
-    person.mouse(tuple(at))
-    eventually(lambda: "Robot r0" in person.text("selected"))
+    person.mouse(person.at_robot())
+    person.shows("Robot r0")
     assert person.page.run(VIEW) == before
 
 
@@ -283,12 +277,7 @@ def test_battery_queue_lag_and_trouble_are_shown(person: Person, services: Drive
         0.0, 0.0, battery=0.62, unsent=17, last_error="the disk is full", error_age=200.0
     )
     eventually(lambda: "the disk is full (for 3 min)" in person.text("selected"))
-    facts = dict(
-        person.page.run(
-            "return [...document.querySelectorAll('#selected dt')]"
-            ".map(one => [one.textContent, one.nextSibling.textContent])"
-        )
-    )
+    facts = person.facts()
     assert facts["battery"] == "62 %" and facts["not yet on the server"] == "17 changes, one for 2 min"
     assert facts["state"] == "alive" and facts["last heard"] == "0.2 s ago"
     services.fleet = robot_at(0.0, 0.0)
@@ -312,10 +301,7 @@ def test_words_that_say_what_to_type_are_not_cut_off(person: Person) -> None:
 def test_another_mouse_button_neither_selects_nor_moves(person: Person, services: DrivenServices) -> None:
     """A right click selected; with the menu that it opens its end is not heard of, and the map hung on."""
     page, before = person.page, person.page.run(VIEW)
-    x, y = page.run(
-        "const box = mapweave.painter.canvas.getBoundingClientRect(), robot = mapweave.painter.robots[0];"
-        "const [u, v] = mapweave.viewport.toScreen(robot.x, robot.y); return [box.left + u, box.top + v]"
-    )
+    x, y = person.at_robot()
 
     def mouse(kind: str, button: str, buttons: int, x: float) -> None:
         page.devtools(

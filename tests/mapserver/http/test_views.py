@@ -29,6 +29,7 @@ from tests.agent.conftest import CAMERA, DESCRIPTION, PhotoWalls
 from tests.agent.test_loop_waits_for_nothing import Player
 from tests.browser import PROGRAMS, Browser, there_is_none
 from tests.mapserver.http.client import ask
+from tests.mapserver.http.person import Person
 from tests.mapweave.test_kept_maps import WAY
 from tests.waiting import eventually
 
@@ -101,22 +102,14 @@ def page(fleet: Fleet, browser: Browser) -> Browser:
     return browser
 
 
-@pytest.fixture
-def show(page: Browser) -> Callable[[NodeId], None]:
-    def select(node: NodeId) -> None:
-        page.run(
-            f"document.getElementById('query').value = '{node}';"
-            "document.getElementById('search').requestSubmit()"
-        )
-        heading = "return document.querySelector('#selected h2')?.textContent"
-        eventually(lambda: page.run(heading) == f"Node {node}")
-
-    return select
+def show(page: Browser, node: NodeId) -> None:
+    Person(page).search(node)
+    Person(page).shows(f"Node {node}")
 
 
-def test_a_node_is_shown_with_its_view(fleet: Fleet, page: Browser, show: Callable[[NodeId], None]) -> None:
+def test_a_node_is_shown_with_its_view(fleet: Fleet, page: Browser) -> None:
     node = fleet.node("r0")
-    show(node)
+    show(page, node)
     eventually(lambda: page.run(SHOWN.format("#selected")) == 1)
     landmarks = len(fleet.agents["r0"].pipeline.map.nodes[node].landmarks)
     assert page.run(LABEL.format("#selected")) == f"The view of {node} with its {landmarks} landmarks"
@@ -129,13 +122,11 @@ def test_a_node_is_shown_with_its_view(fleet: Fleet, page: Browser, show: Callab
     assert page.run("return document.querySelectorAll('#selected svg image ~ circle').length") == landmarks
 
 
-def test_a_node_without_a_view_is_shown_as_before(
-    fleet: Fleet, page: Browser, show: Callable[[NodeId], None]
-) -> None:
+def test_a_node_without_a_view_is_shown_as_before(fleet: Fleet, page: Browser) -> None:
     """Of a robot that keeps none nothing is asked."""
     page.errors()
     node = fleet.node("r2")
-    show(node)
+    show(page, node)
     assert page.run("return document.querySelector('#selected svg image')") is None
     assert "landmarks in the image of" in page.run(LABEL.format("#selected"))
     assert "No view: r2 is away, or keeps no views (keep_views" in page.run(WORDS)
@@ -178,13 +169,13 @@ def test_a_link_says_which_view_is_missing_and_why(fleet: Fleet, page: Browser) 
     assert f"No view of {b}: r2 is away, or keeps no views" in words and f"No view of {a}" not in words
 
 
-def test_a_view_that_is_lost_is_left_out(fleet: Fleet, page: Browser, show: Callable[[NodeId], None]) -> None:
+def test_a_view_that_is_lost_is_left_out(fleet: Fleet, page: Browser) -> None:
     """The robot keeps views, but the one of this node is gone from its disk."""
     node = max(fleet.agents["r1"].pipeline.map.nodes)
     (fleet.folder / "r1.views" / f"{node}.jpg").unlink()
     with pytest.raises(MapweaveError, match=f"r1 has kept no view of {node}"):
         fleet.server.view(node)
-    show(node)
+    show(page, node)
     eventually(lambda: f"No view: r1 has kept no view of {node}" in page.run(WORDS))
     assert page.run("return document.querySelector('#selected svg image')") is None
     assert "landmarks in the image of" in page.run(LABEL.format("#selected"))

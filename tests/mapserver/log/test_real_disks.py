@@ -110,17 +110,9 @@ print(json.dumps(said))
 @pytest.fixture(scope="module")
 def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
     """What agent and server have said on disks that were full, and then read-only."""
-    unshare = own_mounts()
-    folder = tmp_path_factory.mktemp("disks")
-    command = [*unshare, sys.executable, "-c", PROGRAM, str(folder)]
-    ran = subprocess.run(
-        command,
-        capture_output=True,
-        text=True,
-        timeout=300,
-        cwd=Path(__file__).parents[3],
-        env=dict(os.environ),
-    )
+    command = [*own_mounts(), sys.executable, "-c", PROGRAM, str(tmp_path_factory.mktemp("disks"))]
+    root = Path(__file__).parents[3]
+    ran = subprocess.run(command, capture_output=True, text=True, timeout=300, cwd=root, env=dict(os.environ))
     assert ran.returncode == 0, ran.stderr
     return dict(json.loads(ran.stdout))
 

@@ -157,6 +157,13 @@ def assert_follows(servers: Servers, *, unmerged: bool = True) -> None:
             assert counters.merges == counters.verified == counters.recognised == 0
 
 
+def begun(servers: Servers, changes: list[Change]) -> None:
+    """Two servers, one of which follows, have these."""
+    servers.start("s0", "s1")
+    servers.send(changes)
+    assert_follows(servers)
+
+
 def answers_of(server: MapServer, views: list[View]) -> list[RelocalizeAnswer]:
     """To one question after the other; a server that is busy is asked again."""
     answers: list[RelocalizeAnswer] = []
@@ -233,9 +240,7 @@ def test_a_follower_whose_merge_is_damaged_merges_itself_and_says_so(
     servers: Servers, address: str, name: str, how: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     changes = numbered(drives(1))
-    servers.start("s0", "s1")
-    servers.send(changes[:24])
-    assert_follows(servers)
+    begun(servers, changes[:24])
     # The leader writes no more: what lies there is all that one that comes late has.
     monkeypatch.setattr(PostgresStore, "publish", lambda store, results: None)
     with psycopg.connect(address, autocommit=True) as people:
@@ -295,9 +300,7 @@ def test_a_follower_says_that_its_leader_cannot_merge_and_how_old_its_map_is(
     servers: Servers, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     changes = numbered(drives(1))
-    servers.start("s0", "s1")
-    servers.send(changes[:24])
-    assert_follows(servers)
+    begun(servers, changes[:24])
     (follower,) = servers.followers
     leader = servers.leader._name
     eventually(lambda: follower.status()["unmerged_s"] == 0.0)
@@ -332,9 +335,7 @@ def test_a_follower_says_that_its_leader_stands_still(
 ) -> None:
     monkeypatch.setattr(merge_adoption, "SILENT", 3.0)
     changes = numbered(drives(1))
-    servers.start("s0", "s1")
-    servers.send(changes[:24])
-    assert_follows(servers)
+    begun(servers, changes[:24])
     (follower,) = servers.followers
     goes_on = threading.Event()
 
@@ -395,12 +396,9 @@ class Process:
 
     def __init__(self, address: str, name: str, folder: Path) -> None:
         self.name = name
-        self.process = subprocess.Popen(
-            [sys.executable, "-c", PROCESS, address, name, str(folder)],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            text=True,
-        )
+        command = [sys.executable, "-c", PROCESS, address, name, str(folder)]
+        pipe = subprocess.PIPE
+        self.process = subprocess.Popen(command, stdin=pipe, stdout=pipe, text=True)
 
     def tell(self, words: str) -> None:
         assert self.process.stdin is not None

@@ -358,13 +358,8 @@ def test_a_leader_that_is_killed_while_it_prunes(
         feeder = stack.enter_context(closing(PostgresStore(address, "feeder")))
         for map_id in MAPS:
             send(feeder, logs.changes[map_id])
-        child = stack.enter_context(
-            subprocess.Popen(
-                [sys.executable, "-c", CHILD, address, str(tmp_path / "s0")],
-                stdout=subprocess.PIPE,
-                text=True,
-            )
-        )
+        command = [sys.executable, "-c", CHILD, address, str(tmp_path / "s0")]
+        child = stack.enter_context(subprocess.Popen(command, stdout=subprocess.PIPE, text=True))
         stack.callback(child.kill)
         assert child.stdout is not None and child.stdout.readline() == "in the midst\n"
         with monkeypatch.context() as patch:
