@@ -30,6 +30,7 @@ from mapweave.agent.recordings.recording import (
 from mapweave.agent.recordings.wheel_data import WheelModel, wheels_of
 from mapweave.agent.ros_messages.images import grey_of
 from mapweave.agent.ros_messages.values import (
+    BASES,
     CAMERA_TYPE,
     IMAGE_TYPES,
     KIDNAP_TYPE,
@@ -38,6 +39,7 @@ from mapweave.agent.ros_messages.values import (
     FixedTransforms,
     Mount,
     camera_of,
+    planar_pose_of,
     pose_of,
     stamp_of,
 )
@@ -51,6 +53,10 @@ POSE_TYPES = (
     "geometry_msgs/msg/PoseStamped",
     "geometry_msgs/msg/PoseWithCovarianceStamped",
 )
+ODOMETRY_FRAME = "odom"
+"""The frame in which a base drives, by REP 105."""
+StampedRow = tuple[int, int, tuple[float, float, float]]
+"""Stamp, ns, that of the header, 0 if there is none; x m, y m, heading rad."""
 TRUTH = ("truth", "gt", "amcl", "mocap", "vicon")
 """Parts of names of topics that are never taken for odometry."""
 DEPTH = "depth"
@@ -267,6 +273,10 @@ def bag(path: Path, options: RecordingOptions) -> Recording:
     elif (topic := _odometry_topic(opened, options)) is not None:
         notes.append(f"odometry from {topic.name}")
         odometry = _poses(opened, topic.name)
+    elif transforms := _odometry_transforms(opened):
+        name, rows = transforms
+        notes.append(f"odometry from {name}")
+        odometry = _poses_of(opened, name, rows)
     found, lost = opened.contents, tuple(opened.damage)
     whole = complete(path, kind, given, images, odometry, tuple(notes), lost, found)
     kidnapped = _kidnapped(opened, whole.stamps_ns)
@@ -311,8 +321,25 @@ def _odometry_topic(opened: Bag, options: RecordingOptions) -> BagTopic | None:
     return min(fitting, key=lambda topic: ("filter" in topic.name.lower(), -topic.count, topic.name))
 
 
+def _odometry_transforms(opened: Bag) -> tuple[str, list[StampedRow]] | None:
+    """What a base without a topic of odometry says by tf: the most transforms from odom to the base."""
+    found: dict[str, list[StampedRow]] = {}
+    for topic in _of(opened, (TF_TYPE,)):
+        for arrived, message in () if "static" in topic.name else opened.messages(topic.name):
+            for one in message.transforms:
+                parent, child = one.header.frame_id.lstrip("/"), one.child_frame_id.lstrip("/")
+                if parent.rpartition("/")[2] == ODOMETRY_FRAME and child.rpartition("/")[2] in BASES:
+                    rows = found.setdefault(f"{topic.name}, {parent} to {child}", [])
+                    rows.append((stamp_of(one) or arrived, stamp_of(one), planar_pose_of(one.transform)))
+    return max(found.items(), key=lambda item: len(item[1]), default=None)
+
+
 def _poses(opened: Bag, topic: str) -> StampedPoses:
     rows = [(stamp, stamp_of(message), pose_of(message)) for stamp, message in opened.messages(topic)]
+    return _poses_of(opened, topic, rows)
+
+
+def _poses_of(opened: Bag, topic: str, rows: list[StampedRow]) -> StampedPoses:
     poses = np.array([row[2] for row in rows]).reshape(-1, 3)
     good = np.isfinite(poses).all(axis=1)
     if not good.all():

@@ -64,9 +64,16 @@ def pose_of(message: Any) -> tuple[float, float, float]:
     The heading is not a number if the quaternion is all zeros: the sender has left it empty.
     """
     pose = message.pose.pose if hasattr(message.pose, "pose") else message.pose
-    q = pose.orientation
-    heading = heading_of(q.x, q.y, q.z, q.w) if any((q.x, q.y, q.z, q.w)) else math.nan
-    return pose.position.x, pose.position.y, heading
+    return pose.position.x, pose.position.y, _heading(pose.orientation)
+
+
+def planar_pose_of(transform: Any) -> tuple[float, float, float]:
+    """X m, y m and heading rad of a Transform; likewise."""
+    return transform.translation.x, transform.translation.y, _heading(transform.rotation)
+
+
+def _heading(q: Any) -> float:
+    return heading_of(q.x, q.y, q.z, q.w) if any((q.x, q.y, q.z, q.w)) else math.nan
 
 
 def camera_of(message: Any, rectified: bool = False) -> tuple[Camera, LensModel, tuple[float, ...]]:

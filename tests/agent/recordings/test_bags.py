@@ -281,6 +281,54 @@ def test_the_longer_a_cut_bag_is_the_more_images_it_has(
     assert counts[2] >= 0.5 * 0.6 * COUNT and counts[3] >= 0.6 * COUNT
 
 
+def moved(store: Any, stamp: int, frames: tuple[str, str], pose: Pose2) -> Any:
+    """A TransformStamped on the floor."""
+    across = make(store, "geometry_msgs/msg/Vector3", x=pose.x, y=pose.y, z=0.0)
+    z, w = math.sin(pose.heading / 2), math.cos(pose.heading / 2)
+    turned = make(store, "geometry_msgs/msg/Quaternion", x=0.0, y=0.0, z=z, w=w)
+    return make(
+        store, "geometry_msgs/msg/TransformStamped", header=header(store, stamp, frames[0]),
+        child_frame_id=frames[1],
+        transform=make(store, "geometry_msgs/msg/Transform", translation=across, rotation=turned),
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("ros1", [False, True])
+def test_a_base_that_tells_its_odometry_by_tf_alone(ros1: bool, drive: Drive, tmp_path: Path) -> None:
+    """What a localizer corrects, and where a second robot and a wheel are, is not its odometry."""
+    path, store = tmp_path / ("drive.bag" if ros1 else "drive"), STORE1 if ros1 else STORE
+    writer: Any = Writer1(path) if ros1 else Writer(path, version=8, storage_plugin=StoragePlugin.MCAP)
+    serialize: Callable[[Any, str], Any] = store.serialize_ros1 if ros1 else store.serialize_cdr
+    topics = {
+        "/tf": TF,
+        "/cam/image_raw": "sensor_msgs/msg/Image",
+        "/cam/camera_info": "sensor_msgs/msg/CameraInfo",
+    }
+    with writer:
+        opened = {name: writer.add_connection(name, kind, typestore=store) for name, kind in topics.items()}
+        for k, (stamp, grey) in enumerate(zip(drive.stamps_ns, drive.images, strict=True)):
+            transforms = [
+                moved(store, stamp, ("map", "odom"), Pose2(k, 0.0, 0.0)),
+                moved(store, stamp, ("/odom", "base_footprint"), drive.poses[k]),
+                moved(store, stamp, ("base_link", "wheel"), Pose2(0.0, 0.1, k)),
+            ] + [moved(store, stamp, ("r1/odom", "r1/base_link"), Pose2(0.0, k, 0.0))] * (k % 2)
+            for name, message in (
+                ("/tf", make(store, TF, transforms=transforms)),
+                ("/cam/image_raw", image(store, stamp, grey, "mono8")),
+                ("/cam/camera_info", camera_info(store, stamp, drive)),
+            ):
+                writer.write(opened[name], stamp + 30_000_000, serialize(message, topics[name]))
+    replay = Replay(path, options=OPTIONS)
+    assert replay.recording.notes == (
+        "images from /cam/image_raw",
+        "odometry from /tf, odom to base_footprint",
+    )
+    seen = list(iter(replay.sense, None))
+    assert [observation.stamp_ns for observation in seen] == drive.stamps_ns
+    for observation, (forward, turn) in zip(seen, drive.increments, strict=True):
+        assert (observation.odometry.forward, observation.odometry.turn) == pytest.approx((forward, turn))
+
+
 def test_a_cut_bag_of_ros1_still_says_where_the_camera_is(drive: Drive, tmp_path: Path) -> None:
     """Without its index it is read by ROS 1's standard types, of which rosbags lacks that of tf."""
     path = tmp_path / "drive.bag"
