@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.completing import complete_drivers
 from mapweave.commands.network import (
     add_log_format,
     add_network,
@@ -27,6 +26,7 @@ from mapweave.commands.network import (
     stop_on_signals,
     warn_without_router,
 )
+from mapweave.commands.value_completion import complete_drivers
 from mapweave.connection import found_soon
 from mapweave.extras import need
 

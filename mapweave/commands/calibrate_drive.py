@@ -17,9 +17,9 @@ from mapweave.commands.agent import (
     open_robot,
     take_robot_file,
 )
-from mapweave.commands.completing import complete_drivers
 from mapweave.commands.network import add_network, network_of, settings_of, stop_on_signals
 from mapweave.commands.replay import add_recording, name_of, options_of
+from mapweave.commands.value_completion import complete_drivers
 from mapweave.exit_status import INTERRUPTED, NO
 
 if TYPE_CHECKING:

@@ -12,8 +12,8 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.agent import take_robot_file
-from mapweave.commands.completing import complete_drivers
 from mapweave.commands.network import add_network, network_of
+from mapweave.commands.value_completion import complete_drivers
 from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:

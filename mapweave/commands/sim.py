@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.answer import add_json
-from mapweave.commands.completing import complete_scenarios
 from mapweave.commands.network import (
     add_log_format,
     add_network,
@@ -22,6 +21,7 @@ from mapweave.commands.network import (
     warn_without_router,
 )
 from mapweave.commands.usage import UsageError, arguments_read
+from mapweave.commands.value_completion import complete_scenarios
 from mapweave.exit_status import DONE, NO
 
 if TYPE_CHECKING:

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from mapweave.hybridmap.pose import Array
-from mapweave.scenarios.film import Film
 from mapweave.scenarios.film_frame import FilmFrame
 from mapweave.scenarios.fleet import TrialFleet, TrialStage
 from mapweave.scenarios.live import LiveFilm
 from mapweave.scenarios.scenario_runner import ScenarioRunner
+from mapweave.scenarios.webm_film import Film
 
 FILM = "film.webm"
 FRAMES_PER_SECOND = 10.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.scenarios.film import Film
+from mapweave.scenarios.webm_film import Film
 
 
 def frames(count: int, size: tuple[int, int] = (320, 240)) -> list[np.ndarray]:
