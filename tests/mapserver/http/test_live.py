@@ -30,7 +30,7 @@ from mapweave.mapserver.http import live
 from mapweave.mapserver.http.live import MOST_VIEWERS, LiveUpdates
 from mapweave.mapserver.http.login import RequestAuthorization
 from mapweave.mapserver.http.row_table import RowTable
-from mapweave.mapserver.http.serving import ConnectionTimeouts
+from mapweave.mapserver.http.serving import MAX_VIEWER_BYTES, ConnectionTimeouts
 from mapweave.mapserver.http.web import Web
 from mapweave.merge.outlier_rejection.link_probability import link_probabilities
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -240,9 +240,11 @@ def test_who_takes_nothing_or_says_too_much_is_dropped(services: StubServices) -
             for k in range(3):
                 services.holds["summary"] = f"look {k}"
                 eventually(lambda k=k: watching.until("state")["server"]["summary"] == f"look {k}")
-            watching.connection.send("x" * 5000)
-            with pytest.raises(ConnectionClosed):
-                watching.until("nothing")
+            watching.connection.send("x" * (MAX_VIEWER_BYTES + 1))
+            with pytest.raises(ConnectionClosed) as closed:
+                for _ in range(3):
+                    watching.until("state")
+            assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009, "too long"
 
 
 def test_viewers_that_are_closed_or_asleep_leave_nothing(services: StubServices) -> None:

@@ -1,7 +1,7 @@
 """A running agent whose key file is replaced."""
 
 from collections.abc import Iterator
-from datetime import timedelta
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 
 import pytest
@@ -35,11 +35,11 @@ class Enrolled:
         self.path, self.said = folder / "r0.key.toml", list[str]()
         self.good = read_key_file(self.keys.key_file("r0"))
 
-    def short_lived(self) -> Credentials:
-        """A key of the same robot that ends soon."""
+    def short_lived(self, since: timedelta = timedelta()) -> Credentials:
+        """A key of the same robot that ends soon, or has ended."""
         good = self.good.credentials
         issued = Authority(good.authority, (self.keys.path / "authority.key").read_text()).issue(
-            "r0", Role.ROBOT, LIFE
+            "r0", Role.ROBOT, LIFE, now=datetime.now(UTC) - since
         )
         return Credentials("r0", Role.ROBOT, good.authority, issued.certificate, issued.private_key)
 
@@ -87,12 +87,17 @@ def test_what_is_no_better_key_is_not_taken(enrolled: Enrolled):
         assert bus.wait_connected(10)
         enrolled.put(read_key_file(enrolled.keys.key_file("r1")).credentials)
         own.check()
+        enrolled.put(enrolled.short_lived(since=timedelta(days=1)))
+        own.check()
         enrolled.path.write_text("half of")
         own.check()
         own.check()
         enrolled.path.unlink()
         own.check()
-        words = ("is the key of robot r1", "it is no key file, or not whole", "no such key file")
+        words = (
+            "is the key of robot r1", "the certificate of r0 expired on ", "it is no key file, or not whole",
+            "no such key file",
+        )  # fmt: skip
         assert len(enrolled.said) == len(words)
         for said, part in zip(enrolled.said, words, strict=True):
             assert said.startswith("goes on with the key that it had: ") and part in said
