@@ -45,6 +45,6 @@ def node_of_goal(goal: str, map_id: MapId, places: PlaceResolver, name: str = "g
     else:
         node = places.resolve(goal, (merged.component_of(own[0]) or 0) if own else 0).node
     # A robot that has mapped nothing yet may find itself on the map of another.
-    if missing := router.missing(min(own, default=node), node, ("start", name)):
+    if missing := router.missing(min(own, default=node), node, ("start" if own else name, name)):
         raise InvalidValue(f"{name} {goal}: {missing}" if named else missing)
     return node

@@ -102,6 +102,12 @@ def test_a_goal_that_does_not_exist_is_refused_at_once(house: House, goal: str, 
     assert control.report is None and house.person.missions() == ()
 
 
+def test_what_a_robot_without_nodes_is_sent_to_is_not_called_its_start(house: House) -> None:
+    house.robot("r7")
+    with pytest.raises(InvalidValue, match=r"^goal r9\.1\.1 is not in the merged map"):
+        house.person.go("r7", "r9.1.1")
+
+
 @pytest.mark.parametrize(
     ("via", "reason"),
     [
