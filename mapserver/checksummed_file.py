@@ -60,7 +60,7 @@ class FileKind(Generic[Value]):
 
     def packed(self, value: Value, made_by: str) -> bytes:
         """The bytes of the file; see `save`."""
-        return sealed(self.magic, (json_part({**self.header, "made_by": made_by}), *self.parts(value)))
+        return checksummed(self.magic, (json_part({**self.header, "made_by": made_by}), *self.parts(value)))
 
     def load(self, source: Path | bytes, made_by: str) -> Value:
         """Read a file.
@@ -72,10 +72,10 @@ class FileKind(Generic[Value]):
         Raises:
             InvalidFile: there is none, it is damaged, or it was made otherwise; with the reason.
         """
-        return read_sealed(source, self.magic, {**self.header, "made_by": made_by}, self.read, self.lack)
+        return read_checksummed(source, self.magic, {**self.header, "made_by": made_by}, self.read, self.lack)
 
 
-def sealed(magic: bytes, parts: Iterable[NDArray[Any]]) -> bytes:
+def checksummed(magic: bytes, parts: Iterable[NDArray[Any]]) -> bytes:
     """The bytes of such a file.
 
     Args:
@@ -113,7 +113,7 @@ def unseal(source: Path | bytes, magic: bytes) -> Iterator[NDArray[Any]]:
     return _arrays(io.BytesIO(content[len(magic) :]), len(content) - len(magic))
 
 
-def read_sealed(
+def read_checksummed(
     source: Path | bytes,
     magic: bytes,
     header: Any,

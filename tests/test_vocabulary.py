@@ -33,6 +33,7 @@ PLAIN = {
     "ruled": "constrained",
     "ruling": "manual constraint",
     "rulings": "manual constraints",
+    "sealed": "checksummed",
     "somebody": "a person",
     "stories": "consistent sets",
     "story": "consistent set",

@@ -24,11 +24,11 @@ class RejectionCounter:
         """Count (N,) tracks accepted or refused; returns those to give up, whose count begins again."""
         given_up = []
         for track, good in zip(ids.tolist(), accepted.tolist(), strict=True):
-            strikes = 0 if good else self._counts.get(track, 0) + 1
-            if strikes >= self._most:
+            refusals = 0 if good else self._counts.get(track, 0) + 1
+            if refusals >= self._most:
                 given_up.append(track)
-                strikes = 0
-            self._counts[track] = strikes
+                refusals = 0
+            self._counts[track] = refusals
         return np.array(given_up, np.int64)
 
     def forget(self) -> None:

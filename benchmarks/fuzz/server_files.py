@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 MADE_BY = "fuzz"
 VIEWED = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.25, 0.0)
 """Of the node of which there is an image."""
-SEALED: dict[bytes, Callable[[bytes], object]] = {
+CHECKSUMMED: dict[bytes, Callable[[bytes], object]] = {
     restart_record_file.MAGIC: lambda data: restart_record_file.load(data, MADE_BY),
     verification_cache_file.MAGIC: lambda data: verification_cache_file.load(data, MADE_BY),
     shared_merge.MAGIC: lambda data: shared_merge.SharedMerge.read(data, MADE_BY),
@@ -41,15 +41,15 @@ SEALED: dict[bytes, Callable[[bytes], object]] = {
 """Files with a digest at their end, by their first line."""
 
 
-def run_sealed(data: bytes, _: Path) -> None:
+def run_checksummed(data: bytes, _: Path) -> None:
     """The first byte chooses the kind; the digest is put behind what follows."""
     if data:
-        magic = [*SEALED][data[0] % len(SEALED)]
+        magic = [*CHECKSUMMED][data[0] % len(CHECKSUMMED)]
         whole = magic + data[1:]
-        SEALED[magic](whole + hashlib.sha256(whole).digest())
+        CHECKSUMMED[magic](whole + hashlib.sha256(whole).digest())
 
 
-def sealed_samples(samples: Samples) -> list[bytes]:
+def checksummed_samples(samples: Samples) -> list[bytes]:
     """A good file of each kind, without its first line and digest."""
     merged = samples.merged
     record = _record(merged)
@@ -66,7 +66,7 @@ def sealed_samples(samples: Samples) -> list[bytes]:
     )
     return [
         bytes([k]) + bytes(file)[len(magic) : -DIGEST]
-        for k, (magic, file) in enumerate(zip(SEALED, files, strict=True))
+        for k, (magic, file) in enumerate(zip(CHECKSUMMED, files, strict=True))
     ]
 
 

@@ -333,7 +333,7 @@ def check_finite(value: Any, nan_allowed: bool = False) -> None:
 
 TARGETS: dict[str, Target] = {
     "messages": Target(_messages, _messages_samples),
-    "sealed": Target(server_files.run_sealed, server_files.sealed_samples, 65536),
+    "checksummed": Target(server_files.run_checksummed, server_files.checksummed_samples, 65536),
     "shown": Target(server_files.run_shown, server_files.shown_samples),
     "learned": Target(_file("r0.learned.toml", server_files.run_learned), server_files.learned_samples),
     "views": Target(server_files.run_view, server_files.view_samples, 16384),

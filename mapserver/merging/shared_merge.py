@@ -25,7 +25,7 @@ from mapweave.hybridmap.limits import Number
 from mapweave.hybridmap.manual_constraint import ManualConstraint, ManualConstraints
 from mapweave.hybridmap.pin import Pin
 from mapweave.hybridmap.pruned_node import PrunedNodes
-from mapweave.mapserver.checksummed_file import json_part, read_json, read_sealed, sealed
+from mapweave.mapserver.checksummed_file import checksummed, json_part, read_checksummed, read_json
 from mapweave.mapserver.merging import restart_record_file
 from mapweave.mapserver.merging.restart_record import RestartRecord
 from mapweave.mapserver.merging.verification_cache import PRINT_BYTES
@@ -134,7 +134,7 @@ def packed(
     Raises:
         InvalidValue: it cannot be encoded.
     """
-    return sealed(MAGIC, _parts(head, record, merged, verdict_of, made_by))
+    return checksummed(MAGIC, _parts(head, record, merged, verdict_of, made_by))
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +164,7 @@ class SharedMerge:
             record = restart_record_file.load(next(parts).tobytes(), made_by)
             return SharedMerge(head, record, tuple(parts))
 
-        return read_sealed(data, MAGIC, _header(made_by), read, "is no merge of this version")
+        return read_checksummed(data, MAGIC, _header(made_by), read, "is no merge of this version")
 
     def merged(
         self, maps: Mapping[MapId, HybridMap], verdicts: Mapping[Pair, Verdict], pruned: PrunedNodes

@@ -79,7 +79,7 @@ def test_a_finding_is_counted_at_once(tmp_path):
 
 
 NEW = [*RECORDINGS, "cluster", "plans", "live", "nav2_map", "world", "fleet_file", "tokens"]
-NEW += ["messages", "sealed", "shown", "learned", "views"]
+NEW += ["messages", "checksummed", "shown", "learned", "views"]
 
 
 @pytest.mark.parametrize("name", NEW)
@@ -97,8 +97,8 @@ def test_every_kind_of_message_and_of_sealed_file_has_a_good_sample(samples: Sam
     kinds = {sample[0] for sample in TARGETS["messages"].samples(samples)}
     assert kinds == {*range(len(targets.DECODERS))}
     assert {"KeptPruned", "KeptPruning", "MissionReport", "PlanPiece", "refusal"} <= targets.DECODERS.keys()
-    assert len(TARGETS["sealed"].samples(samples)) == len(server_files.SEALED)
-    magics = {line.partition(b"\n")[0] for line in server_files.SEALED}
+    assert len(TARGETS["checksummed"].samples(samples)) == len(server_files.CHECKSUMMED)
+    magics = {line.partition(b"\n")[0] for line in server_files.CHECKSUMMED}
     assert magics == {b"mapweave superseded", b"mapweave verdicts", b"mapweave merge"}
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.errors import InvalidFile
-from mapweave.mapserver.checksummed_file import DIGEST, json_part, read_sealed, sealed
+from mapweave.mapserver.checksummed_file import DIGEST, checksummed, json_part, read_checksummed
 
 MAGIC = b"a kind\n"
 
@@ -27,18 +27,18 @@ MAGIC = b"a kind\n"
     ],
 )
 def test_heads_of_arrays_that_are_none_are_refused(word: bytes, instead: bytes, tmp_path: Path) -> None:
-    data = sealed(MAGIC, [json_part("header"), np.arange(3.0)])
+    data = checksummed(MAGIC, [json_part("header"), np.arange(3.0)])
     assert len(word) == len(instead) and word in data
     whole = data[:-DIGEST].replace(word, instead)
     path = tmp_path / "x"
     path.write_bytes(whole + hashlib.sha256(whole).digest())
     with pytest.raises(InvalidFile, match="x: is none of these"):
-        read_sealed(path, MAGIC, "header", list, "is none of these")
+        read_checksummed(path, MAGIC, "header", list, "is none of these")
 
 
 def test_what_is_sealed_may_be_part_of_a_cycle() -> None:
     """Python 3.13 says so of a view of a stream, and pytest makes an error of that."""
-    cycle: list[object] = [sealed(MAGIC, [np.arange(3.0)])]
+    cycle: list[object] = [checksummed(MAGIC, [np.arange(3.0)])]
     cycle.append(cycle)
     del cycle
     gc.collect()
