@@ -92,7 +92,7 @@ def test_good_samples_are_taken(name: str, samples: Samples, tmp_path):
         TARGETS[name].run(sample, tmp_path)
 
 
-def test_every_kind_of_message_and_of_sealed_file_has_a_good_sample(samples: Samples):
+def test_every_kind_of_message_and_of_checksummed_file_has_a_good_sample(samples: Samples):
     """The last kinds had none: what they were mutated of was refused at its first byte."""
     kinds = {sample[0] for sample in TARGETS["messages"].samples(samples)}
     assert kinds == {*range(len(targets.DECODERS))}

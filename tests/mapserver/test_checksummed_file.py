@@ -36,7 +36,7 @@ def test_heads_of_arrays_that_are_none_are_refused(word: bytes, instead: bytes, 
         read_checksummed(path, MAGIC, "header", list, "is none of these")
 
 
-def test_what_is_sealed_may_be_part_of_a_cycle() -> None:
+def test_what_is_checksummed_may_be_part_of_a_cycle() -> None:
     """Python 3.13 says so of a view of a stream, and pytest makes an error of that."""
     cycle: list[object] = [checksummed(MAGIC, [np.arange(3.0)])]
     cycle.append(cycle)
