@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
@@ -19,6 +20,7 @@ from mapweave.hybridmap.constraint_subject import RetiredNodes
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.manual_constraint import ConstraintRequest, ManualConstraint
+from mapweave.hybridmap.mission_order import MissionKind, MissionRequest
 from mapweave.hybridmap.pose import Pose2
 from mapweave.identities.key_file import read_key_file
 from mapweave.identities.key_folder import KeyFolder, Profile
@@ -90,13 +92,18 @@ def test_the_records_name_the_holder_of_the_key(
         eventually(lambda: any(entry.alive for entry in anna.status().robots))
         assert anna.explore("r0").order.by == "anna" and control.report is not None
         assert control.report.order.by == "anna"
+        forged = encode(MissionRequest("forged", "r0", MissionKind.STOP, time.time_ns(), "vera"))
+        (reply,) = session.ask(sent_by(KEYS.any_mission(), "anna"), forged, 20.0)
+        assert not reply.error
+        assert (control.report.order.id, control.report.order.by) == ("forged", "anna")
 
         with Session(bus("anna"), KEYS, "r0", "vera", "anna"):
             pass
         link.report(Status("standing", "", 7, 0, Pose2(), False), 2)
         eventually(lambda: any("r0: the drive by hand is over, by anna since" in one for one in words()))
         assert any(one.startswith("r0: driven by hand, by anna since") for one in words())
-        assert any(one.startswith("r0: explore, by anna (mission") for one in words())
+        for kind in ("explore", "stop"):
+            assert any(one.startswith(f"r0: {kind}, by anna (mission") for one in words()), words()
 
         with pytest.raises(InvalidValue, match="with this key you are anna, not bob"):
             Fleet(endpoint, "demo", "bob", anna_key)

@@ -19,7 +19,7 @@ from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver import quotas as quotas_module
 from mapweave.mapserver.log import ingest, intake, kept_bytes, known_logs, pull_schedule, pulled
 from mapweave.mapserver.log.entry import ReceivedChange
-from mapweave.mapserver.log.intake import ADVICE
+from mapweave.mapserver.log.intake import ADVICE, Intake
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from mapweave.mapserver.log.store import PRUNING_MARK
 from mapweave.mapserver.quotas import BURST, Quotas, QuotaSettings
@@ -110,6 +110,18 @@ def test_what_is_held_back_is_fetched_later_in_order(started: Start, hub: Memory
     eventually(lambda: len(server.seen) >= 301)
     assert [c.sequence for c in server.seen if c.map == MAP] == list(range(1, 301))
     assert quotas.over() == {}, "it has kept to its quota for a while"
+
+
+def test_beacons_beyond_the_quota_are_not_looked_at(server: Server):
+    """Each of them may cost an answer."""
+    clock = Clock()
+    quotas = Quotas(QuotaSettings(changes=1.0), clock)
+    robot = Intake("r0", quotas, server.store, tuple)
+    most = round(BURST)
+    assert [robot.beacon() for _ in range(most + 5)] == [True] * most + [False] * 5
+    assert "5 beacons" in quotas.over()["r0"]
+    clock.now += 3.0
+    assert [robot.beacon() for _ in range(5)] == [True] * 3 + [False] * 2
 
 
 def test_a_robot_that_sends_more_than_its_quota_is_stored_at_the_rate_of_its_quota(
