@@ -20,6 +20,8 @@ from mapweave.vision.lens import NO_DISTORTION, Distortion, Lens
 
 Stamps = NDArray[np.int64]
 
+MUCH_RARER = 1.5
+"""Poses that are so many times rarer than images are named."""
 SILENCE_S, SILENCE_GAPS = 2.0, 10.0
 """A camera that gives no image for so long, s and median gaps, has stopped."""
 FASTEST = 100.0
@@ -263,7 +265,7 @@ def assembled(
         def read(k: int) -> NDArray[np.uint8]:
             return whole(int(numbers[k]))
 
-        notes = (*notes, *_silence(stamps, odometry.stamps_ns))
+        notes = (*notes, *_silence(stamps, odometry.stamps_ns), *_rare(stamps, odometry.stamps_ns))
     else:
         increments = odometry
     if len(increments) != len(stamps) or not np.isfinite(increments).all():
@@ -329,6 +331,16 @@ def _plausible_rows(increments: Array, stamps_ns: Stamps) -> tuple[int, str]:
 
 def _rectified(read: Callable[[int], NDArray[np.uint8]], lens: Lens) -> Callable[[int], NDArray[np.uint8]]:
     return lambda k: lens.rectified(read(k))
+
+
+def _rare(images_ns: Stamps, poses_ns: Stamps) -> list[str]:
+    """A line if poses are rarer than images: between two of them a curve is a straight way."""
+    if len(images_ns) < 2:
+        return []
+    image, pose = (float(np.median(np.diff(each))) * 1e-9 for each in (images_ns, poses_ns))
+    if pose <= MUCH_RARER * image:
+        return []
+    return [f"odometry has a pose every {pose:.2g} s, images come every {image:.2g} s: straight ways between"]
 
 
 def _silence(stamps_ns: Stamps, odometry_ns: Stamps) -> list[str]:

@@ -236,6 +236,18 @@ def test_a_fisheye_of_euroc_becomes_an_ideal_camera(drive: Drive, poses_file: Pa
         open_recording(tmp_path, options)
 
 
+def test_odometry_that_is_slower_than_the_images_is_named(drive: Drive, poses_file: Path, tmp_path):
+    """Poses 3 s apart on a curve were taken for odometry of another clock, without a word of them."""
+    euroc(drive, tmp_path)
+    options = RecordingOptions(odometry=poses_file, camera_height=0.3)
+    assert not any("straight" in note for note in open_recording(tmp_path, options).notes)
+    head, *rows = poses_file.read_text().splitlines(keepends=True)
+    poses_file.write_text(head + "".join(rows[::12]))
+    image, pose = STEP_NS * 1e-9, 3 * STEP_NS * 1e-9
+    line = f"odometry has a pose every {pose:.2g} s, images come every {image:.2g} s: straight ways between"
+    assert line in open_recording(tmp_path, options).notes
+
+
 def test_lists_of_sensor_yaml_may_have_a_line_each(drive: Drive, poses_file: Path, tmp_path):
     euroc(drive, tmp_path)
     sensor, options = (
