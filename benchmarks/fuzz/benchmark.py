@@ -30,7 +30,7 @@ from benchmarks.command_line import command_line
 
 SUMS = ("inputs", "accepted", "crashes", "hangs", "accepted_invalid")
 AT_ONCE = 2
-START, GRACE = 600.0, 60.0
+START, GRACE = 120.0, 60.0
 """s in which a process must be ready, and beyond its time in which it must end."""
 
 
