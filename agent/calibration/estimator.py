@@ -33,7 +33,7 @@ from mapweave.agent.calibration.pair_information import (
     reduce_pair,
     with_floor,
 )
-from mapweave.agent.calibration.parameter_sigmas import DELAY_SHARE, MODEL_SIGMAS, PRIOR_SIGMAS, useful
+from mapweave.agent.calibration.parameter_sigmas import MODEL_SIGMAS, PRIOR_SIGMAS, useful
 from mapweave.agent.calibration.ranger_scale import RangedScale
 from mapweave.agent.calibration.turn_correction import PairTurn
 from mapweave.agent.drive_geometry import COUNT, DriveGeometry, Parameter
@@ -208,9 +208,7 @@ class Estimator:
         self._learn_scene()
         inverse_hessian = np.asarray(np.linalg.inv(hessian), np.float64)
         self._covariance = _wider(inverse_hessian, self._scatter(inverse_hessian, scores))
-        model = MODEL_SIGMAS.copy()
-        model[P.DELAY] = max(model[P.DELAY], DELAY_SHARE * float(np.median(np.diff(wheels.stamps))))
-        self._covariance = self._covariance + np.diag(model**2)
+        self._covariance = self._covariance + np.diag(MODEL_SIGMAS**2)
         return Estimate(
             self.vector.copy(),
             self._covariance,

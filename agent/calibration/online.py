@@ -64,7 +64,7 @@ SURE = 4.0
 """It is wrong also if one solution says so by so many sigmas,"""
 MANY_PAIRS = 100
 """once so many pairs were taken: these have little in common by chance, and a drive may be too short for half
-as many again. Both chosen; see docs/decisions/drive-geometry.md."""
+as many again. Both chosen; see docs/decisions/delay.md."""
 WORTH = np.full(COUNT, 2.0)
 """A change is put to use if it is larger than so many useful sigmas, and sure enough to be named."""
 WORTH[P.WHEEL_SCALE] = 1.0

@@ -20,11 +20,9 @@ USEFUL_SIGMAS = {
 }  # fmt: skip
 """A drive shows a parameter if its sigma is below this: smaller errors do not show in a map. How far the
 camera stands off counts as a share of its height: 16 cm on a car, 3 cm on a robot with a mast of 30 cm."""
-MODEL_SIGMAS = np.array([0.005, 0.005, 0.001, 0.01, 0.015, 0.002, 0.001, 0.001, 0.002, 0.002])
+MODEL_SIGMAS = np.array([0.005, 0.005, 0.001, 0.01, 0.015, 0.002, 0.001, 0.001, 0.002, 0.005])
 """Errors of the estimator itself, in the order of `Parameter`: depths are not Gaussian, pairs short. Measured
-on drives through simulated buildings; no sigma is smaller."""
-DELAY_SHARE = 0.08
-"""And of the delay, as a share of the time between two readings: nothing is known of what happens within."""
+on drives through simulated buildings, that of the delay on a street; no sigma is smaller."""
 
 
 def useful(declared: Array) -> Array:

@@ -74,6 +74,14 @@ def test_sigmas_cover_the_errors(trials: list[tuple[DriveGeometry, Estimate]]):
     assert np.mean(z < 4.0) > 0.97
 
 
+def test_a_delay_is_known_better_than_readings_are_apart():
+    """Wheels are read every 0.1 s; what happens between two readings hides no delay from many turns."""
+    true = DriveGeometry(forward=0.1, height=0.25, delay=0.05)
+    estimate = estimated(drive(np.random.default_rng(3), true, 30.0), 3)
+    off, sigma = abs(estimate.vector[P.DELAY] - true.delay), estimate.sigmas[P.DELAY]
+    assert off < 3.0 * sigma < 0.02
+
+
 def test_a_straight_drive_shows_no_lever():
     """Only turns tell how far ahead a camera stands; the heading shows all the same."""
     true = DriveGeometry(forward=0.3, heading=0.04, height=0.25)
