@@ -1,5 +1,7 @@
 """A world that needs no simulator: a photograph hung on two walls, rendered by an exact homography."""
 
+from __future__ import annotations
+
 from collections import OrderedDict
 from collections.abc import Iterator
 from functools import cached_property

@@ -1,7 +1,5 @@
 """The link to the fleet: missions, status, and questions that may stay without an answer."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator
@@ -75,7 +73,7 @@ def link(hub: MemoryHub) -> Iterator[FleetClient]:
     bus.close()
 
 
-def test_an_order_is_acknowledged_and_reported(link: FleetClient, other: MemoryBus) -> None:
+def test_an_order_is_acknowledged_and_reported(link: FleetClient, other: MemoryBus):
     order = MissionOrder("a1", "r0", MissionKind.GO, 7, "anna", THERE)
     for _ in range(2):
         (reply,) = other.ask(KEYS.mission("r0"), encode(order), 2.0)
@@ -97,7 +95,7 @@ def test_an_order_is_acknowledged_and_reported(link: FleetClient, other: MemoryB
 )
 def test_invalid_orders_are_refused_without_effect(
     link: FleetClient, other: MemoryBus, change: dict[str, object], said: str
-) -> None:
+):
     fields = msgpack.unpackb(encode(MissionOrder("a1", "r0", MissionKind.STOP, 7, "anna")))
     (reply,) = other.ask(KEYS.mission("r0"), msgpack.packb(fields | change), 2.0)
     assert said in reply.error
@@ -105,7 +103,7 @@ def test_invalid_orders_are_refused_without_effect(
     assert decode(reply.payload, AgentStatus).mission is None
 
 
-def test_the_fleet_receives_the_robots_status(link: FleetClient, other: MemoryBus) -> None:
+def test_the_fleet_receives_the_robots_status(link: FleetClient, other: MemoryBus):
     received: list[AgentStatus] = []
     other.subscribe(
         KEYS.agent_statuses(), lambda sample: received.append(decode(sample.payload, AgentStatus))
@@ -116,7 +114,7 @@ def test_the_fleet_receives_the_robots_status(link: FleetClient, other: MemoryBu
 
 
 @given(st.text(), st.integers(1, 400))
-def test_any_status_can_be_sent(text: str, times: int) -> None:
+def test_any_status_can_be_sent(text: str, times: int):
     """A status quotes servers and drivers: line breaks and long texts must not end the robot's loop."""
     bus = MemoryBus(MemoryHub())
     link = FleetClient(bus, KEYS, MAP, MissionControl("r0"))
@@ -130,7 +128,7 @@ def test_any_status_can_be_sent(text: str, times: int) -> None:
     assert all(c == d for c, d in zip(text * times, message, strict=False) if c.isprintable())
 
 
-def test_the_status_is_current(hub: MemoryHub, other: MemoryBus) -> None:
+def test_the_status_is_current(hub: MemoryHub, other: MemoryBus):
     """Also when nothing was published: what waits for the server, what has gone over the network."""
     bus, waiting = TrafficMeter(MemoryBus(hub)), [3]
     failure = ["r0.sqlite: the disk\nis full"]
@@ -169,7 +167,7 @@ def test_the_status_is_current(hub: MemoryHub, other: MemoryBus) -> None:
     bus.close()
 
 
-def test_the_agent_is_alive_until_it_goes(hub: MemoryHub, other: MemoryBus) -> None:
+def test_the_agent_is_alive_until_it_goes(hub: MemoryHub, other: MemoryBus):
     seen: list[tuple[str, bool]] = []
     other.watch(KEYS.agents_alive(), lambda key, alive: seen.append((key, alive)))
     bus = MemoryBus(hub)
@@ -185,14 +183,14 @@ QUESTIONS: list[Question] = [WhereAmI(7, VIEW), WhichWay(7, HERE, THERE), WhatIs
 
 
 @pytest.mark.parametrize("question", QUESTIONS, ids=["where", "way", "known"])
-def test_without_a_server_the_answer_has_the_reason(link: FleetClient, question: Question) -> None:
+def test_without_a_server_the_answer_has_the_reason(link: FleetClient, question: Question):
     link.ask(question)
     (answer,) = link.answers(wait=True)
     assert (answer.number, answer.content, answer.error) == (7, None, NO_ANSWER)
     assert link.answers(wait=True) == (), "nothing is open: there is nothing to wait for"
 
 
-def test_the_servers_answers_come_with_their_numbers(link: FleetClient, other: MemoryBus) -> None:
+def test_the_servers_answers_come_with_their_numbers(link: FleetClient, other: MemoryBus):
     asked: list[object] = []
 
     def relocalize(request) -> None:
@@ -223,7 +221,7 @@ def test_the_servers_answers_come_with_their_numbers(link: FleetClient, other: M
     assert request.start_from_robot == Pose2(0.25, -0.5, 1.0)
 
 
-def test_who_is_near_is_asked_only_of_a_server_that_is_there(link: FleetClient, other: MemoryBus) -> None:
+def test_who_is_near_is_asked_only_of_a_server_that_is_there(link: FleetClient, other: MemoryBus):
     """A robot that maps alone asks for ever: that is no trouble to report."""
     who = WhoIsNear(-2, ((HERE, Pose2(0.5, 0.0, 0.1)),), 0.01, 0.02, 0.16, 0.3, 0.25)
     asked: list[NearbyRequest] = []
@@ -246,7 +244,7 @@ def test_who_is_near_is_asked_only_of_a_server_that_is_there(link: FleetClient, 
     assert asked == [NearbyRequest("r0", who.starts, 0.01, 0.02, 0.16, 0.3, 0.25)]
 
 
-def test_it_gets_what_others_have_mapped(link: FleetClient, other: MemoryBus) -> None:
+def test_it_gets_what_others_have_mapped(link: FleetClient, other: MemoryBus):
     asked: list[KnownRequest] = []
 
     def known(request) -> None:
@@ -261,7 +259,7 @@ def test_it_gets_what_others_have_mapped(link: FleetClient, other: MemoryBus) ->
     assert answer.content.views.tolist() == [[1.0, 2.0, 0.5, 0.5]]
 
 
-def test_a_robot_never_waits(link: FleetClient, other: MemoryBus) -> None:
+def test_a_robot_never_waits(link: FleetClient, other: MemoryBus):
     release = threading.Event()
 
     def slow(request) -> None:
@@ -279,7 +277,7 @@ def test_a_robot_never_waits(link: FleetClient, other: MemoryBus) -> None:
     assert [answer.number for answer in got] == [1]
 
 
-def test_waiting_ends_when_the_time_is_over(hub: MemoryHub, other: MemoryBus) -> None:
+def test_waiting_ends_when_the_time_is_over(hub: MemoryHub, other: MemoryBus):
     release, bus = threading.Event(), MemoryBus(hub)
     link = FleetClient(bus, KEYS, MAP, MissionControl("r0"), answer_timeout=0.5)
     other.serve(sent_by_any(KEYS.route("s0")), lambda request: release.wait(60))
@@ -303,9 +301,7 @@ def answering(other: MemoryBus, server: str, answer: object) -> None:
 
 
 @pytest.mark.parametrize("busy", [0, 2], ids=["at once", "after it was busy"])
-def test_a_server_that_knows_the_place_is_not_waited_past(
-    link: FleetClient, hub: MemoryHub, busy: int
-) -> None:
+def test_a_server_that_knows_the_place_is_not_waited_past(link: FleetClient, hub: MemoryHub, busy: int):
     """As in benchmarks.chaos: the other one still worked on the robot's last question."""
     frozen, other, release = MemoryBus(hub), MemoryBus(hub), threading.Event()
     frozen.serve(sent_by_any(KEYS.relocalize("s0")), lambda request: release.wait(60))
@@ -353,7 +349,7 @@ def test_a_server_that_knows_the_place_is_not_waited_past(
 @pytest.mark.parametrize("first", ["worse", "better"])
 def test_of_two_servers_the_one_that_knows_more_is_believed(
     link: FleetClient, other: MemoryBus, question: Question, worse: object, better: object, first: str
-) -> None:
+):
     """One of them may be new, or get its store again; and a robot drives only where both let it."""
     for server, answer in zip(("s0", "s1"), (worse, better)[:: 1 if first == "worse" else -1], strict=True):
         answering(other, server, answer)
@@ -362,7 +358,7 @@ def test_of_two_servers_the_one_that_knows_more_is_believed(
     assert answer.content is not None and encode(answer.content) == encode(better)
 
 
-def test_a_question_that_a_server_took_along_is_asked_again(link: FleetClient, hub: MemoryHub) -> None:
+def test_a_question_that_a_server_took_along_is_asked_again(link: FleetClient, hub: MemoryHub):
     """A server dies with the question; the other one takes its place a moment later."""
     dying, other = MemoryBus(hub), MemoryBus(hub)
     asked = threading.Event()
@@ -379,7 +375,7 @@ def test_a_question_that_a_server_took_along_is_asked_again(link: FleetClient, h
     other.close()
 
 
-def test_a_refusal_is_quoted_and_another_servers_answer_is_used(link: FleetClient, other: MemoryBus) -> None:
+def test_a_refusal_is_quoted_and_another_servers_answer_is_used(link: FleetClient, other: MemoryBus):
     other.serve(sent_by_any(KEYS.route("s0")), lambda request: request.refuse("no such node"))
     link.ask(WhichWay(1, HERE, THERE))
     (answer,) = link.answers(wait=True)
@@ -398,7 +394,7 @@ def test_a_refusal_is_quoted_and_another_servers_answer_is_used(link: FleetClien
 
 def test_a_question_that_cannot_be_sent_is_answered_and_the_next_one_is_asked(
     link: FleetClient, other: MemoryBus
-) -> None:
+):
     """A robot that stood before very many closed doors must not lose its voice, nor stop a lock-step."""
     other.serve(sent_by_any(KEYS.route("s0")), lambda request: request.reply(encode(RouteAnswer((), "yes"))))
     link.ask(WhichWay(1, HERE, THERE, Pose2(), ((HERE, THERE),) * (MAX_BLOCKED + 1)))
@@ -410,7 +406,7 @@ def test_a_question_that_cannot_be_sent_is_answered_and_the_next_one_is_asked(
     assert isinstance(got[1].content, RouteAnswer)
 
 
-def test_closing_twice_is_no_error(hub: MemoryHub) -> None:
+def test_closing_twice_is_no_error(hub: MemoryHub):
     bus = MemoryBus(hub)
     link = FleetClient(bus, KEYS, MAP, MissionControl("r0"))
     link.close()
@@ -418,9 +414,7 @@ def test_closing_twice_is_no_error(hub: MemoryHub) -> None:
     bus.close()
 
 
-def test_a_trouble_is_in_the_status_only_while_it_holds(
-    hub: MemoryHub, other: MemoryBus, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_trouble_is_in_the_status_only_while_it_holds(hub: MemoryHub, other: MemoryBus, caplog):
     caplog.set_level("INFO", "mapweave.agent.fleet_client")
     bus, missions = MemoryBus(hub), MissionControl("r0")
     link = FleetClient(bus, KEYS, MAP, missions, answer_timeout=0.1)

@@ -1,7 +1,5 @@
 """Tests of kernels run twice: as numba compiles them, and in NumPy as on a robot without it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.util import find_spec

@@ -1,7 +1,5 @@
 """Annotations: the last one of a name holds, the whole record stays, and messages bring them unchanged."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -78,7 +76,7 @@ entries = st.one_of(
 
 @pytest.mark.slow
 @given(st.lists(entries, max_size=6))
-def test_messages_and_files_bring_annotations_unchanged(made) -> None:
+def test_messages_and_files_bring_annotations_unchanged(made):
     record = Annotations(tuple(made))
     assert decode(encode(record), Annotations) == record
     for entry in made:
@@ -88,7 +86,7 @@ def test_messages_and_files_bring_annotations_unchanged(made) -> None:
 
 
 @given(st.lists(entries, max_size=8), st.integers(0, 8))
-def test_two_records_join_by_their_dates(made, cut) -> None:
+def test_two_records_join_by_their_dates(made, cut):
     first, second = Annotations(tuple(made[:cut])), Annotations(tuple(made[cut:]))
     assert set((first + second).made) == set(made)
     stamps_ns = [entry.stamp_ns for entry in (first + second).made]
@@ -96,7 +94,7 @@ def test_two_records_join_by_their_dates(made, cut) -> None:
     assert (first + second) + first == first + second
 
 
-def test_the_last_of_a_kind_and_name_holds() -> None:
+def test_the_last_of_a_kind_and_name_holds():
     kitchen = Annotation("kitchen", Place(A), False, "anna", 1)
     moved = replace(kitchen, body=Place(B), stamp_ns=2)
     closed = Annotation("kitchen", Closure((A, B)), False, "bob", 3)
@@ -115,13 +113,13 @@ def test_the_last_of_a_kind_and_name_holds() -> None:
     ["", "x" * 65, "a\nb", " kitchen", "kitchen ", "-kitchen", "home", "Home", "area", "r0.1.17", "R0.1",
      "3,4", "3.1, -2.0", "nan,inf", "1,2,3"],
 )  # fmt: skip
-def test_names_that_commands_would_misread_are_refused(name) -> None:
+def test_names_that_commands_would_misread_are_refused(name):
     with pytest.raises(InvalidValue):
         Annotation(name, Place(A), False, "anna", 1)
 
 
 @pytest.mark.parametrize("name", ["kitchen", "Küche 2", "12", "r0", "b.c", "anna's desk", "台所"])
-def test_other_names_are_taken(name) -> None:
+def test_other_names_are_taken(name):
     assert Annotation(name, Place(A), False, "anna", 1).name == name
 
 
@@ -140,18 +138,18 @@ def test_other_names_are_taken(name) -> None:
         lambda: Annotation("x", Place(A), False, "", 1, "w" * 301),
     ],
 )
-def test_what_makes_no_sense_is_refused(make) -> None:
+def test_what_makes_no_sense_is_refused(make):
     with pytest.raises(InvalidValue):
         make()
 
 
-def test_a_closure_holds_from_its_beginning_until_its_end() -> None:
+def test_a_closure_holds_from_its_beginning_until_its_end():
     closure = Closure((A, B), None, 10, 20)
     assert [closure.holds(at) for at in (9, 10, 19, 20)] == [False, True, True, False]
     assert Closure((A, B)).holds(0) and Closure((A, B), None, 10).holds(2**63 - 1)
 
 
-def test_kinds_of_a_newer_program_are_left_out_of_files_and_refused_alone() -> None:
+def test_kinds_of_a_newer_program_are_left_out_of_files_and_refused_alone():
     entry = {
         "name": "x",
         "body": {"kind": "hologram", "node": [*A]},

@@ -1,7 +1,5 @@
 """Areas: the geometry against OpenCV, exact fractions and winding numbers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from fractions import Fraction
 from itertools import combinations, pairwise
@@ -27,7 +25,7 @@ polygons = st.lists(points, min_size=3, max_size=8, unique=True)
 
 
 @given(polygons, points)
-def test_a_point_is_inside_as_opencv_finds(corners, point) -> None:
+def test_a_point_is_inside_as_opencv_finds(corners, point):
     shape = np.array(corners, float)
     # Off the corners and borders, where a point is neither in nor out.
     at = np.add(point, (0.2371, 0.1113))
@@ -36,7 +34,7 @@ def test_a_point_is_inside_as_opencv_finds(corners, point) -> None:
 
 
 @given(polygons, points, points)
-def test_a_segment_crosses_the_border_as_exact_fractions_say(corners, begin, end) -> None:
+def test_a_segment_crosses_the_border_as_exact_fractions_say(corners, begin, end):
     ring = [*corners, corners[0]]
     expected = any(meet(a, b, begin, end) for a, b in pairwise(ring))
     got = crosses(np.array(corners, float), np.array([begin], float), np.array([end], float))
@@ -58,7 +56,7 @@ def on(p, q, r) -> bool:
     return cross == 0 and all(min(q[k], r[k]) <= p[k] <= max(q[k], r[k]) for k in (0, 1))
 
 
-def test_an_area_moves_with_its_anchor() -> None:
+def test_an_area_moves_with_its_anchor():
     anchor, corners = Pose2(3.0, -1.0, 0.7), [(2.0, -2.0), (5.0, -2.0), (5.0, 1.0), (2.0, 1.0)]
     area = Area.of_merged(NODE, anchor, corners)
     assert area.polygon(anchor) == pytest.approx(np.array(corners))
@@ -68,7 +66,7 @@ def test_an_area_moves_with_its_anchor() -> None:
     assert back == pytest.approx(np.mean(area.corners, axis=0))
 
 
-def test_a_circle_is_within_its_polygon() -> None:
+def test_a_circle_is_within_its_polygon():
     area = Area.around(NODE, 2.0)
     angles = np.linspace(0.0, 6.3, 400)
     circle = 1.9999 * np.column_stack([np.cos(angles), np.sin(angles)])
@@ -86,13 +84,13 @@ def test_a_circle_is_within_its_polygon() -> None:
         tuple((float(k), float(k * k)) for k in range(65)),
     ],
 )
-def test_what_is_no_area_is_refused(corners) -> None:
+def test_what_is_no_area_is_refused(corners):
     with pytest.raises(InvalidValue):
         Area(NODE, corners)
 
 
 @pytest.mark.parametrize("radius", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_radius_is_positive(radius) -> None:
+def test_a_radius_is_positive(radius):
     with pytest.raises(InvalidValue, match="give metres"):
         Area.around(NODE, radius)
 
@@ -122,7 +120,7 @@ def clean(corners) -> bool:
 
 
 @given(polygons.filter(lambda corners: not on_one_line(corners)))
-def test_an_outline_crosses_itself_where_two_sides_meet_as_exact_fractions_say(corners) -> None:
+def test_an_outline_crosses_itself_where_two_sides_meet_as_exact_fractions_say(corners):
     sides = sides_of(corners)
     apart = [(p, q) for p, q in combinations(sides, 2) if not {*p} & {*q}]
     assume(clean(corners))
@@ -130,7 +128,7 @@ def test_an_outline_crosses_itself_where_two_sides_meet_as_exact_fractions_say(c
 
 
 @given(polygons.filter(lambda corners: not on_one_line(corners)))
-def test_an_outline_that_winds_twice_around_a_point_crosses_itself(corners) -> None:
+def test_an_outline_that_winds_twice_around_a_point_crosses_itself(corners):
     """Winding numbers by the angle at each point of a grid that no side meets, of any polygon."""
     steps = np.arange(-4.0, 4.0, 0.25) + np.sqrt(2.0) / 31.0
     grid = np.stack(np.meshgrid(steps, steps + 0.017), -1).reshape(-1, 2)
@@ -143,7 +141,7 @@ def test_an_outline_that_winds_twice_around_a_point_crosses_itself(corners) -> N
 
 
 @given(polygons.filter(lambda corners: not on_one_line(corners)), st.floats(-3.2, 3.2), st.integers(0, 7))
-def test_how_an_outline_is_written_down_does_not_matter(corners, heading, first) -> None:
+def test_how_an_outline_is_written_down_does_not_matter(corners, heading, first):
     """The other way around, from another corner, with the first one repeated, or turned with rounding."""
     expected = crosses_itself(corners)
     assert crosses_itself(corners[::-1]) == expected
@@ -163,7 +161,7 @@ def test_how_an_outline_is_written_down_does_not_matter(corners, heading, first)
         ("0,0 2,0 2,2 0,0 2,0 2,2", ""),  # twice around
     ],
 )
-def test_the_words_say_where_an_outline_crosses_itself_and_what_to_do(corners, where) -> None:
+def test_the_words_say_where_an_outline_crosses_itself_and_what_to_do(corners, where):
     area = Area(NODE, tuple(map(read_corner, corners.split())))
     with pytest.raises(InvalidValue) as refused:
         area.check_outline()
@@ -182,16 +180,16 @@ def test_the_words_say_where_an_outline_crosses_itself_and_what_to_do(corners, w
         "0,0 3,0 3,1 1,1 1,2 3,2 3,3 0,3",
     ],
 )
-def test_an_outline_may_touch_itself(corners) -> None:
+def test_an_outline_may_touch_itself(corners):
     Area(NODE, tuple(map(read_corner, corners.split()))).check_outline()
 
 
-def test_what_is_round_does_not_cross_itself() -> None:
+def test_what_is_round_does_not_cross_itself():
     for radius in (1e-3, 0.5, 9e3):
         Area.around(NODE, radius).check_outline()
 
 
-def test_an_area_that_was_kept_before_outlines_were_checked_can_be_read_and_taken_back() -> None:
+def test_an_area_that_was_kept_before_outlines_were_checked_can_be_read_and_taken_back():
     area = Area(NODE, ((0.0, 0.0), (2.0, 2.0), (2.0, 0.0), (0.0, 2.0)))
     kept = ManualConstraint(RetiredArea(area), True, "anna", 5)
     assert decode(encode(kept), ManualConstraint) == kept

@@ -26,7 +26,7 @@ def grey(image: np.ndarray) -> np.ndarray:
     return cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)
 
 
-def test_decoded_is_the_nearest_step_of_each_coordinate() -> None:
+def test_decoded_is_the_nearest_step_of_each_coordinate():
     sift, tables = fake_sift(50, 1), landmark_tables()
     grid = tables.step * (np.arange(SYMBOLS) - ZERO)
     nearest = np.abs(project(sift)[:, :, None] - grid).argmin(axis=2)
@@ -34,20 +34,20 @@ def test_decoded_is_the_nearest_step_of_each_coordinate() -> None:
     assert np.allclose(decode(encode(sift)), grid[nearest], atol=1e-6)
 
 
-def test_decoded_values_encode_to_themselves_within_the_range() -> None:
+def test_decoded_values_encode_to_themselves_within_the_range():
     codes = np.random.default_rng(5).integers(0, SYMBOLS, (100, DIMENSIONS)).astype(np.uint8)
     assert np.array_equal(quantise(decode(codes)), codes)
     assert quantise(np.full((1, DIMENSIONS), 1e9)).max() == SYMBOLS - 1
     assert quantise(np.full((1, DIMENSIONS), -1e9)).min() == 0
 
 
-def test_projection_agrees_with_the_table() -> None:
+def test_projection_agrees_with_the_table():
     sift, tables = fake_sift(8, 2), landmark_tables()
     roots = np.sqrt(sift / sift.sum(axis=1, keepdims=True))
     assert np.allclose(project(sift), (roots - tables.mean) @ tables.basis, atol=1e-6)
 
 
-def test_scale_of_the_input_does_not_matter_and_nothing_is_no_harm() -> None:
+def test_scale_of_the_input_does_not_matter_and_nothing_is_no_harm():
     sift = fake_sift(5, 3)
     assert np.array_equal(encode(sift), encode(sift / 512))
     assert encode(np.zeros((2, 128))).shape == (2, DIMENSIONS)
@@ -56,19 +56,19 @@ def test_scale_of_the_input_does_not_matter_and_nothing_is_no_harm() -> None:
 
 
 @pytest.mark.parametrize("wrong", [np.zeros((3, 127)), np.full((1, 128), np.nan), np.zeros(128)])
-def test_invalid_sift_settings_are_refused(wrong: np.ndarray) -> None:
+def test_invalid_sift_settings_are_refused(wrong: np.ndarray):
     with pytest.raises(InvalidValue):
         encode(wrong)
 
 
-def test_invalid_codes_are_refused() -> None:
+def test_invalid_codes_are_refused():
     with pytest.raises(InvalidValue):
         decode(np.zeros((3, DIMENSIONS), np.int64))  # type: ignore[arg-type]
     with pytest.raises(InvalidValue):
         decode(np.zeros((3, 16), np.uint8))
 
 
-def test_tables_that_are_none_are_refused() -> None:
+def test_tables_that_are_none_are_refused():
     good = landmark_tables()
     impossible = good.codes.copy()
     impossible[0, [0, ZERO]] = [0, impossible[0, 0] + impossible[0, ZERO]]
@@ -84,7 +84,7 @@ def test_tables_that_are_none_are_refused() -> None:
             replace(good, **wrong)
 
 
-def test_rounding_adds_the_stated_noise_to_distances() -> None:
+def test_rounding_adds_the_stated_noise_to_distances():
     """Real descriptors, all pairs, before and after."""
     _, sift = real_sift(skimage.data.coins(), 300)
     exact, rounded = project(sift).astype(np.float64), decode(encode(sift)).astype(np.float64)
@@ -93,7 +93,7 @@ def test_rounding_adds_the_stated_noise_to_distances() -> None:
     assert grown.mean() == pytest.approx(rounding_noise(), rel=0.25)
 
 
-def test_codes_keep_right_matches_of_real_photographs() -> None:
+def test_codes_keep_right_matches_of_real_photographs():
     """Two cameras side by side, with the true disparity of each pixel; neither photograph was trained on."""
     left, right, disparity = skimage.data.stereo_motorcycle()
     pixels, sift = zip(*(real_sift(grey(image), 500) for image in (left, right)), strict=True)

@@ -38,7 +38,7 @@ bodies = st.one_of(
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(bodies, max_size=25))
-def test_contents_are_a_log_of_the_same_map(log: list[ChangeBody]) -> None:
+def test_contents_are_a_log_of_the_same_map(log: list[ChangeBody]):
     first = HybridMap(log)
     again = HybridMap(first.contents())
     assert set(first.nodes) == set(again.nodes)
@@ -52,7 +52,7 @@ def test_contents_are_a_log_of_the_same_map(log: list[ChangeBody]) -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.lists(bodies, max_size=20), bodies)
-def test_applying_a_change_twice_changes_nothing_more(log: list[ChangeBody], body: ChangeBody) -> None:
+def test_applying_a_change_twice_changes_nothing_more(log: list[ChangeBody], body: ChangeBody):
     once, twice = HybridMap([*log, body]), HybridMap([*log, body, body])
     assert set(once.nodes) == set(twice.nodes)
     assert once.edges == twice.edges
@@ -80,7 +80,7 @@ def replayed(log: list[ChangeBody]) -> nx.MultiGraph:
 
 @settings(max_examples=200, deadline=None)
 @given(st.lists(bodies, max_size=40))
-def test_the_graph_is_that_of_networkx(log: list[ChangeBody]) -> None:
+def test_the_graph_is_that_of_networkx(log: list[ChangeBody]):
     hybrid_map = HybridMap()
     for body in log:
         dropped = list(hybrid_map.dropped_by(body))
@@ -104,7 +104,7 @@ def test_the_graph_is_that_of_networkx(log: list[ChangeBody]) -> None:
     assert sorted(map(len, components), reverse=True) == [*map(len, components)]
 
 
-def test_what_robots_ask_of_their_map_loads_no_networkx(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_robots_ask_of_their_map_loads_no_networkx(monkeypatch):
     monkeypatch.setitem(sys.modules, "networkx", None)
     hybrid_map = HybridMap(
         [*(NodePut(node(k)) for k in range(4)), EdgePut(edge(8, 0, 1)), EdgePut(edge(9, 1, 2))]
@@ -120,7 +120,7 @@ def test_what_robots_ask_of_their_map_loads_no_networkx(monkeypatch: pytest.Monk
         hybrid_map.graph()
 
 
-def test_retiring_a_node_takes_its_edges_along() -> None:
+def test_retiring_a_node_takes_its_edges_along():
     hybrid_map = HybridMap(
         [NodePut(node(1)), NodePut(node(2)), EdgePut(edge(9, 1, 2)), NodeRetired(node(2).id)]
     )
@@ -128,7 +128,7 @@ def test_retiring_a_node_takes_its_edges_along() -> None:
     assert hybrid_map.components() == [{node(1).id}]
 
 
-def test_edge_between_takes_the_most_certain_and_the_direction_asked() -> None:
+def test_edge_between_takes_the_most_certain_and_the_direction_asked():
     hybrid_map = HybridMap(
         [NodePut(node(1)), NodePut(node(2)), EdgePut(edge(8, 1, 2, 0.5)), EdgePut(edge(9, 2, 1, 0.1))]
     )
@@ -139,6 +139,6 @@ def test_edge_between_takes_the_most_certain_and_the_direction_asked() -> None:
     assert hybrid_map.edge_between(node(1).id, NodeId("r0", 1, 5)) is None
 
 
-def test_components_are_largest_first() -> None:
+def test_components_are_largest_first():
     hybrid_map = HybridMap([*(NodePut(node(k)) for k in range(4)), EdgePut(edge(9, 2, 3))])
     assert [len(part) for part in hybrid_map.components()] == [2, 1, 1]

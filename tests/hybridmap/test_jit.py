@@ -85,7 +85,7 @@ def run(folder: Path, how: str, cache: Path, scale: str = "Scale") -> dict[str, 
 
 
 @pytest.mark.parametrize("how", ["without", "disabled"])
-def test_without_numba_a_kernel_runs_as_it_is_written(tmp_path: Path, how: str) -> None:
+def test_without_numba_a_kernel_runs_as_it_is_written(tmp_path, how: str):
     assert run(tmp_path, how, tmp_path / "cache")["hits"] == -1
 
 
@@ -120,7 +120,7 @@ assert doubled(np.arange(3), 1).tolist() == [1, 3, 5]
 """
 
 
-def test_the_first_calls_with_whole_numbers_do_not_wait_for_numba(tmp_path: Path) -> None:
+def test_the_first_calls_with_whole_numbers_do_not_wait_for_numba(tmp_path):
     pytest.importorskip("numba")
     (tmp_path / "whole.py").write_text(WHOLE)
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
@@ -131,21 +131,21 @@ def test_the_first_calls_with_whole_numbers_do_not_wait_for_numba(tmp_path: Path
 
 
 @pytest.mark.slow
-def test_a_kernel_is_compiled_once_and_kept(tmp_path: Path) -> None:
+def test_a_kernel_is_compiled_once_and_kept(tmp_path):
     pytest.importorskip("numba")
     assert run(tmp_path, "with", tmp_path / "cache")["hits"] == 0
     assert run(tmp_path, "with", tmp_path / "cache")["hits"] == 1
 
 
 @pytest.mark.slow
-def test_a_kernel_is_compiled_without_a_cache_folder(tmp_path: Path) -> None:
+def test_a_kernel_is_compiled_without_a_cache_folder(tmp_path):
     pytest.importorskip("numba")
     (tmp_path / "file").write_text("")
     assert run(tmp_path, "with", tmp_path / "file" / "cache")["hits"] == 0
 
 
 @pytest.mark.slow
-def test_a_kernel_of_an_earlier_version_is_compiled_again(tmp_path: Path) -> None:
+def test_a_kernel_of_an_earlier_version_is_compiled_again(tmp_path):
     """After an upgrade that renamed a class, agents ended with a traceback until the cache was deleted."""
     pytest.importorskip("numba")
     assert run(tmp_path, "with", tmp_path / "cache")["hits"] == 0
@@ -156,7 +156,7 @@ def test_a_kernel_of_an_earlier_version_is_compiled_again(tmp_path: Path) -> Non
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["nbi", "nbc"])
 @pytest.mark.parametrize("left", [0, 40, 200])
-def test_a_kernel_whose_file_is_cut_off_is_compiled_again(tmp_path: Path, kind: str, left: int) -> None:
+def test_a_kernel_whose_file_is_cut_off_is_compiled_again(tmp_path, kind: str, left: int):
     """As after a loss of power: so many bytes of the index, or of the compiled code, are left."""
     pytest.importorskip("numba")
     cache = tmp_path / "cache"
@@ -174,7 +174,7 @@ ALIAS = TypeAliasType("ALIAS", np.ndarray[tuple[Any, ...], np.dtype[Scalar]], ty
 
 @pytest.mark.parametrize("array", [NDArray, ALIAS])
 @pytest.mark.parametrize("scalar", [np.float64, np.int64, np.uint8])
-def test_the_elements_of_an_array_are_known_from_each_numpys_annotation(array: Any, scalar: type) -> None:
+def test_the_elements_of_an_array_are_known_from_each_numpys_annotation(array: Any, scalar: type):
     def one(values: Annotated[array[scalar], 1]) -> None:
         raise AssertionError("only its annotations are read")
 

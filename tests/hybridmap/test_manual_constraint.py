@@ -1,7 +1,5 @@
 """Manual constraints: the last one counts, the whole record stays."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -34,7 +32,7 @@ A, B = NodeId("a", 1, 3), NodeId("b", 1, 5)
 POSE = PoseGaussian(Pose2(1.0, 2.0, 0.5), np.diag([1e-3, 4e-3, 1e-4]))
 
 
-def test_what_it_is_about_is_put_in_order() -> None:
+def test_what_it_is_about_is_put_in_order():
     assert Apart((B, A)).ends == (A, B)
     assert Apart((B.map, A.map)).ends == (A.map, B.map)
     assert RetiredNodes((B, A, B)).nodes == (A, B)
@@ -45,13 +43,13 @@ def test_what_it_is_about_is_put_in_order() -> None:
 
 
 @pytest.mark.parametrize(("who", "why"), [("x\ny", ""), ("x", "w" * 301)])
-def test_words_that_are_no_line_are_refused(who: str, why: str) -> None:
+def test_words_that_are_no_line_are_refused(who: str, why: str):
     with pytest.raises(InvalidValue):
         ManualConstraint(Apart((A, B)), True, who, 0, why)
 
 
 @pytest.mark.parametrize(("x", "y"), [(2e4, 0.0), (0.0, -1e308), (float("nan"), 0.0), (0.0, float("nan"))])
-def test_no_link_by_hand_joins_nodes_that_are_far_apart(x: float, y: float) -> None:
+def test_no_link_by_hand_joins_nodes_that_are_far_apart(x: float, y: float):
     """Their maps could not be merged, and were set apart; a link of before can be taken back."""
     link = Linked(NodeId("r0", 1, 1), NodeId("r1", 1, 1), Pose2(x, y, 0.0))
     with pytest.raises(InvalidValue, match="nodes that see one place are at most 10000 m apart"):
@@ -59,7 +57,7 @@ def test_no_link_by_hand_joins_nodes_that_are_far_apart(x: float, y: float) -> N
     assert not ConstraintRequest(ManualConstraint(link, False, "anna", 1)).constraint.holds
 
 
-def test_a_constraint_on_maps_holds_for_all_their_nodes() -> None:
+def test_a_constraint_on_maps_holds_for_all_their_nodes():
     constraints = ManualConstraints([ManualConstraint(Apart((A.map, B.map)), True, "anna", 1)])
     assert (
         constraints.against(A, B)
@@ -70,7 +68,7 @@ def test_a_constraint_on_maps_holds_for_all_their_nodes() -> None:
     assert constraints.about(B, A) == constraints.about(MapId("b", 1), MapId("a", 1)) == constraints.made
 
 
-def test_what_was_taken_back_already_is_not_taken_back_again() -> None:
+def test_what_was_taken_back_already_is_not_taken_back_again():
     apart, other = Apart((A.map, B.map)), RetiredMap(A.map)
     made = [
         ManualConstraint(apart, True, "anna", 0),
@@ -108,7 +106,7 @@ subjects = st.sampled_from(
 
 
 @given(st.lists(st.tuples(subjects, st.booleans()), max_size=8), st.integers(0, 8))
-def test_the_last_constraint_counts_in_any_order(made, cut) -> None:
+def test_the_last_constraint_counts_in_any_order(made, cut):
     """Against a replay into a plain dictionary; and two halves joined are the whole."""
     constraints = [ManualConstraint(about, holds, "x", k) for k, (about, holds) in enumerate(made)]
     last = {}
@@ -125,7 +123,7 @@ def test_the_last_constraint_counts_in_any_order(made, cut) -> None:
     assert ((A, B) in whole.links) == (holds and not excluded)
 
 
-def test_retired_nodes_are_linked_with_nothing() -> None:
+def test_retired_nodes_are_linked_with_nothing():
     retired = ManualConstraint(RetiredNodes((A,)), True, "anna", 10**18, "repainted")
     constraints = ManualConstraints([retired], {A: retired})
     assert constraints.retires(A) is constraints.against(B, A) is retired
@@ -134,7 +132,7 @@ def test_retired_nodes_are_linked_with_nothing() -> None:
     assert event_words(retired) == 'node a.1.3 is retired by anna on 2001-09-09 01:46 UTC: "repainted"'
 
 
-def test_a_retired_map_is_about_all_of_its_nodes() -> None:
+def test_a_retired_map_is_about_all_of_its_nodes():
     first, second = MapId("r0", 1), MapId("r1", 1)
     retired = ManualConstraint(RetiredMap(first), True, "anna", 1)
     constraints = ManualConstraints([retired])
@@ -152,7 +150,7 @@ points = st.lists(st.tuples(metres, metres), max_size=9)
 
 
 @given(points.filter(lambda some: len(some) > 2), points)
-def test_an_area_contains_what_its_sides_go_round_an_odd_number_of_times(corners, asked) -> None:
+def test_an_area_contains_what_its_sides_go_round_an_odd_number_of_times(corners, asked):
     """Against the angle by which the polygon winds round a point."""
     try:
         area = Area(A, tuple(corners))
@@ -168,7 +166,7 @@ def test_an_area_contains_what_its_sides_go_round_an_odd_number_of_times(corners
         assert area.contains(np.array([point]))[0] == (turns % 2 != 0)
 
 
-def test_subjects_as_people_write_them() -> None:
+def test_subjects_as_people_write_them():
     assert read_retired(["a.1"]) == RetiredMap(A.map) and read_retired(["b.1.5", "a.1.3"]).nodes == (A, B)
     assert read_corner("1.5,-2") == (1.5, -2.0) and read_pose([1, 2, 180]).heading == pytest.approx(np.pi)
     assert read_pose([1, 2, -360]).heading == pytest.approx(-2.0 * np.pi)

@@ -26,25 +26,25 @@ def random_covariance(rng: np.random.Generator, size: float) -> np.ndarray:
 
 
 @given(poses, poses, poses)
-def test_composition_is_associative(a: Pose2, b: Pose2, c: Pose2) -> None:
+def test_composition_is_associative(a: Pose2, b: Pose2, c: Pose2):
     assert close((a @ b) @ c, a @ (b @ c))
 
 
 @given(poses)
-def test_inverse_on_both_sides(a: Pose2) -> None:
+def test_inverse_on_both_sides(a: Pose2):
     assert close(a @ a.inverse(), Pose2())
     assert close(a.inverse() @ a, Pose2())
 
 
 @given(poses, poses, metres, metres)
-def test_composition_acts_on_points_one_after_the_other(a: Pose2, b: Pose2, x: float, y: float) -> None:
+def test_composition_acts_on_points_one_after_the_other(a: Pose2, b: Pose2, x: float, y: float):
     point = np.array([[x, y, 0.7]])
     assert np.allclose((a @ b).apply(point), a.apply(b.apply(point)), atol=1e-9)
     assert (a @ b).apply(point)[0, 2] == 0.7
 
 
 @given(st.floats(-1000, 1000))
-def test_wrapped_angle_is_the_same_direction(angle: float) -> None:
+def test_wrapped_angle_is_the_same_direction(angle: float):
     wrapped = wrap_angle(angle)
     assert -math.pi <= wrapped < math.pi
     assert math.isclose(math.cos(wrapped), math.cos(angle), abs_tol=1e-9)
@@ -52,7 +52,7 @@ def test_wrapped_angle_is_the_same_direction(angle: float) -> None:
 
 
 @given(poses)
-def test_adjoint_against_finite_differences(a: Pose2) -> None:
+def test_adjoint_against_finite_differences(a: Pose2):
     step = 1e-6
     for k in range(3):
         d = np.zeros(3)
@@ -62,7 +62,7 @@ def test_adjoint_against_finite_differences(a: Pose2) -> None:
         assert np.allclose(moved, a.adjoint[:, k], atol=1e-3)
 
 
-def test_gaussian_composition_and_inverse_against_sampling() -> None:
+def test_gaussian_composition_and_inverse_against_sampling():
     rng = np.random.default_rng(5)
     a = PoseGaussian(Pose2(1, 2, 0.6), random_covariance(rng, 0.004))
     b = PoseGaussian(Pose2(-3, 0.5, -2.0), random_covariance(rng, 0.004))
@@ -82,7 +82,7 @@ def test_gaussian_composition_and_inverse_against_sampling() -> None:
         assert np.allclose(np.cov(deviations.T), gaussian.covariance, rtol=0.06, atol=1e-6)
 
 
-def test_mahalanobis_distance_of_samples_has_three_degrees_of_freedom() -> None:
+def test_mahalanobis_distance_of_samples_has_three_degrees_of_freedom():
     rng = np.random.default_rng(6)
     a = PoseGaussian(Pose2(1, 2, 3.0), random_covariance(rng, 0.01))
     samples = rng.multivariate_normal(np.zeros(3), a.covariance, 4000)
@@ -101,13 +101,13 @@ def test_mahalanobis_distance_of_samples_has_three_degrees_of_freedom() -> None:
         np.array([[1, 0, 1e200], [0, 1, 0], [1e200, 0, 1.0]]),
     ],
 )
-def test_invalid_covariances_are_refused(covariance: np.ndarray) -> None:
+def test_invalid_covariances_are_refused(covariance: np.ndarray):
     with pytest.raises(InvalidValue):
         PoseGaussian(Pose2(), covariance)
 
 
 @pytest.mark.parametrize("seed", range(200))
-def test_the_covariance_check_agrees_with_eigenvalues(seed: int) -> None:
+def test_the_covariance_check_agrees_with_eigenvalues(seed: int):
     rng = np.random.default_rng(seed)
     turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]
     values = 10.0 ** rng.uniform(-8, 3, 3) * rng.choice([1.0, 0.0], 3)
@@ -120,7 +120,7 @@ def test_the_covariance_check_agrees_with_eigenvalues(seed: int) -> None:
             assert accepted(one) == (result > -1e-6)
 
 
-def test_a_covariance_may_be_of_any_size() -> None:
+def test_a_covariance_may_be_of_any_size():
     assert accepted(1e200 * np.array([[2, 1, 0], [1, 2, 1], [0, 1, 2.0]]))
 
 
@@ -132,7 +132,7 @@ def accepted(covariance: np.ndarray) -> bool:
     return True
 
 
-def test_arrays_agree_with_single_poses() -> None:
+def test_arrays_agree_with_single_poses():
     rng = np.random.default_rng(7)
     first = [
         PoseGaussian(Pose2.from_vector(rng.normal(0, 2, 3)), random_covariance(rng, 0.1)) for _ in range(20)
@@ -158,7 +158,7 @@ def test_arrays_agree_with_single_poses() -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.floats(-6, 2), st.floats(0, 5))
-def test_any_decoded_pose_can_be_inverted_and_composed(seed: int, size: float, lever: float) -> None:
+def test_any_decoded_pose_can_be_inverted_and_composed(seed: int, size: float, lever: float):
     """Of any rank, rounded to float32, and seen from kilometres away, where only rounding is left of it."""
     rng = np.random.default_rng(seed)
     root = rng.normal(size=(3, rng.integers(1, 4))) * 10.0**size

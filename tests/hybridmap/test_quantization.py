@@ -1,7 +1,5 @@
 """Landmarks on their grid: rounding is as small as it is said to be, and is done once."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -20,7 +18,7 @@ shares = st.floats(0.002, 4.0)
 
 
 @given(depths, shares)
-def test_a_depth_is_off_by_little_of_its_sigma(depth: float, share: float) -> None:
+def test_a_depth_is_off_by_little_of_its_sigma(depth: float, share: float):
     back, sigma = (
         float(a[0]) for a in restore_depths(*round_depths(np.array([depth]), np.array([depth * share])))
     )
@@ -29,13 +27,13 @@ def test_a_depth_is_off_by_little_of_its_sigma(depth: float, share: float) -> No
 
 
 @given(st.integers(1, 63), st.integers(0, 55 * 512))
-def test_rounded_values_round_to_themselves(share: int, depth: int) -> None:
+def test_rounded_values_round_to_themselves(share: int, depth: int):
     steps = np.array([share]), np.array([min(depth, (55 << int(FINE_BITS[share])) - 1)])
     again = round_depths(*restore_depths(*steps))
     assert (again[0][0], again[1][0]) == (steps[0][0], steps[1][0])
 
 
-def test_steps_are_the_coarsest_that_are_fine_enough() -> None:
+def test_steps_are_the_coarsest_that_are_fine_enough():
     share = 0.002 * np.exp(np.arange(63) / 8)
     assert (0.25 / 2.0 ** FINE_BITS[1:] <= share / 3 + 1e-12)[share < 0.75].all()
     finer_than_needed = (0.25 / 2.0 ** (FINE_BITS[1:] - 1) <= share / 3) & (FINE_BITS[1:] > 0)
@@ -45,7 +43,7 @@ def test_steps_are_the_coarsest_that_are_fine_enough() -> None:
 @pytest.mark.parametrize(
     ("width", "height", "step"), [(320, 240, 1 / 8), (4095, 64, 1 / 8), (4096, 64, 1 / 4), (16384, 16, 1)]
 )
-def test_pixels_are_off_by_half_a_step(width: int, height: int, step: float) -> None:
+def test_pixels_are_off_by_half_a_step(width: int, height: int, step: float):
     grid = PixelGrid.of(Camera(width, height, 100.0, 100.0, 8.0, 8.0, 0.2))
     pixels = np.random.default_rng(3).uniform(-0.45, 1.45, (500, 2)) * [width, height]
     back = grid.restore(*grid.round(pixels))
@@ -53,7 +51,7 @@ def test_pixels_are_off_by_half_a_step(width: int, height: int, step: float) -> 
     assert np.array_equal(grid.restore(*grid.round(back)), back)
 
 
-def test_settled_landmarks_are_ordered_by_rows() -> None:
+def test_settled_landmarks_are_ordered_by_rows():
     random = np.random.default_rng(4)
     pixels = (random.uniform(0, 1, (60, 2)) * [319, 30]).astype(np.float32)
     codes = random.integers(0, 64, (60, 32)).astype(np.uint8)
@@ -75,19 +73,19 @@ def test_settled_landmarks_are_ordered_by_rows() -> None:
 @pytest.mark.parametrize(
     ("depth", "sigma"), [(0.0, 0.1), (-1.0, 0.1), (1.0, math.nan), (1.0, -0.1), (1.0, math.inf)]
 )
-def test_invalid_depths_are_refused(depth: float, sigma: float) -> None:
+def test_invalid_depths_are_refused(depth: float, sigma: float):
     with pytest.raises(InvalidValue):
         round_depths(np.array([depth]), np.array([sigma]))
 
 
-def test_depths_beyond_use_are_unknown() -> None:
+def test_depths_beyond_use_are_unknown():
     share, depth = round_depths(np.array([0.009, 1.3e4, math.inf, math.nan]), np.ones(4))
     assert not share.any()
     assert not depth.any()
     assert all(np.isnan(a).all() for a in restore_depths(share, depth))
 
 
-def test_snapped_landmarks_keep_their_order() -> None:
+def test_snapped_landmarks_keep_their_order():
     """Edges of a node refer to its landmarks by number, also where a node is written again."""
     random = np.random.default_rng(6)
     pixels = (random.uniform(0, 1, (50, 2)) * [319, 239]).astype(np.float32)

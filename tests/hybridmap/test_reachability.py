@@ -1,7 +1,5 @@
 """Which edges the servo could drive: counted by brute force, and said in words."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -59,7 +57,7 @@ def wall(n: int, rng: np.random.Generator, x: float = 3.0) -> np.ndarray:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_landmarks_in_view_are_those_that_both_cameras_see_at_every_stop(seed: int) -> None:
+def test_landmarks_in_view_are_those_that_both_cameras_see_at_every_stop(seed: int):
     """Against one landmark and one pose after the other."""
     rng = np.random.default_rng(seed)
     a_from_b = Pose2(rng.uniform(-1, 1), rng.uniform(-0.8, 0.8), rng.uniform(-0.7, 0.7))
@@ -75,7 +73,7 @@ def test_landmarks_in_view_are_those_that_both_cameras_see_at_every_stop(seed: i
     assert least_in_view(edge.shared[:, ::-1], b, a, a_from_b.inverse()) == pytest.approx(count, abs=2)
 
 
-def test_few_landmarks_a_long_way_or_a_wide_turn_only_tie_poses() -> None:
+def test_few_landmarks_a_long_way_or_a_wide_turn_only_tie_poses():
     rng = np.random.default_rng(1)
     near = Pose2(0.4, 0.1, 0.1)
     edge, a, b = pair(near, wall(60, rng), rng)
@@ -93,14 +91,14 @@ def test_few_landmarks_a_long_way_or_a_wide_turn_only_tie_poses() -> None:
     assert not reachability_of(turned, a, b).drivable and "degrees" in reachability_of(turned, a, b).reason
 
 
-def test_driven_edges_are_always_reachable() -> None:
+def test_driven_edges_are_always_reachable():
     rng = np.random.default_rng(2)
     for kind in (EdgeKind.MAPPED, EdgeKind.TURNED, EdgeKind.DRIVEN):
         edge, a, b = pair(Pose2(3.0, 0.0, 2.0), wall(3, rng), rng, kind)
         assert reachability_of(edge, a, b).drivable
 
 
-def test_landmarks_without_depth_count_by_being_at_both_ends() -> None:
+def test_landmarks_without_depth_count_by_being_at_both_ends():
     rng = np.random.default_rng(3)
     edge, a, b = pair(Pose2(0.5, 0.0, 0.05), wall(40, rng), rng)
 
@@ -112,7 +110,7 @@ def test_landmarks_without_depth_count_by_being_at_both_ends() -> None:
     assert least_in_view(edge.shared, bare(a), bare(b), edge.a_from_b.mean) == len(edge.shared)
 
 
-def test_what_is_a_little_too_far_is_not_said_to_be_as_far_as_the_servo_manages() -> None:
+def test_what_is_a_little_too_far_is_not_said_to_be_as_far_as_the_servo_manages():
     """Before: 45 degrees are more than the 45 that the servo manages."""
     rng = np.random.default_rng(2)
     said = reachability_of(
@@ -122,7 +120,7 @@ def test_what_is_a_little_too_far_is_not_said_to_be_as_far_as_the_servo_manages(
     assert f"{FARTHEST + 0.1:.1f} m are more than the {FARTHEST:g} m that" in said
 
 
-def test_closed_edges_of_a_map() -> None:
+def test_closed_edges_of_a_map():
     rng = np.random.default_rng(4)
     edge, a, b = pair(Pose2(0.4), wall(60, rng), rng)
     second, c, d = pair(Pose2(2.8), wall(60, rng, x=6.0), rng)
@@ -132,7 +130,7 @@ def test_closed_edges_of_a_map() -> None:
     assert closed_edges(first) == {closed.id}
 
 
-def test_landmarks_missing_in_a_rewritten_node_are_not_in_view() -> None:
+def test_landmarks_missing_in_a_rewritten_node_are_not_in_view():
     rng = np.random.default_rng(2)
     edge, a, b = pair(Pose2(0.4, 0.1, 0.1), wall(60, rng), rng)
     whole, kept = reachability_of(edge, a, b), 9

@@ -38,7 +38,7 @@ def random_map(seed: int, n: int = 14, m: int = 22) -> HybridMap:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(0, 10**6), st.booleans())
-def test_costs_no_more_than_dijkstra(seed: int, optimised: bool) -> None:
+def test_costs_no_more_than_dijkstra(seed: int, optimised: bool):
     hybrid_map = random_map(seed)
     rng = np.random.default_rng(seed)
     poses = {i: n.map_from_robot.mean for i, n in hybrid_map.nodes.items()}
@@ -67,7 +67,7 @@ def chain(*poses: Pose2) -> tuple[list[Node], HybridMap]:
     return nodes, HybridMap(changes_of(nodes, edges))
 
 
-def test_blocked_pairs_are_gone_around_in_either_order() -> None:
+def test_blocked_pairs_are_gone_around_in_either_order():
     nodes, one = chain(Pose2(0, 0), Pose2(1, 0), Pose2(2, 0), Pose2(2, 3))
     one.apply(EdgePut(edge(200, nodes[0], nodes[3])))
     one.apply(EdgePut(edge(201, nodes[3], nodes[2])))
@@ -79,20 +79,20 @@ def test_blocked_pairs_are_gone_around_in_either_order() -> None:
     assert nowhere.nodes == () and nowhere.reason.endswith(" is blocked (2 pairs)")
 
 
-def test_turning_costs() -> None:
+def test_turning_costs():
     nodes, one = chain(Pose2(0, 0, 0), Pose2(0, 0, 3.0))
     s = RouteSettings(per_edge=0.1, per_turn=0.4)
     assert RouteTable(one, settings=s).find(nodes[0].id, nodes[1].id).cost == pytest.approx(0.1 + 0.4 * 3.0)
 
 
-def test_of_two_edges_the_cheaper_is_driven() -> None:
+def test_of_two_edges_the_cheaper_is_driven():
     nodes, one = chain(Pose2(0, 0), Pose2(1, 0))
     one.apply(EdgePut(edge(5, nodes[0], nodes[1])))
     route = RouteTable(one, penalties={NodeId("e", 1, 5): 1.0}).find(nodes[0].id, nodes[1].id)
     assert route.edges == (NodeId("e", 1, 100),)
 
 
-def test_a_driven_link_costs_its_length() -> None:
+def test_a_driven_link_costs_its_length():
     """Two metres across a room, and a detour of four: the link is taken once it was driven, not before."""
     places = [Pose2(0, 0), Pose2(2, 0), Pose2(1, 1.7)]
     nodes = [node(k, place) for k, place in enumerate(places)]
@@ -109,7 +109,7 @@ def test_a_driven_link_costs_its_length() -> None:
     assert straight.edges == (NodeId("e", 1, 4),) and straight.cost == pytest.approx(2.02)
 
 
-def test_links_between_maps_without_common_frame_are_driven() -> None:
+def test_links_between_maps_without_common_frame_are_driven():
     """The two maps' frames have nothing in common: only the measured link says that the nodes are near."""
     a, b = node(1, Pose2(0, 0)), node(1, Pose2(100, 100), "r1")
     relative = PoseGaussian.from_sigmas(Pose2(1, 0, 0), 0.1, 0.1)
@@ -119,7 +119,7 @@ def test_links_between_maps_without_common_frame_are_driven() -> None:
     assert RouteTable(hybrid_map, settings=s).find(a.id, b.id).cost == pytest.approx(1.5 + 0.1)
 
 
-def test_reasons() -> None:
+def test_reasons():
     nodes, one = chain(Pose2(0, 0), Pose2(1, 0))
     lonely = node(9, Pose2(5, 5))
     one.apply(NodePut(lonely))
@@ -133,7 +133,7 @@ def test_reasons() -> None:
 
 @settings(max_examples=100, deadline=None)
 @given(st.integers(0, 10**6))
-def test_there_is_a_way_or_a_reason_as_networkx_finds_it(seed: int) -> None:
+def test_there_is_a_way_or_a_reason_as_networkx_finds_it(seed: int):
     """With portals between maps of different frames, closed edges, blocked pairs and a toll for these."""
     rng = np.random.default_rng(seed)
     hybrid_map = random_map(seed, m=16)
@@ -177,7 +177,7 @@ def test_there_is_a_way_or_a_reason_as_networkx_finds_it(seed: int) -> None:
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(0, 10**6))
-def test_closed_edges_are_as_if_they_were_not_there(seed: int) -> None:
+def test_closed_edges_are_as_if_they_were_not_there(seed: int):
     hybrid_map, rng = random_map(seed), np.random.default_rng(seed)
     closed = {edge_id for edge_id in hybrid_map.edges if rng.random() < 0.3}
     left = HybridMap(

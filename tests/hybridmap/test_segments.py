@@ -1,14 +1,12 @@
 """Distances of points from segments, against points all along them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
 from mapweave.hybridmap.segments import distances
 
 
-def test_the_distance_is_that_of_the_nearest_point_of_the_segment() -> None:
+def test_the_distance_is_that_of_the_nearest_point_of_the_segment():
     rng = np.random.default_rng(5)
     points, begin, end = (rng.uniform(-3.0, 3.0, (count, 2)) for count in (20, 30, 30))
     end[::7] = begin[::7]

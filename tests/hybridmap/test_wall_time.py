@@ -1,7 +1,5 @@
 """Wall time in people's words."""
 
-from __future__ import annotations
-
 import time
 from datetime import UTC, datetime, timedelta, timezone
 
@@ -33,7 +31,7 @@ EAST = timezone(timedelta(hours=2))
         ("+1.5d", UTC, datetime(2026, 3, 3, 1, 30, tzinfo=UTC)),
     ],
 )
-def test_times_are_read(text, zone, expected) -> None:
+def test_times_are_read(text, zone, expected):
     assert read_time(text, NOW_NS, zone) == round(expected.timestamp()) * 10**9
 
 
@@ -46,7 +44,7 @@ def test_times_are_read(text, zone, expected) -> None:
         ("2026-07-01 08:15", UTC, datetime(2026, 7, 1, 8, 15, tzinfo=UTC)),
     ],
 )
-def test_times_of_the_past_are_read(text: str, zone: timezone, expected: datetime) -> None:
+def test_times_of_the_past_are_read(text: str, zone: timezone, expected: datetime):
     assert read_time(text, NOW_NS, zone, past=True) == round(expected.timestamp()) * 10**9
 
 
@@ -60,7 +58,7 @@ def test_times_of_the_past_are_read(text: str, zone: timezone, expected: datetim
         ("1999-01-01", "14:00", datetime(2026, 3, 1, 14, 0, tzinfo=UTC)),
     ],
 )
-def test_an_end_without_a_date_is_behind_its_begin(begin: str, end: str, expected: datetime) -> None:
+def test_an_end_without_a_date_is_behind_its_begin(begin: str, end: str, expected: datetime):
     """A closure over midnight could be made before 06:00 and after 22:00 with dates alone."""
     begin_ns = read_time(begin, NOW_NS, UTC)
     assert read_time(end, NOW_NS, UTC, begin_ns) == round(expected.timestamp()) * 10**9
@@ -70,17 +68,17 @@ def test_an_end_without_a_date_is_behind_its_begin(begin: str, end: str, expecte
     "text",
     ["", "soon", "25:00", "14:61", "2026-13-01", "1960-01-01", "+h", "9999-12-31 23:59", "14"],
 )
-def test_what_is_no_time_is_refused(text) -> None:
+def test_what_is_no_time_is_refused(text):
     with pytest.raises(InvalidValue):
         read_time(text, NOW_NS, UTC)
 
 
-def test_a_time_is_written_in_both_zones() -> None:
+def test_a_time_is_written_in_both_zones():
     assert utc_words(NOW_NS) == "2026-03-01 13:30 UTC"
     assert local_words(NOW_NS, EAST) == "2026-03-01 15:30 +0200"
 
 
-def test_a_clock_is_set_forward_or_back_until_then(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_is_set_forward_or_back_until_then(monkeypatch):
     """In the evening before, 14:00 was the 14:00 of a clock that was not changed."""
     try:
         with monkeypatch.context() as patch:
@@ -95,7 +93,7 @@ def test_a_clock_is_set_forward_or_back_until_then(monkeypatch: pytest.MonkeyPat
         time.tzset()
 
 
-def test_a_clock_that_is_set_back_shows_a_time_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_that_is_set_back_shows_a_time_twice(monkeypatch):
     """Of the second 02:30 a quarter of an hour before it, it was that of the next day."""
     try:
         with monkeypatch.context() as patch:
@@ -118,7 +116,7 @@ def test_a_clock_that_is_set_back_shows_a_time_twice(monkeypatch: pytest.MonkeyP
         time.tzset()
 
 
-def test_a_long_text_is_refused_at_once() -> None:
+def test_a_long_text_is_refused_at_once():
     """It may come over HTTP, with megabytes of blanks."""
     with pytest.raises(InvalidValue, match=r"is no time") as refused:
         read_time("a" + 500_000 * " " + "az", 0)

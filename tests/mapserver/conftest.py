@@ -1,7 +1,5 @@
 """A small fleet's store, and views of the same rooms."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any

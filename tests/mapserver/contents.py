@@ -1,7 +1,5 @@
 """Maps that a robot may legally send, however little sense they make: drawn up to the limits and beyond."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

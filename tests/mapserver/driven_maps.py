@@ -1,7 +1,5 @@
 """Maps of nodes at given places with exact edges between them, and how a merger takes them in."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
 

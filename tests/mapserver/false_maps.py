@@ -1,7 +1,5 @@
 """Maps that no honest robot makes: of copies, and of true views with wrong ways between them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

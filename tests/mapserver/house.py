@@ -1,7 +1,5 @@
 """A map server with a mapped room, robots that do nothing but say so, and a person."""
 
-from __future__ import annotations
-
 import http.client
 import json
 from contextlib import ExitStack

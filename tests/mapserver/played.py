@@ -1,7 +1,5 @@
 """An agent's log played by hand, and an ingest with its store that can be restarted."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

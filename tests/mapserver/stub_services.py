@@ -1,7 +1,5 @@
 """A server with scripted answers, and a picture to ask about."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import Future
 from functools import cache

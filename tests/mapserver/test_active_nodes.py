@@ -1,7 +1,5 @@
 """What questions are answered from: not from retired maps, not from landmarks that have gone."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -52,7 +50,7 @@ def two() -> Two:
     return Two()
 
 
-def test_nothing_is_answered_from_a_retired_map_until_it_is_taken_back(two: Two) -> None:
+def test_nothing_is_answered_from_a_retired_map_until_it_is_taken_back(two: Two):
     for constraints, known in (
         ([], True),
         ([RETIRED], False),
@@ -80,7 +78,7 @@ def certainties(merger: Merger, views: Sequence[View]) -> list[Certainty]:
 
 
 @pytest.mark.slow
-def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
+def test_after_a_map_is_retired_answers_are_as_before_it_came():
     rng = np.random.default_rng(4)
     world, maps = room(0, 0, 5, 4, 700, rng), [MapId(agent, 1) for agent in "abc"]
     logs: dict[MapId, list[Change]] = {}
@@ -110,7 +108,7 @@ def test_after_a_map_is_retired_answers_are_as_before_it_came() -> None:
     assert any(item.other.id.map == maps[2] for item in alike)
 
 
-def test_a_retired_map_whose_robot_maps_on_stays_out(two: Two) -> None:
+def test_a_retired_map_whose_robot_maps_on_stays_out(two: Two):
     two.merger.constrain(ManualConstraints([RETIRED]))
     merged = two.merger.merged()
     rng = np.random.default_rng(3)
@@ -123,7 +121,7 @@ def test_a_retired_map_whose_robot_maps_on_stays_out(two: Two) -> None:
     assert any(node == late.id for node, _ in two.merger.places.query(two.view(THERE), 5))
 
 
-def test_what_an_inactive_node_has_replaced_is_active(two: Two) -> None:
+def test_what_an_inactive_node_has_replaced_is_active(two: Two):
     two.merger.constrain(ManualConstraints())
     old, new = NodeId("a", 1, 1), NodeId("b", 1, 1)
     merged = replace(two.merger.merged(), superseded={old: Superseded(new, 30, 0.1, 0.1)})
@@ -132,7 +130,7 @@ def test_what_an_inactive_node_has_replaced_is_active(two: Two) -> None:
         assert (old in dict(places.query(two.view(HERE), 5))) is active
 
 
-def test_faded_landmarks_are_left_out_of_answers_and_routes(two: Two) -> None:
+def test_faded_landmarks_are_left_out_of_answers_and_routes(two: Two):
     two.merger.constrain(ManualConstraints())
     merged = two.merger.merged()
     node_id = NodeId("a", 1, 3)
@@ -150,7 +148,7 @@ def test_faded_landmarks_are_left_out_of_answers_and_routes(two: Two) -> None:
     assert without_faded(fresh, faded) is fresh, "it is known better than what was found out"
 
 
-def test_small_pieces_of_implausible_maps_answer_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_pieces_of_implausible_maps_answer_nothing(monkeypatch):
     """A robot of which all edges are refused leaves as many pieces as nodes, each a place of its own."""
     two = Two()
     merged = two.merger.merged()

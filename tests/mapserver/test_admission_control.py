@@ -1,7 +1,5 @@
 """Admission control: in time or refused, and refused questions come back when there is room."""
 
-from __future__ import annotations
-
 import itertools
 import threading
 
@@ -41,7 +39,7 @@ class Counter:
 
 
 @pytest.mark.parametrize("workers", [1, 2])
-def test_unusual_jobs_do_not_change_the_estimated_duration(workers: int) -> None:
+def test_unusual_jobs_do_not_change_the_estimated_duration(workers: int):
     """A person's question takes seconds; no robot is turned away for it afterwards."""
     clock = Clock(100.0)
     admission = AdmissionControl(AdmissionSettings(workers), clock, first_guess=0.1)
@@ -57,7 +55,7 @@ def test_unusual_jobs_do_not_change_the_estimated_duration(workers: int) -> None
 
 
 @pytest.mark.parametrize(("workers", "seconds", "in_time"), [(1, 0.1, 0.65), (2, 0.05, 0.51), (4, 0.2, 0.23)])
-def test_accepted_questions_are_answered_in_time(workers: int, seconds: float, in_time: float) -> None:
+def test_accepted_questions_are_answered_in_time(workers: int, seconds: float, in_time: float):
     counter = Counter(AdmissionSettings(workers, in_time=in_time), seconds)
     while not counter.ask():
         assert counter.taken < 1000
@@ -68,13 +66,13 @@ def test_accepted_questions_are_answered_in_time(workers: int, seconds: float, i
     counter.end()
 
 
-def test_a_free_worker_takes_a_job_of_any_cost() -> None:
+def test_a_free_worker_takes_a_job_of_any_cost():
     counter = Counter(AdmissionSettings(2, in_time=0.1), 5.0)
     assert [counter.ask() > 0.0 for _ in range(4)] == [False, False, True, True]
     counter.end()
 
 
-def test_a_refused_crowd_comes_back_in_sequence() -> None:
+def test_a_refused_crowd_comes_back_in_sequence():
     """Fifty ask at once and keep to their retry times: the queue never fills again."""
     workers, seconds = 2, 0.05
     settings = AdmissionSettings(workers, in_time=0.5)
@@ -145,7 +143,7 @@ class Simulated:
         self.pool.shutdown()
 
 
-def test_all_get_a_turn() -> None:
+def test_all_get_a_turn():
     """Fifty robots ask on and on: with appointments, none waits much longer than a round takes."""
     seconds, robots = 0.06, 50
     fair = Simulated(robots, seconds, keep=True, rng=np.random.default_rng(1))
@@ -158,7 +156,7 @@ def test_all_get_a_turn() -> None:
     assert fair.refusals < 1.1 * len(fair.waits)
 
 
-def test_an_appointment_has_precedence_and_expires() -> None:
+def test_an_appointment_has_precedence_and_expires():
     counter = Counter(AdmissionSettings(1, in_time=0.5), 0.1)
     while not counter.ask():
         pass
@@ -174,7 +172,7 @@ def test_an_appointment_has_precedence_and_expires() -> None:
     counter.end()
 
 
-def test_the_time_that_a_question_takes_is_learned(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_time_that_a_question_takes_is_learned(monkeypatch):
     clock = Clock(100.0)
     monkeypatch.setattr(admission_control, "SMOOTHING", 0.5)
     admission = AdmissionControl(AdmissionSettings(1), clock, first_guess=0.01)
@@ -189,7 +187,7 @@ def test_the_time_that_a_question_takes_is_learned(monkeypatch: pytest.MonkeyPat
     admission.close()
 
 
-def test_results_and_errors_come_back_and_a_failure_costs_no_worker() -> None:
+def test_results_and_errors_come_back_and_a_failure_costs_no_worker():
     for executor in (None, LockstepSchedule().executor(1)):
         admission = AdmissionControl(AdmissionSettings(1), executor=executor)
         assert admission.submit(lambda: 3 + 4, 1).result(5) == 7
@@ -202,7 +200,7 @@ def test_results_and_errors_come_back_and_a_failure_costs_no_worker() -> None:
         admission.close()
 
 
-def test_questions_that_waited_too_long_are_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_questions_that_waited_too_long_are_refused(monkeypatch):
     """Each question takes four times as long as was thought."""
     clock = Clock(100.0)
     monkeypatch.setattr(admission_control, "TOO_LATE", 1.5)
@@ -230,12 +228,12 @@ def test_questions_that_waited_too_long_are_refused(monkeypatch: pytest.MonkeyPa
 @pytest.mark.parametrize(
     ("name", "value"), [("workers", -1), ("workers", 65), ("in_time", 0.0), ("in_time", float("nan"))]
 )
-def test_settings_that_cannot_work(name: str, value: float) -> None:
+def test_settings_that_cannot_work(name: str, value: float):
     with pytest.raises(SettingsError, match=f"^file: {name}:? .*{value}"):
         build(AdmissionSettings, {name: value}, "file")
 
 
-def test_closing_finishes_accepted_jobs() -> None:
+def test_closing_finishes_accepted_jobs():
     admission = AdmissionControl(AdmissionSettings(1, in_time=60.0))
     done: list[int] = []
     for k in range(20):
@@ -244,7 +242,7 @@ def test_closing_finishes_accepted_jobs() -> None:
     assert done == list(range(20))
 
 
-def test_in_lockstep_the_asking_thread_works_and_no_question_is_refused() -> None:
+def test_in_lockstep_the_asking_thread_works_and_no_question_is_refused():
     schedule = LockstepSchedule()
     admission = AdmissionControl(
         AdmissionSettings(1, in_time=0.1), schedule.monotonic, schedule.executor(1), first_guess=100.0

@@ -1,14 +1,11 @@
 """What robots do once no operator is there: pages, shells that wait, robots that were away, two servers."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -50,7 +47,7 @@ class Watch:
         self.attendance.check()
 
 
-def test_a_robot_that_a_person_has_sent_stands_once_no_operator_is_there(house: House) -> None:
+def test_a_robot_that_a_person_has_sent_stands_once_no_operator_is_there(house: House):
     watch, (_, control) = Watch(house), house.robot()
     watch.after(GRACE + 1.0)
     sent = house.person.go("r0", str(THERE), because="a parcel")
@@ -72,7 +69,7 @@ def test_a_robot_that_a_person_has_sent_stands_once_no_operator_is_there(house: 
     assert house.person.go("r0", str(THERE)).state is MissionState.RUNNING, "it takes orders as before"
 
 
-def test_it_goes_home_and_is_let_go_home(house: House) -> None:
+def test_it_goes_home_and_is_let_go_home(house: House):
     watch, (_, control) = Watch(house, Unattended.HOME), house.robot()
     house.person.go("r0", str(THERE))
     watch.after(GRACE + 1.0)
@@ -82,14 +79,14 @@ def test_it_goes_home_and_is_let_go_home(house: House) -> None:
     assert control.report == home
 
 
-def test_a_robot_that_has_no_home_stands(house: House) -> None:
+def test_a_robot_that_has_no_home_stands(house: House):
     watch, (_, control) = Watch(house, Unattended.HOME), house.robot("r5")
     house.person.explore("r5")
     watch.after(GRACE + 1.0)
     assert control.report is not None and control.report.order.kind is MissionKind.STOP
 
 
-def test_robots_that_no_person_has_sent_go_on(house: House) -> None:
+def test_robots_that_no_person_has_sent_go_on(house: House):
     watch, (link, control) = Watch(house), house.robot()
     control.begin(MissionKind.EXPLORE)
     link.report(DRIVES, 2)
@@ -101,7 +98,7 @@ def test_robots_that_no_person_has_sent_go_on(house: House) -> None:
     assert control.report.order.kind is MissionKind.CARRIED, "a person is beside it"
 
 
-def test_by_default_all_go_on(house: House) -> None:
+def test_by_default_all_go_on(house: House):
     assert AttendanceSettings().words == ""
     watch, (_, control) = Watch(house, Unattended.GO_ON), house.robot()
     sent = house.person.go("r0", str(THERE))
@@ -109,7 +106,7 @@ def test_by_default_all_go_on(house: House) -> None:
     assert control.report == sent
 
 
-def test_a_robot_that_was_away_stands_when_it_is_back(house: House) -> None:
+def test_a_robot_that_was_away_stands_when_it_is_back(house: House):
     watch, (link, control) = Watch(house), house.robot()
     house.person.go("r0", str(THERE))
     link.close()
@@ -124,7 +121,7 @@ def test_a_robot_that_was_away_stands_when_it_is_back(house: House) -> None:
     assert [report.order.kind for report in house.person.missions()] == [MissionKind.GO, MissionKind.STOP]
 
 
-def test_who_waits_for_a_mission_is_there(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_who_waits_for_a_mission_is_there(house: House, monkeypatch):
     """As `mapweave go --wait` and `fleet.go(..., wait=60)` do."""
     monkeypatch.setattr("mapweave.fleet.SILENT", 0.05)
     watch, (link, control) = Watch(house), house.robot()
@@ -144,9 +141,7 @@ def test_who_waits_for_a_mission_is_there(house: House, monkeypatch: pytest.Monk
 
 
 @pytest.mark.parametrize("wait", [False, True])
-def test_a_shell_that_does_not_wait_says_what_follows(
-    house: House, wait: bool, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_shell_that_does_not_wait_says_what_follows(house: House, wait: bool, monkeypatch, capsys):
     house.robot()
     monkeypatch.setattr("mapweave.commands.missions.fleet_of", lambda _: nullcontext(house.person))
     give = ["go", "r0", str(THERE), *(["--wait", "--timeout", "0.2"] if wait else [])]
@@ -162,7 +157,7 @@ def test_a_shell_that_does_not_wait_says_what_follows(
     assert (said in capsys.readouterr().err) is not wait
 
 
-def test_a_page_that_may_only_look_is_no_operator(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_page_that_may_only_look_is_no_operator(monkeypatch):
     """Without keys another machine, by way of a proxy, only reads."""
     services, seen = StubServices(), [0]
     monkeypatch.setattr(services, "attend", lambda: seen.__setitem__(0, seen[0] + 1))
@@ -178,9 +173,7 @@ def test_a_page_that_may_only_look_is_no_operator(monkeypatch: pytest.MonkeyPatc
         eventually(lambda: _still(lambda: seen[0]), 20.0)
 
 
-def test_of_servers_that_share_a_store_the_one_that_leads_gives_the_order(
-    house: House, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_servers_that_share_a_store_the_one_that_leads_gives_the_order(house: House, monkeypatch):
     """And also the others say that an operator was at their pages, once for as long as nothing is new."""
     watch, (_, control) = Watch(house), house.robot()
     written: list[tuple[str, bytes]] = []
@@ -197,9 +190,7 @@ def test_of_servers_that_share_a_store_the_one_that_leads_gives_the_order(
     assert control.report is not None and control.report.order.kind is MissionKind.STOP
 
 
-def test_a_store_that_takes_nothing_keeps_no_robot_from_standing(
-    house: House, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_store_that_takes_nothing_keeps_no_robot_from_standing(house: House, monkeypatch):
     def full(*_: object) -> None:
         raise InvalidFile("the database does not answer")
 
@@ -217,9 +208,7 @@ def _still(count: Callable[[], int]) -> bool:
     return count() == before
 
 
-def test_servers_that_share_a_store_hear_of_each_others_operators(
-    postgres: PostgresServer, tmp_path: Path
-) -> None:
+def test_servers_that_share_a_store_hear_of_each_others_operators(postgres: PostgresServer, tmp_path):
     hub = MemoryHub()
     address = postgres.database()
     with (

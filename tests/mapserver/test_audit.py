@@ -1,13 +1,10 @@
 """Who, when and why in the server's records, with sessions of their own over TLS: the holder of the key."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -39,9 +36,7 @@ KEYS = Keys("demo")
 NODES = [NodeId("r0", 1, 5), NodeId("r0", 1, 7)]
 
 
-def test_the_records_name_the_holder_of_the_key(
-    mapped_room: Callable[[], MappedRoom], tmp_path: Path
-) -> None:
+def test_the_records_name_the_holder_of_the_key(mapped_room: Callable[[], MappedRoom], tmp_path):
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, [], "s0", free_port())
     (endpoint,) = folder.catalogue.endpoints
     for name, role in (("anna", Role.OPERATOR), ("vera", Role.VIEWER), ("r0", Role.ROBOT)):

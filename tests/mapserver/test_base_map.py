@@ -1,7 +1,5 @@
 """A server with a map from the start: robots begin anywhere, and their maps join it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from dataclasses import replace
@@ -71,12 +69,12 @@ def wanted(*maps: MapId) -> dict[MapId, list[bytes]]:
     return {map_id: sorted(map(encode_body, LOGS[map_id])) for map_id in maps}
 
 
-def test_a_small_base_map_in_words() -> None:
+def test_a_small_base_map_in_words():
     (first, *_) = [body for body in LOGS[R0] if isinstance(body, NodePut)]
     assert str(BaseMap("a.mapweave", {R0: HybridMap([first])})) == "a.mapweave: 1 node of 1 map"
 
 
-def test_a_robot_that_begins_anywhere_joins_the_map_that_is_there(tmp_path: Path) -> None:
+def test_a_robot_that_begins_anywhere_joins_the_map_that_is_there(tmp_path):
     with serving(tmp_path, BASE) as (server, hub):
         assert contents(server) == wanted(R0, R1) and server.status()["components"] == 1
         assert JOINED in server.history()
@@ -97,7 +95,7 @@ def test_a_robot_that_begins_anywhere_joins_the_map_that_is_there(tmp_path: Path
         assert contents(server) == wanted(R2), "the store has what robots have sent, and no more"
 
 
-def test_a_robot_goes_on_with_its_map_of_the_base(tmp_path: Path) -> None:
+def test_a_robot_goes_on_with_its_map_of_the_base(tmp_path):
     newer = [*LOGS[R0], NodeRetired(NodeId(*R0, 7))]
     with serving(tmp_path, BASE) as (server, hub), robot(hub, tmp_path, R0, newer):
         eventually(lambda: server.status()["nodes"] == 7)
@@ -120,7 +118,7 @@ def renumbered(changes: list[ChangeBody], by: int) -> list[ChangeBody]:
     ]
 
 
-def test_another_map_of_the_same_name_is_refused_and_the_base_stays(tmp_path: Path) -> None:
+def test_another_map_of_the_same_name_is_refused_and_the_base_stays(tmp_path):
     other = [
         NodePut(replace(body.node, stamp_ns=body.node.stamp_ns + 1))
         for body in LOGS[R0]
@@ -140,7 +138,7 @@ def test_another_map_of_the_same_name_is_refused_and_the_base_stays(tmp_path: Pa
         assert server.status()["nodes"] == 4, "the store is free again"
 
 
-def test_constraints_and_annotations_of_the_base_hold(tmp_path: Path) -> None:
+def test_constraints_and_annotations_of_the_base_hold(tmp_path):
     apart = ManualConstraint(Apart((R0, R1)), True, "anna", 5, "two kitchens")
     kitchen = Annotation("kitchen", Place(NodeId(*R0, 3)), False, "anna", 6)
     content = map_file_of(merge_parts(BASE.maps, ManualConstraints([apart])), (), Annotations((kitchen,)))

@@ -1,7 +1,5 @@
 """What one robot could not drive is dear for the others, for a while, and never out of the question."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 
@@ -19,7 +17,7 @@ A, B, C = (NodeId("a", 1, number) for number in (1, 3, 5))
 ME = MapId("a", 1)
 
 
-def test_a_blockage_is_forgotten_after_its_last_report() -> None:
+def test_a_blockage_is_forgotten_after_its_last_report():
     blockages = Blockages(forget=100.0)
     blockages.report([(B, A)], 0.0)
     blockages.report([(A, B), (B, C)], 50.0)
@@ -28,14 +26,14 @@ def test_a_blockage_is_forgotten_after_its_last_report() -> None:
     assert blockages.known(0.0) == [], "what was forgotten does not come back"
 
 
-def test_without_a_clock_nothing_is_forgotten_but_the_oldest() -> None:
+def test_without_a_clock_nothing_is_forgotten_but_the_oldest():
     blockages = Blockages(forget=math.inf, most=2)
     for pair in ((A, B), (B, C), (A, B), (A, C)):
         blockages.report([pair], 0.0)
     assert blockages.known(1e9) == [(A, B), (A, C)]
 
 
-def test_no_robot_displaces_what_others_have_reported() -> None:
+def test_no_robot_displaces_what_others_have_reported():
     """One that says that all is blocked displaced the reports of all others."""
     blockages = Blockages(most=8)
     blockages.report([(A, B), (B, C)], 0.0, "r0")
@@ -62,7 +60,7 @@ def ring() -> tuple[Router, list[NodeId]]:
 
 def test_others_are_led_around_a_blockage_and_through_it_where_there_is_no_other_way(
     ring: tuple[Router, list[NodeId]],
-) -> None:
+):
     router, nodes = ring
 
     def way(**arguments: object) -> list[NodeId]:

@@ -1,10 +1,7 @@
 """Files of arrays: with a right digest and wrong heads they are refused in one line."""
 
-from __future__ import annotations
-
 import gc
 import hashlib
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +23,7 @@ MAGIC = b"a kind\n"
         (b"'<f8'", b"',  '"),
     ],
 )
-def test_heads_of_arrays_that_are_none_are_refused(word: bytes, instead: bytes, tmp_path: Path) -> None:
+def test_heads_of_arrays_that_are_none_are_refused(word: bytes, instead: bytes, tmp_path):
     data = checksummed(MAGIC, [json_part("header"), np.arange(3.0)])
     assert len(word) == len(instead) and word in data
     whole = data[:-DIGEST].replace(word, instead)
@@ -36,7 +33,7 @@ def test_heads_of_arrays_that_are_none_are_refused(word: bytes, instead: bytes, 
         read_checksummed(path, MAGIC, "header", list, "is none of these")
 
 
-def test_what_is_checksummed_may_be_part_of_a_cycle() -> None:
+def test_what_is_checksummed_may_be_part_of_a_cycle():
     """Python 3.13 says so of a view of a stream, and pytest makes an error of that."""
     cycle: list[object] = [checksummed(MAGIC, [np.arange(3.0)])]
     cycle.append(cycle)

@@ -1,7 +1,5 @@
 """A real server over Zenoh: places and closures from the shell, and what robots get to know of them."""
 
-from __future__ import annotations
-
 import json
 import re
 import time
@@ -32,8 +30,8 @@ KEYS = Keys("demo")
 
 
 def test_what_is_closed_from_the_shell_holds_for_all(
-    mapped_room: Callable[[], MappedRoom], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    mapped_room: Callable[[], MappedRoom], capsys, monkeypatch
+):
     endpoint, mapped = f"tcp/127.0.0.1:{free_port()}", mapped_room()
     first, second, last = sorted(mapped.truth)[0], sorted(mapped.truth)[1], sorted(mapped.truth)[-1]
     router = ZenohBus(BusSettings("router", listen=(endpoint,)))

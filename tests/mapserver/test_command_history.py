@@ -1,7 +1,5 @@
 """Who has sent, stopped or driven which robot, when and why, is in the history."""
 
-from __future__ import annotations
-
 import logging
 import re
 import time
@@ -34,7 +32,7 @@ def commands(house: House) -> list[str]:
     return [re.sub(r"mission [0-9a-f]{12}", "mission ID", event.words) for event in events]
 
 
-def test_missions_and_stops_are_in_the_history_with_who_and_why(house: House) -> None:
+def test_missions_and_stops_are_in_the_history_with_who_and_why(house: House):
     link, _ = house.robot()
     house.person.go("r0", str(THERE), because="a guest waits")
     house.person.explore("r0")
@@ -67,7 +65,7 @@ def test_missions_and_stops_are_in_the_history_with_who_and_why(house: House) ->
     assert not any(event.kind is MapEventKind.COMMANDED for event in house.person.map().history)
 
 
-def test_a_command_is_an_event_at_once(house: House) -> None:
+def test_a_command_is_an_event_at_once(house: House):
     house.robot()
     events = house.person.events(30.0)
     house.person.explore("r0")
@@ -76,7 +74,7 @@ def test_a_command_is_an_event_at_once(house: House) -> None:
     events.close()  # type: ignore[attr-defined]
 
 
-def test_a_drive_by_hand_is_in_the_history(house: House) -> None:
+def test_a_drive_by_hand_is_in_the_history(house: House):
     house.robot()
     begin = 1_772_366_400_250_000_000
     for over in (False, False, True, True):
@@ -87,7 +85,7 @@ def test_a_drive_by_hand_is_in_the_history(house: House) -> None:
     assert commands(house) == [f"r0: driven by hand, {by}", f"r0: the drive by hand is over, {by}"]
 
 
-def test_the_reason_of_the_shell_goes_with_the_mission(monkeypatch: pytest.MonkeyPatch, house: House) -> None:
+def test_the_reason_of_the_shell_goes_with_the_mission(monkeypatch, house: House):
     _, control = house.robot()
     monkeypatch.setattr("mapweave.commands.missions.fleet_of", lambda arguments: house.person)
     monkeypatch.setattr(type(house.person), "close", lambda self: None)
@@ -118,7 +116,7 @@ def kept_few(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("kept_few")
-def test_a_robot_that_reports_mission_after_mission_displaces_no_other() -> None:
+def test_a_robot_that_reports_mission_after_mission_displaces_no_other():
     record, clock = Record(), iter(range(1, 10**9))
     history = CommandHistory(record, lambda: next(clock), lambda job: None)
     history.order(MissionOrder.new("r1", MissionKind.STOP, "anna"), False)
@@ -127,9 +125,7 @@ def test_a_robot_that_reports_mission_after_mission_displaces_no_other() -> None
     assert len(history.events) == MOST and history.events[0].words.startswith("r1: stop, by anna")
 
 
-def test_what_two_servers_note_at_once_and_a_full_disk_does_not_take_is_not_lost(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_what_two_servers_note_at_once_and_a_full_disk_does_not_take_is_not_lost(caplog):
     record = Record()
     first, second = (CommandHistory(record, time.time_ns, lambda job: None) for _ in range(2))
     order = MissionOrder.new("r0", MissionKind.STOP, "anna")
@@ -149,7 +145,7 @@ def test_what_two_servers_note_at_once_and_a_full_disk_does_not_take_is_not_lost
         assert len(words) == 2 and sum("mission " + order.id in one for one in words) == 1
 
 
-def test_a_robots_first_report_of_an_order_that_a_person_gave_it_names_the_robot(house: House) -> None:
+def test_a_robots_first_report_of_an_order_that_a_person_gave_it_names_the_robot(house: House):
     order = MissionOrder.new("r0", MissionKind.EXPLORE, "eve")
     report = MissionReport(order, MissionState.RUNNING)
     status = AgentStatus(Status("standing", "", 7, 0, Pose2(), False), 1, "r0", 1, mission=report)
@@ -160,7 +156,7 @@ def test_a_robots_first_report_of_an_order_that_a_person_gave_it_names_the_robot
 
 
 @pytest.mark.usefixtures("kept_few")
-def test_a_clock_that_was_put_back_loses_no_command() -> None:
+def test_a_clock_that_was_put_back_loses_no_command():
     """A machine without a clock of its own begins in another year: what is noted then is the newest all the
     same.
     """

@@ -1,7 +1,5 @@
 """Manual constraints by Python, HTTP and shell, over real connections, and after the server starts again."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import re
@@ -122,9 +120,7 @@ def components(content: MapFile) -> int:
     return len({number for number, _ in content.poses.values()})
 
 
-def test_corrections_by_python_http_and_shell_outlast_the_server(
-    path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_corrections_by_python_http_and_shell_outlast_the_server(path: Path, capfd):
     with serving(path) as asking:
         fleet = asking.fleet
         before = asking.merged()
@@ -187,9 +183,7 @@ def test_corrections_by_python_http_and_shell_outlast_the_server(
         assert kinds == [Linked, RetiredNodes, RetiredNodes, Linked, RetiredArea, RetiredArea]
 
 
-def test_the_shell_asks_as_python_does(
-    path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_the_shell_asks_as_python_does(path: Path, monkeypatch, capfd):
     """Each of its questions had a connection of its own, other words, and a limit of its own."""
     reached, reach = [], connection.reach
 
@@ -221,7 +215,7 @@ def test_the_shell_asks_as_python_does(
         assert main(["map", "retire", "b.1.5", *asking.at]) == 0 and len(reached) == 1
 
 
-def test_python_hears_of_every_server_what_it_keeps_and_refuses(path: Path, tmp_path: Path) -> None:
+def test_python_hears_of_every_server_what_it_keeps_and_refuses(path: Path, tmp_path):
     """Of several the first to answer was all that it heard of."""
     other = write_store(tmp_path / "s1.sqlite", {B: logs()[B]})
     router = ZenohFleet()
@@ -241,8 +235,8 @@ def test_python_hears_of_every_server_what_it_keeps_and_refuses(path: Path, tmp_
 
 
 def test_of_two_links_before_a_merge_the_second_must_fit_the_first(
-    path: Path, merging: threading.Event, capfd: pytest.CaptureFixture[str]
-) -> None:
+    path: Path, merging: threading.Event, capfd
+):
     """Both were taken, and either of them contradicted the map for ever."""
     with serving(path) as asking:
         fleet = asking.fleet
@@ -275,9 +269,7 @@ def test_of_two_links_before_a_merge_the_second_must_fit_the_first(
         assert (poses[a].inverse() @ poses[b]).distance(off) < 0.01
 
 
-def test_who_waits_for_a_merge_hears_what_for(
-    path: Path, merging: threading.Event, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_who_waits_for_a_merge_hears_what_for(path: Path, merging: threading.Event, monkeypatch, capfd):
     monkeypatch.setattr(map_constraint, "PATIENT", 0.05)
     with serving(path) as asking:
         capfd.readouterr()
@@ -318,14 +310,14 @@ def test_who_waits_for_a_merge_hears_what_for(
         (b'{"link": ["\xff", "a.1.1"]}', "the body is no constraint"),
     ],
 )
-def test_a_request_that_is_wrong_says_why(small: Asking, body: object, words: str) -> None:
+def test_a_request_that_is_wrong_says_why(small: Asking, body: object, words: str):
     status, answer = small.http("POST", body)
     assert status == 400 and words in answer["error"], answer
     assert "Expected `" not in answer["error"] and "$" not in answer["error"]
     assert small.http("GET") == (200, {"constraints": []})
 
 
-def test_places_stand_for_nodes_and_areas_in_corrections(path: Path) -> None:
+def test_places_stand_for_nodes_and_areas_in_corrections(path: Path):
     with serving(path) as asking:
         fleet = asking.fleet
         fleet.annotate("place", "door", node=str(LAST))
@@ -369,9 +361,7 @@ def test_places_stand_for_nodes_and_areas_in_corrections(path: Path) -> None:
         assert "'dor' is no place of this map" in posted(area={"anchor": "dor", "corners": corners})
 
 
-def test_a_node_in_the_place_of_a_retired_one_is_named_with_the_reason(
-    path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_node_in_the_place_of_a_retired_one_is_named_with_the_reason(path: Path, capfd):
     """Only lists and explanations named it."""
     with serving(path) as asking:
         asking.fleet.place("door", str(LAST))
@@ -392,8 +382,8 @@ def test_a_node_in_the_place_of_a_retired_one_is_named_with_the_reason(
 
 
 def test_a_closure_of_an_edge_that_is_none_is_refused_and_others_say_how_much_they_close(
-    small: Asking, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+    small: Asking, tmp_path, capfd
+):
     with pytest.raises(InvalidValue, match=r"^no edge joins a\.1\.1 and b\.1\.5 \(a\.1\.1 has edges to node"):
         small.fleet.annotate("closure", "nowhere", edge=["a.1.1", "b.1.5"])
     assert not small.fleet.annotations().made
@@ -407,9 +397,7 @@ def test_a_closure_of_an_edge_that_is_none_is_refused_and_others_say_how_much_th
     assert re.search(r"; it closes \d+ ways? of robots$", capfd.readouterr().out.strip())
 
 
-def test_an_outline_that_crosses_itself_is_refused_by_every_way_to_give_one(
-    small: Asking, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_an_outline_that_crosses_itself_is_refused_by_every_way_to_give_one(small: Asking, tmp_path, capfd):
     """A bow tie was taken, and closed two corners of the floor that was meant."""
     words = [(0.0, 0.0), (2.0, 2.0), (2.0, 0.0), (0.0, 2.0)]
     line = (
@@ -467,7 +455,7 @@ def test_an_outline_that_crosses_itself_is_refused_by_every_way_to_give_one(
 )  # fmt: skip
 def test_a_time_window_that_ends_before_it_begins_is_refused_with_times_that_people_read(
     small: Asking, begin: str | int, end: str | int, words: str
-) -> None:
+):
     status, answer = small.http("POST", {"window": {"map": "a.1", "begin": begin, "end": end}, "check": True})
     assert status == 400 and answer["error"].count("\n") == 0
     assert words in answer["error"]
@@ -475,14 +463,12 @@ def test_a_time_window_that_ends_before_it_begins_is_refused_with_times_that_peo
         small.fleet.retire("a.1", begin=begin, end=end)
 
 
-def test_a_time_of_zero_is_a_time(small: Asking) -> None:
+def test_a_time_of_zero_is_a_time(small: Asking):
     with pytest.raises(InvalidValue, match="until 1970-01-01 00:00:00 UTC: no node lies in it"):
         small.fleet.retire("a.1", end=0)
 
 
-def test_what_is_taken_back_says_what_another_correction_still_excludes(
-    path: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_taken_back_says_what_another_correction_still_excludes(path: Path, tmp_path, capfd):
     with serving(path) as asking:
         fleet = asking.fleet
         fleet.annotate("closure", "shut", edge=["a.1.1", "a.1.3"])

@@ -1,7 +1,5 @@
 """What others have mapped, in the asking robot's own map: against the truth."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -52,7 +50,7 @@ def scene() -> Scene:
     return Scene()
 
 
-def test_others_views_are_where_they_truly_are(scene: Scene) -> None:
+def test_others_views_are_where_they_truly_are(scene: Scene):
     answer = SharedCoverage(scene.merged).answer(A, (5.0, 0.0), 100.0)
     own = scene.merged.maps[A].nodes
     true = [scene.truth[n] for n in sorted(scene.truth) if n.map == B]
@@ -69,7 +67,7 @@ def test_others_views_are_where_they_truly_are(scene: Scene) -> None:
     assert "14 of 14 views" in answer.reason
 
 
-def test_only_near_views_are_returned_nearest_first(scene: Scene) -> None:
+def test_only_near_views_are_returned_nearest_first(scene: Scene):
     everything = SharedCoverage(scene.merged).answer(A, (5.0, 0.0), 100.0).views
     away = np.hypot(everything[:, 0] - 5.0, everything[:, 1])
     assert (np.diff(away) >= 0).all()
@@ -78,7 +76,7 @@ def test_only_near_views_are_returned_nearest_first(scene: Scene) -> None:
     assert np.array_equal(near, everything[away <= reach])
 
 
-def test_the_agent_of_an_isolated_map_gets_no_poses(scene: Scene) -> None:
+def test_the_agent_of_an_isolated_map_gets_no_poses(scene: Scene):
     for asking, reason in ((C, "no other map is joined to c"), (MapId("d", 1), "is not in the merged map")):
         answer = SharedCoverage(scene.merged).answer(asking, (0.0, 0.0), 100.0)
         assert answer.views.shape == (0, 4)
@@ -86,7 +84,7 @@ def test_the_agent_of_an_isolated_map_gets_no_poses(scene: Scene) -> None:
     assert not SharedCoverage(MergedMap.empty()).answer(A, (0.0, 0.0), 9.0).views.size
 
 
-def test_a_bent_map_is_aligned_at_its_nearest_node() -> None:
+def test_a_bent_map_is_aligned_at_its_nearest_node():
     """The own map drifted by a turn halfway, the merged map knows better: each view keeps to its side."""
     rng = np.random.default_rng(3)
     nodes, _ = take_map(room(0, 0, 5, 4, 300, rng), A, [Pose2(1.0 + k, 2.0) for k in range(3)], rng)
@@ -106,7 +104,7 @@ def test_a_bent_map_is_aligned_at_its_nearest_node() -> None:
     assert (x, y, heading) == pytest.approx((expected.x, expected.y, expected.heading))
 
 
-def test_answers_fit_into_a_message(scene: Scene) -> None:
+def test_answers_fit_into_a_message(scene: Scene):
     views = np.zeros((MAX_KNOWN + 9, 4))
     views[:, 0] = np.arange(len(views))[::-1]
 
@@ -119,7 +117,7 @@ def test_answers_fit_into_a_message(scene: Scene) -> None:
     assert result.views[:, 0].tolist() == list(range(MAX_KNOWN))
 
 
-def test_the_server_answers_over_the_bus(scene: Scene, tmp_path) -> None:
+def test_the_server_answers_over_the_bus(scene: Scene, tmp_path):
     hub, keys = MemoryHub(), Keys("fleet")
     bus, asker = MemoryBus(hub), MemoryBus(hub)
     with MapServer(bus, keys, tmp_path / "s0.sqlite", "s0", schedule=LockstepSchedule()):

@@ -1,7 +1,5 @@
 """A server that explains merges, applies manual constraints, and does so after it was started again."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -126,7 +124,7 @@ def same(first: MergedMap, second: MergedMap) -> None:
         assert np.allclose(one.covariance, two.covariance, rtol=1e-3, atol=1e-8)
 
 
-def test_a_link_explains_itself_over_the_bus(path: Path) -> None:
+def test_a_link_explains_itself_over_the_bus(path: Path):
     with serving(path) as asker:
         content = asker.merged()
         pair = min(pair for pair in links(content) if pair[0].map != pair[1].map)
@@ -140,7 +138,7 @@ def test_a_link_explains_itself_over_the_bus(path: Path) -> None:
         assert "there is no map z.1; known are: a.1, b.1" in reply.error
 
 
-def test_blocked_edges_are_used_in_route_explanations(path: Path) -> None:
+def test_blocked_edges_are_used_in_route_explanations(path: Path):
     node_id, two = NodeId("a", 1, 1), NodeId("a", 1, 3)
     with serving(path) as asker:
 
@@ -158,7 +156,7 @@ def test_blocked_edges_are_used_in_route_explanations(path: Path) -> None:
         assert sum(hop.cost for hop in result.hops) > free.hops[0].cost
 
 
-def test_undone_links_stay_undone_after_a_restart(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_undone_links_stay_undone_after_a_restart(path: Path, caplog):
     caplog.set_level(logging.WARNING)
     with serving(path) as asker:
         assert str(asker.status()["event"]).startswith("a.1 and b.1 are one map now, by ")
@@ -181,7 +179,7 @@ def test_undone_links_stay_undone_after_a_restart(path: Path, caplog: pytest.Log
         assert asker.maps().joined
 
 
-def test_one_link_of_many_can_be_undone(path: Path) -> None:
+def test_one_link_of_many_can_be_undone(path: Path):
     with serving(path) as asker:
         before = links(asker.merged())
         pair = min(before)
@@ -192,7 +190,7 @@ def test_one_link_of_many_can_be_undone(path: Path) -> None:
             assert "joined by their robot's way" in asker.constrain(neighbours).error
 
 
-def test_merged_without_a_server_is_the_same(path: Path) -> None:
+def test_merged_without_a_server_is_the_same(path: Path):
     with serving(path) as asker:
         asker.constrain(min(links(asker.merged())))
         served = asker.merged()
@@ -206,7 +204,7 @@ def test_merged_without_a_server_is_the_same(path: Path) -> None:
     same(offline.merged(), merged_of(served))
 
 
-def test_a_file_holds_the_whole_merged_map(path: Path) -> None:
+def test_a_file_holds_the_whole_merged_map(path: Path):
     with serving(path) as asker:
         asker.constrain((A, B))
         content = asker.merged()
@@ -227,7 +225,7 @@ def test_a_file_holds_the_whole_merged_map(path: Path) -> None:
         assert 0.0 < edge.evidence["probability"] < 1.0
 
 
-def test_faded_landmarks_are_in_the_file(path: Path) -> None:
+def test_faded_landmarks_are_in_the_file(path: Path):
     with serving(path) as asker:
         merged = merged_of(asker.merged())
     node = min(merged.poses)
@@ -243,7 +241,7 @@ def test_faded_landmarks_are_in_the_file(path: Path) -> None:
         pack_map_file(replace(content, faded={NodeId("z", 1, 1): gone}))
 
 
-def test_an_incomplete_merge_is_reported(stored: bytes, path: Path) -> None:
+def test_an_incomplete_merge_is_reported(stored: bytes, path: Path):
     bus, merged = MemoryBus(MemoryHub()), MergedMap.empty()
     with serving(path) as asker:
         merged = merged_of(asker.merged())
@@ -269,7 +267,7 @@ def test_an_incomplete_merge_is_reported(stored: bytes, path: Path) -> None:
     bus.close()
 
 
-def test_other_links_use_the_gate_of_the_merge(path: Path) -> None:
+def test_other_links_use_the_gate_of_the_merge(path: Path):
     with serving(path) as asker:
         pair = min(links(asker.merged()))
     strict = ServerSettings(merge=MergeSettings(ConsistencySettings(gate=1e-9)))
@@ -278,7 +276,7 @@ def test_other_links_use_the_gate_of_the_merge(path: Path) -> None:
         assert not any(link.agrees for link in result.other_links)
 
 
-def test_an_unreadable_constraint_costs_only_itself(path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_an_unreadable_constraint_costs_only_itself(path: Path, caplog):
     store = SqliteStore(path)
     store.add_constraint(b"rubbish")
     ConstraintRecord(store).add(ManualConstraint(Apart((MapId("r0", 1), MapId("r1", 1))), True, "anna", 5))
@@ -287,7 +285,7 @@ def test_an_unreadable_constraint_costs_only_itself(path: Path, caplog: pytest.L
     store.close()
 
 
-def test_beside_a_base_map_a_constraint_of_far_ahead_can_be_taken_back(path: Path) -> None:
+def test_beside_a_base_map_a_constraint_of_far_ahead_can_be_taken_back(path: Path):
     """Records are joined by date; each stays in its own order."""
     pairs = [Apart((MapId("r0", 1), MapId(f"r{number}", 1))) for number in (1, 2, 3)]
     base = BaseMap(constraints=ManualConstraints([ManualConstraint(pairs[0], True, "ben", 3)]))

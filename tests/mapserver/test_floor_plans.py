@@ -1,7 +1,5 @@
 """Floor plans under a merged map: known transforms are found, and doubtful pairs are named."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -64,7 +62,7 @@ def plan_of(pairs: Sequence[PlanPair], scale: float | None = None, origin: Pose2
 
 @pytest.mark.parametrize("scale", [None, 0.05])
 @pytest.mark.parametrize("origin", [IDENTITY, ORIGIN])
-def test_exact_pairs_give_the_transform(merged: MergedMap, scale: float | None, origin: Pose2) -> None:
+def test_exact_pairs_give_the_transform(merged: MergedMap, scale: float | None, origin: Pose2):
     placed = check_plan(plan_of(pairs_of(merged, off=0.0), scale, origin), merged)
     (part,) = placed.parts
     assert part.component == 0 and part.metres_per_pixel == pytest.approx(0.05, rel=1e-6)
@@ -78,7 +76,7 @@ def test_exact_pairs_give_the_transform(merged: MergedMap, scale: float | None, 
     assert np.allclose(part.plan_from_merged.apply(point), in_plan, atol=1e-5)
 
 
-def test_clicks_are_off_as_expected_and_the_plan_by_less(merged: MergedMap) -> None:
+def test_clicks_are_off_as_expected_and_the_plan_by_less(merged: MergedMap):
     """Over many plans the true position of a pixel amid the pairs is off by the sigma that is given."""
     offs, sigmas, rms = [], [], []
     middle = np.array([400.0, 250.0])
@@ -97,7 +95,7 @@ def test_clicks_are_off_as_expected_and_the_plan_by_less(merged: MergedMap) -> N
     assert 0.03 < np.mean(sigmas) < 0.2 and 0.05 < np.mean(rms) < 0.2
 
 
-def test_a_wrong_pair_and_a_wrong_scale_are_named(merged: MergedMap) -> None:
+def test_a_wrong_pair_and_a_wrong_scale_are_named(merged: MergedMap):
     pairs = pairs_of(merged, count=7)
     wrong = [*pairs[:3], replace(pairs[3], u=pairs[3].u + 60.0), *pairs[4:]]
     part = placed_plan("office", plan_of(wrong, 0.05), merged).part()
@@ -112,7 +110,7 @@ def test_a_wrong_pair_and_a_wrong_scale_are_named(merged: MergedMap) -> None:
     assert free.doubts == () and free.metres_per_pixel == pytest.approx(0.054, rel=0.01)
 
 
-def test_a_plan_that_cannot_be_placed_is_refused(merged: MergedMap) -> None:
+def test_a_plan_that_cannot_be_placed_is_refused(merged: MergedMap):
     pairs = pairs_of(merged)
     with pytest.raises(InvalidValue, match="component 0 has 2 pairs, and 3 are needed"):
         check_plan(plan_of(pairs[:2]), merged)
@@ -134,7 +132,7 @@ def test_a_plan_that_cannot_be_placed_is_refused(merged: MergedMap) -> None:
         plan_of([*pairs, pairs[0]])
 
 
-def test_the_plan_does_not_depend_on_the_frame_of_the_map(merger: Merger, merged: MergedMap) -> None:
+def test_the_plan_does_not_depend_on_the_frame_of_the_map(merger: Merger, merged: MergedMap):
     """The frame of the map can be any: what the plan says of the building does not depend on it."""
     plan = plan_of(pairs_of(merged), 0.05, ORIGIN)
     free = placed_plan("office", plan, merged).part()

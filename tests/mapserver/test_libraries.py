@@ -1,10 +1,7 @@
 """Libraries that take long to import are loaded behind the reading of the store, one after the other."""
 
-from __future__ import annotations
-
 import sys
 import threading
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +13,7 @@ from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
 
 
-def test_all_are_loaded_and_the_kernels_behind_them(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_are_loaded_and_the_kernels_behind_them(monkeypatch):
     loaded: list[str] = []
     monkeypatch.setattr(libraries, "import_module", loaded.append)
     monkeypatch.setattr(libraries.jit, "load", lambda: loaded.append("kernels"))
@@ -25,15 +22,13 @@ def test_all_are_loaded_and_the_kernels_behind_them(monkeypatch: pytest.MonkeyPa
     assert loaded == [*SLOW, "kernels"]
 
 
-def test_a_server_loads_all_of_them(hub: MemoryHub, tmp_path: Path) -> None:
+def test_a_server_loads_all_of_them(hub: MemoryHub, tmp_path):
     with MapServer(MemoryBus(hub), Keys("fleet"), tmp_path / "s0.sqlite", "s0") as running:
         assert running.settle(60)
         assert set(SLOW) <= sys.modules.keys()
 
 
-def test_a_server_that_is_stopped_meanwhile_ends_without_the_rest(
-    hub: MemoryHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_that_is_stopped_meanwhile_ends_without_the_rest(hub: MemoryHub, tmp_path, monkeypatch):
     """It was one job, and who stopped a server at its start waited for two seconds of it."""
     began, more, ran = threading.Event(), threading.Event(), list[int]()
 
@@ -47,9 +42,7 @@ def test_a_server_that_is_stopped_meanwhile_ends_without_the_rest(
     assert not ran
 
 
-def test_a_server_whose_start_fails_leaves_nothing_running(
-    hub: MemoryHub, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_whose_start_fails_leaves_nothing_running(hub: MemoryHub, tmp_path, monkeypatch):
     """The process aborted behind its message when the interpreter ended within such a library."""
 
     def fail(*parts: object, **named: object) -> None:

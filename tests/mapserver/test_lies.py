@@ -1,10 +1,7 @@
 """One robot of three lies: the other two keep their map and their answers, and the page says who it is."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -105,7 +102,7 @@ def said(fleet: Fleet, words: str) -> list[MapEventKind]:
 @pytest.mark.parametrize(
     ("name", "map_id"), [("copies", FIRST), ("copies", LAST), ("vague edges", LAST), ("a clock", FIRST)]
 )
-def test_the_others_keep_their_map_and_their_answers(name: str, map_id: MapId, tmp_path: Path) -> None:
+def test_the_others_keep_their_map_and_their_answers(name: str, map_id: MapId, tmp_path):
     path = tmp_path / "s0.sqlite"
     stored(path, sound_logs()).close()
     log, words = lies(map_id)[name]
@@ -135,7 +132,7 @@ def sound_links(fleet: Fleet) -> set[tuple[NodeId, NodeId]]:
     return {link.pair for link in fleet.server.merged().links if liars.isdisjoint({link.a.map, link.b.map})}
 
 
-def test_no_log_is_as_long_as_the_greatest_number(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_no_log_is_as_long_as_the_greatest_number(tmp_path, caplog):
     """It is not waited for; the log goes on."""
     with serving(tmp_path / "s0.sqlite") as fleet:
         fleet.acks_of(LAST.agent)
@@ -154,7 +151,7 @@ def test_no_log_is_as_long_as_the_greatest_number(tmp_path: Path, caplog: pytest
 
 
 @pytest.mark.parametrize("clock", ["", "utc"])
-def test_a_map_with_a_clock_that_runs_backwards_is_joined_and_moves_no_other(clock: str) -> None:
+def test_a_map_with_a_clock_that_runs_backwards_is_joined_and_moves_no_other(clock: str):
     """Its times contradict each other; its views are true, and those of an honest robot move the others."""
     alone, beside = sound_merger(), sound_merger()
     steps = [a.inverse() @ b @ Pose2(0.01, -0.01, 0.005) for a, b in pairwise(TOUR)]
@@ -170,7 +167,7 @@ def test_a_map_with_a_clock_that_runs_backwards_is_joined_and_moves_no_other(clo
 
 
 @pytest.mark.parametrize("lies", [False, True], ids=["honest", "its clock runs backwards"])
-def test_an_implausible_map_does_not_join_what_nothing_else_joins(lies: bool) -> None:
+def test_an_implausible_map_does_not_join_what_nothing_else_joins(lies: bool):
     """Two robots in two rooms have no node in common, and a third one has been in both."""
     other = Pose2(20.0, 0.0, 0.0)
     world = WORLD + room(20, 0, 5, 4, 600, np.random.default_rng(2))
@@ -217,7 +214,7 @@ def test_an_implausible_map_does_not_join_what_nothing_else_joins(lies: bool) ->
 
 
 @pytest.mark.parametrize("lies", [False, True], ids=["honest", "its clock runs backwards"])
-def test_an_implausible_map_bears_out_no_links_of_others(lies: bool) -> None:
+def test_an_implausible_map_bears_out_no_links_of_others(lies: bool):
     """Two robots have one weak link, which is too little, until a third one has been where both were."""
     other = Pose2(20.0, 0.0, 0.0)
     world = WORLD + room(20, 0, 5, 4, 600, np.random.default_rng(2))
@@ -256,7 +253,7 @@ def test_an_implausible_map_bears_out_no_links_of_others(lies: bool) -> None:
     assert [link.pair for link in merger.merged().links] == [link.pair for link in before.links]
 
 
-def test_a_map_of_which_a_change_was_refused_moves_no_other() -> None:
+def test_a_map_of_which_a_change_was_refused_moves_no_other():
     """No robot sends such a change. What else it sends may be true: it is placed behind others."""
     merger = sound_merger()
     first, second = merger.maps
@@ -275,7 +272,7 @@ def test_a_map_of_which_a_change_was_refused_moves_no_other() -> None:
             assert merged.pose(node).distance(pose.merged_from_robot.mean) < 1e-6
 
 
-def test_edges_that_no_robot_measures() -> None:
+def test_edges_that_no_robot_measures():
     own, other = NodeId(*LAST, 1), NodeId(*FIRST, 3)
     for end, kind, x, variance, words in (
         (NodeId(*LAST, 3), EdgeKind.LOOP, 3.0, 0.1, ""),
@@ -292,7 +289,7 @@ def test_edges_that_no_robot_measures() -> None:
 
 
 @pytest.mark.slow
-def test_fragments_make_no_answer_ambiguous() -> None:
+def test_fragments_make_no_answer_ambiguous():
     """A robot begins map after map, each with two views of the room and a wrong way between them."""
     merger = sound_merger()
     assert certainties(merger, merger.merged()) == [Certainty.FOUND] * 2
@@ -304,7 +301,7 @@ def test_fragments_make_no_answer_ambiguous() -> None:
     assert certainties(merger, merged) == [Certainty.FOUND] * 2
 
 
-def test_many_bad_maps_speak_against_a_robot_unless_most_of_its_nodes_are_sound() -> None:
+def test_many_bad_maps_speak_against_a_robot_unless_most_of_its_nodes_are_sound():
     nodes = take_map(WORLD, LAST, [*TOUR] * 7, np.random.default_rng(8))[0]
 
     def held(size: int) -> HybridMap:
@@ -322,7 +319,7 @@ def test_many_bad_maps_speak_against_a_robot_unless_most_of_its_nodes_are_sound(
 
 
 @pytest.mark.parametrize("wrong", [0, 3, 4])
-def test_a_map_that_contradicts_itself_is_named(wrong: int) -> None:
+def test_a_map_that_contradicts_itself_is_named(wrong: int):
     """Its own loops do; what a server recognises may be a place that looks the same."""
     tour = [*TOUR, *TOUR]
     steps = [a.inverse() @ b for a, b in pairwise(tour)]
@@ -344,7 +341,7 @@ def test_a_map_that_contradicts_itself_is_named(wrong: int) -> None:
 
 
 @pytest.mark.parametrize("count", first_quick([MOST_FRAGMENTS + 1, MOST_FRAGMENTS], 0))
-def test_many_maps_of_one_robot_that_contradict_each_other_make_no_answer_ambiguous(count: int) -> None:
+def test_many_maps_of_one_robot_that_contradict_each_other_make_no_answer_ambiguous(count: int):
     """Each has true views in an order of its own, with wrong ways between them."""
     merger, rng = sound_merger(), np.random.default_rng(3)
     nodes = take_map(WORLD, LAST, TOUR, np.random.default_rng(8))[0]
@@ -358,7 +355,7 @@ def test_many_maps_of_one_robot_that_contradict_each_other_make_no_answer_ambigu
         assert certainties(merger, merged) == [Certainty.FOUND] * 2
 
 
-def test_a_view_that_comes_again_in_many_fragments_moves_no_nodes_of_others() -> None:
+def test_a_view_that_comes_again_in_many_fragments_moves_no_nodes_of_others():
     """It is true, and would count as often as it comes."""
     merger, rng = sound_merger(), np.random.default_rng(3)
     before = merger.merged()
@@ -376,7 +373,7 @@ def test_a_view_that_comes_again_in_many_fragments_moves_no_nodes_of_others() ->
     assert after.implausible.keys() == maps
 
 
-def test_places_of_an_implausible_map_answer_only_where_no_other_map_does() -> None:
+def test_places_of_an_implausible_map_answer_only_where_no_other_map_does():
     """Alone it may know a place; beside others it is no second place, linked with them or not."""
     merger = sound_merger()
     take_in(merger, LAST, views(LAST, Pose2(1.0, 2.0, 0.5), STEP))
@@ -391,7 +388,7 @@ def test_places_of_an_implausible_map_answer_only_where_no_other_map_does() -> N
     assert certainties(merger, every) == [Certainty.AMBIGUOUS] * 2
 
 
-def test_a_joined_fragment_makes_no_answer_ambiguous_and_a_robot_alone_in_twin_rooms_does() -> None:
+def test_a_joined_fragment_makes_no_answer_ambiguous_and_a_robot_alone_in_twin_rooms_does():
     """The fragment has two views where they are, and a third one elsewhere."""
     merger = sound_merger()
     beside = Pose2(0.1, 0.1, 0.2)
@@ -412,7 +409,7 @@ def test_a_joined_fragment_makes_no_answer_ambiguous_and_a_robot_alone_in_twin_r
     assert certainties(merger, merger.merged()) == [Certainty.AMBIGUOUS] * 2
 
 
-def test_nothing_is_concluded_from_a_clock_that_runs_backwards() -> None:
+def test_nothing_is_concluded_from_a_clock_that_runs_backwards():
     nodes = [
         replace(node, stamp_ns=k * 10**10, clock="utc")
         for k, node in enumerate(take_map(WORLD, LAST, TOUR, np.random.default_rng(8))[0])
@@ -425,7 +422,7 @@ def test_nothing_is_concluded_from_a_clock_that_runs_backwards() -> None:
 
 
 @pytest.mark.slow
-def test_maps_that_may_not_be_right_supersede_no_nodes_of_others() -> None:
+def test_maps_that_may_not_be_right_supersede_no_nodes_of_others():
     """They would answer no more, and be deleted after two weeks."""
     true = [body.node for body in views(LAST, Pose2(), STEP) if isinstance(body, NodePut)]
     superseded: dict[str, dict[NodeId, NodeId]] = {}

@@ -1,11 +1,8 @@
 """Map files: what opening one works out."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from mapweave.mapserver.map_files import map_file_of, merged_of
 from mapweave.merge.pose_graph import solved_graph
@@ -15,9 +12,7 @@ from mapweave.storage.map_file import pack_map_file
 from tests.mapserver.stub_services import two_maps
 
 
-def test_opening_a_map_solves_for_no_covariance_that_is_not_asked_for(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_opening_a_map_solves_for_no_covariance_that_is_not_asked_for(monkeypatch):
     """Of a map of 20 000 nodes all of them took minutes, before the page or anything else was there."""
     content, before = map_file_of(two_maps()), two_maps().poses
     with monkeypatch.context() as patch:
@@ -32,7 +27,7 @@ def test_opening_a_map_solves_for_no_covariance_that_is_not_asked_for(
         assert np.allclose(one.covariance, other.covariance, rtol=0.05, atol=1e-9)
 
 
-def test_a_large_map_is_written_without_solving_for_each_node(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_large_map_is_written_without_solving_for_each_node(monkeypatch):
     """20 000 nodes took two minutes; and the same map gives the same file, whatever was asked before."""
     merged = two_maps()
     expected = {node: merged.poses[node].merged_from_robot for node in merged.poses}

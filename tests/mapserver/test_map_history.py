@@ -1,7 +1,5 @@
 """The history of the maps: each event once, with its date, and kept on the disk."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -67,7 +65,7 @@ JOINED = (MapEventKind.JOINED, "a.1 and b.1 are one map now")
 PARTED = (MapEventKind.PARTED, "a.1 and b.1 are no longer one map")
 
 
-def test_each_event_is_listed_once_with_its_time(one: MergedMap, two: MergedMap) -> None:
+def test_each_event_is_listed_once_with_its_time(one: MergedMap, two: MergedMap):
     times = iter(range(10**18, 10**19, 10**9))
     history = MapHistory(clock=lambda: next(times))
     for merged in (MergedMap.empty(), one, one, two, two, one):
@@ -78,7 +76,7 @@ def test_each_event_is_listed_once_with_its_time(one: MergedMap, two: MergedMap)
     assert stamps == sorted(stamps) and stamps[0] >= 10**18
 
 
-def test_a_restarted_server_publishes_only_news(store: Store, one: MergedMap, two: MergedMap) -> None:
+def test_a_restarted_server_publishes_only_news(store: Store, one: MergedMap, two: MergedMap):
     MapHistory(store).follow(one)
     again = MapHistory(store)
     # It merges before it has read its store if manual constraints come first.
@@ -92,14 +90,14 @@ def test_a_restarted_server_publishes_only_news(store: Store, one: MergedMap, tw
     assert MapHistory(store).events == third.events
 
 
-def test_it_is_bounded(store: Store, one: MergedMap, two: MergedMap) -> None:
+def test_it_is_bounded(store: Store, one: MergedMap, two: MergedMap):
     history = MapHistory(store, most=5)
     for k in range(12):
         history.follow(two if k % 2 else one)
     assert events(history) == [PARTED, JOINED, PARTED, JOINED, PARTED] == events(MapHistory(store))
 
 
-def test_many_events_at_once_are_summarised(one: MergedMap) -> None:
+def test_many_events_at_once_are_summarised(one: MergedMap):
     many = {MapId(f"r{k}", 1): one.maps[A] for k in range(200)}
     nodes = frozenset(next(iter(one.maps[A].nodes))._replace(agent=name.agent) for name in many)
     history = MapHistory()
@@ -108,9 +106,7 @@ def test_many_events_at_once_are_summarised(one: MergedMap) -> None:
     assert history.newest == f"and {199 - MOST_AT_ONCE} more at once"
 
 
-def test_mutual_exclusion_is_reported_until_the_maps_are_joined(
-    store: Store, one: MergedMap, two: MergedMap
-) -> None:
+def test_mutual_exclusion_is_reported_until_the_maps_are_joined(store: Store, one: MergedMap, two: MergedMap):
     clash = Collision("a", "b", "hall", 40, 0.1, 12.0, 99.0)
     seen = replace(clash, where="ahead")
     assert is_exclusion(clash.reason) and is_exclusion(seen.reason)
@@ -140,7 +136,7 @@ def test_mutual_exclusion_is_reported_until_the_maps_are_joined(
     assert "same place at the same time" in again.newest
 
 
-def test_each_refused_pair_is_listed_once(one: MergedMap, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_refused_pair_is_listed_once(one: MergedMap, monkeypatch):
     monkeypatch.setattr("mapweave.mapserver.map_history.MOST_APART", 3)
     (link, *_) = (link for link in one.links if {link.a.map, link.b.map} == {A, B})
     names = [MapId(f"r{k}", 1) for k in range(6)]
@@ -157,7 +153,7 @@ def test_each_refused_pair_is_listed_once(one: MergedMap, monkeypatch: pytest.Mo
     assert [kind for kind, _ in events(history)] == [MapEventKind.KEPT_APART] * 3
 
 
-def test_maps_without_nodes_have_no_history(merger: Merger, one: MergedMap) -> None:
+def test_maps_without_nodes_have_no_history(merger: Merger, one: MergedMap):
     other = Merger()
     for map_id in (A, B):
         for change in one.maps[map_id].contents():
@@ -170,7 +166,7 @@ def test_maps_without_nodes_have_no_history(merger: Merger, one: MergedMap) -> N
     assert events(history) == [JOINED]
 
 
-def test_a_damaged_record_is_replaced_and_reported(store: Store, one: MergedMap) -> None:
+def test_a_damaged_record_is_replaced_and_reported(store: Store, one: MergedMap):
     store.put_result("history", b"rubbish")
     history = MapHistory(store)
     (failed,) = history.events
@@ -181,9 +177,7 @@ def test_a_damaged_record_is_replaced_and_reported(store: Store, one: MergedMap)
     assert MapHistory(store).events == history.events
 
 
-def test_a_disk_that_does_not_take_it_ends_nothing(
-    tmp_path: Path, one: MergedMap, two: MergedMap, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_disk_that_does_not_take_it_ends_nothing(tmp_path, one: MergedMap, two: MergedMap, caplog):
     store = SqliteStore(tmp_path / "s0.sqlite")
     history = MapHistory(store)
     history.follow(one)
@@ -200,14 +194,14 @@ def test_a_disk_that_does_not_take_it_ends_nothing(
     store.close()
 
 
-def test_constraints_are_listed_in_the_history() -> None:
+def test_constraints_are_listed_in_the_history():
     events = [MapEvent(10**18 + k, MapEventKind.JOINED, "x") for k in (-1, 1)]
     kinds = [event.kind for event in with_constraints(events, APART)]
     assert kinds == [MapEventKind.JOINED, MapEventKind.CONSTRAINED, MapEventKind.JOINED]
     assert "two kitchens" in with_constraints((), APART)[0].words
 
 
-def test_it_comes_through_bytes() -> None:
+def test_it_comes_through_bytes():
     events = (MapEvent(5, MapEventKind.PARTED, "a and b"), MapEvent(6, MapEventKind.FAILED, "no"))
     assert decode(encode(History(events)), History).history == events
     kept = KeptHistory(events, (frozenset([A, B]), frozenset([MapId("c", 2)])), frozenset([(A, B)]))
@@ -230,7 +224,7 @@ def test_it_comes_through_bytes() -> None:
             decode(pack(fields), History)
 
 
-def test_a_pinned_frame_that_moves_is_listed_with_its_change(merger: Merger, store: Store) -> None:
+def test_a_pinned_frame_that_moves_is_listed_with_its_change(merger: Merger, store: Store):
     history = MapHistory(store)
     older, newer = (
         Pin(min(merger.maps[B].nodes), Pose2(3.0, 4.0, 1.0)),

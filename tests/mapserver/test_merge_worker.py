@@ -1,14 +1,11 @@
 """Settled means merged: not when a change is taken from the queue, nor while the merge is being made."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import replace
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -51,7 +48,7 @@ def held_merges(monkeypatch: pytest.MonkeyPatch) -> tuple[threading.Event, threa
     return entered, go
 
 
-def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_is_not_settled_while_it_merges(monkeypatch):
     entered, go = held_merges(monkeypatch)
     worker = MergeWorker(LiveSchedule(), 1.0)
     assert worker.settled
@@ -76,8 +73,8 @@ def test_it_is_not_settled_while_it_merges(monkeypatch: pytest.MonkeyPatch) -> N
     [(MergeSharing, "read"), (PlaceDatabase, "leave_out"), (Answers, "of"), (MapHistory, "follow")],
 )
 def test_a_follower_that_fails_with_a_merge_goes_on_alone_and_follows_again(
-    where: type, method: str, tmp_path: Path
-) -> None:
+    where: type, method: str, tmp_path
+):
     """Who waits for it is released; a history that fails is no reason to give up."""
     log = numbered_log(drives(1))
     results, followed = Results(), Results()
@@ -125,9 +122,7 @@ def test_a_follower_that_fails_with_a_merge_goes_on_alone_and_follows_again(
 
 
 @pytest.mark.parametrize("broken", [False, True])
-def test_a_store_read_at_once_merges_as_change_by_change(
-    broken: bool, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_store_read_at_once_merges_as_change_by_change(broken: bool, monkeypatch, caplog):
     rng = np.random.default_rng(1)
     world, changes = room(0, 0, 5, 4, 600, rng), []
     for agent in ("a", "b"):
@@ -172,7 +167,7 @@ def mapped_room(agents: tuple[str, ...]) -> tuple[World, list[Pose2], list[Chang
     return world, tour, changes
 
 
-def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch):
     world, tour, changes = mapped_room(("a",))
     view, _ = take_view(world, tour[1], np.random.default_rng(3))
     entered, go = held_merges(monkeypatch)
@@ -195,7 +190,7 @@ def test_a_new_place_is_found_while_a_merge_goes_on(monkeypatch: pytest.MonkeyPa
     worker.close()
 
 
-def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch):
     world, tour, changes = mapped_room(("a", "b"))
     view, _ = take_view(world, tour[1], np.random.default_rng(3))
     go, real = threading.Event(), Merger.search_pairs
@@ -221,7 +216,7 @@ def test_a_store_answers_map_by_map_until_its_maps_are_compared(monkeypatch: pyt
     worker.close()
 
 
-def test_in_lockstep_all_changes_are_merged_before_an_answer() -> None:
+def test_in_lockstep_all_changes_are_merged_before_an_answer():
     _, _, changes = mapped_room(("a",))
     places, schedule = PlaceDatabase(), LockstepSchedule()
     worker = MergeWorker(schedule, 1.0, places=places)
@@ -234,7 +229,7 @@ def test_in_lockstep_all_changes_are_merged_before_an_answer() -> None:
     worker.close()
 
 
-def test_a_database_that_is_empty_at_first_is_the_one_that_is_filled() -> None:
+def test_a_database_that_is_empty_at_first_is_the_one_that_is_filled():
     """The owner of the database saves it: a server's first start must leave a saved index, too."""
     _, _, changes = mapped_room(("a",))
     places = PlaceDatabase()
@@ -245,7 +240,7 @@ def test_a_database_that_is_empty_at_first_is_the_one_that_is_filled() -> None:
     worker.close()
 
 
-def test_the_last_waiting_write_of_a_node_counts() -> None:
+def test_the_last_waiting_write_of_a_node_counts():
     _, _, (first, *_) = mapped_room(("a",))
     assert isinstance(first.body, NodePut)
     worker = MergeWorker(LiveSchedule(), 1.0)

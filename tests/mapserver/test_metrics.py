@@ -1,7 +1,5 @@
 """What Prometheus scrapes from a real server, against what went over the bus and lies on the disk."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections import Counter
 from collections.abc import Iterator
@@ -60,7 +58,7 @@ def acknowledged(fleet: Fleet, map_id: MapId, watermark: int) -> None:
     eventually(lambda: any(ack.map == map_id and ack.watermark == watermark for ack in fleet.acks))
 
 
-def test_counts_are_those_of_the_bus_and_of_the_disk(tmp_path: Path) -> None:
+def test_counts_are_those_of_the_bus_and_of_the_disk(tmp_path):
     path = tmp_path / "s0.sqlite"
     sent = [message for _, log in (FIRST, SECOND) for message in (*log, *log[:2])]
     with serving(path) as fleet:
@@ -90,7 +88,7 @@ def test_counts_are_those_of_the_bus_and_of_the_disk(tmp_path: Path) -> None:
     assert scrape("queue_length", "ingest") == scrape("lag_max_seconds") == scrape("store_failing") == 0
 
 
-def test_a_gap_and_a_silent_robot_are_seen_by_name(fleet: Fleet) -> None:
+def test_a_gap_and_a_silent_robot_are_seen_by_name(fleet: Fleet):
     map_id, log = FIRST
     alive = fleet.bus.announce(KEYS.agent_alive(map_id))
     status = AgentStatus(Status("mapping", "", 3, 0, Pose2(), False), 1, "r0", 1, unsent=len(log) - 1)
@@ -111,9 +109,7 @@ def test_a_gap_and_a_silent_robot_are_seen_by_name(fleet: Fleet) -> None:
     assert closed("changes_pulled_total") > 0 and closed("robot_status_age_seconds", "r0") > 0
 
 
-def test_what_found_the_queue_of_the_bus_full_is_counted(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_found_the_queue_of_the_bus_full_is_counted(fleet: Fleet, monkeypatch):
     assert Scrape(fleet)("refusals_total", "queue_full") == 0
     dispatcher = fleet.server._bus._dispatcher
     monkeypatch.setattr(dispatcher, "_put", lambda *_, **__: False)
@@ -123,7 +119,7 @@ def test_what_found_the_queue_of_the_bus_full_is_counted(
     assert Scrape(fleet)("refusals_total", "queue_full") == 2
 
 
-def test_refusals_have_few_reasons(fleet: Fleet) -> None:
+def test_refusals_have_few_reasons(fleet: Fleet):
     map_id, log = FIRST
     names = {sample for sample in Scrape(fleet).samples if sample[0] == "mapweave_refusals_total"}
     fleet.bus.publish(KEYS.change(map_id), b"\xc1", Mark(1, LOG_ID).encode())
@@ -143,7 +139,7 @@ def test_refusals_have_few_reasons(fleet: Fleet) -> None:
         assert labels <= {"robot", "reason", "outcome", "queue", "file", "version", "le"}, family.name
 
 
-def test_it_is_served_over_http(fleet: Fleet) -> None:
+def test_it_is_served_over_http(fleet: Fleet):
     with Web(("127.0.0.1", 0), fleet.server) as web:
         status, headers, content = ask(web, "GET", "/metrics")
         assert status == 200 and headers["Content-Type"].startswith("text/plain; version=0.0.4")

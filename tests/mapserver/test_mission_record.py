@@ -1,7 +1,5 @@
 """The record of missions on the disk: several servers write it, and a write may wait or fail."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time
@@ -35,7 +33,7 @@ class SharedRecord:
         self.value, self.writes = value, self.writes + 1
 
 
-def test_two_servers_that_write_at_once_lose_no_mission_of_each_other() -> None:
+def test_two_servers_that_write_at_once_lose_no_mission_of_each_other():
     record: Any = SharedRecord()
 
     def relay() -> MissionRelay:
@@ -56,7 +54,7 @@ def test_two_servers_that_write_at_once_lose_no_mission_of_each_other() -> None:
 
 
 @pytest.mark.parametrize("off", [-3600.0, 0.0, 3600.0], ids=["put back", "as it was", "put forward"])
-def test_a_mission_for_a_robot_that_is_away_expires_whatever_the_clock_does(off: float) -> None:
+def test_a_mission_for_a_robot_that_is_away_expires_whatever_the_clock_does(off: float):
     record: Any = SharedRecord()
     hours, seconds = [0.0], [0.0]
 
@@ -80,7 +78,7 @@ def test_a_mission_for_a_robot_that_is_away_expires_whatever_the_clock_does(off:
     assert last <= mission_relay.EXPIRY and (off > 0.0 or last == mission_relay.EXPIRY)
 
 
-def test_a_record_that_cannot_be_written_now_holds_up_no_robot_and_no_reader(house: House) -> None:
+def test_a_record_that_cannot_be_written_now_holds_up_no_robot_and_no_reader(house: House):
     """As with a PostgreSQL whose standby is away: the commit waits until there is one."""
     house.robot()
     eventually(lambda: house.entry("r0").alive)
@@ -101,7 +99,7 @@ def test_a_record_that_cannot_be_written_now_holds_up_no_robot_and_no_reader(hou
         eventually(lambda: store.result(mission_relay.KEPT) is not None)
 
 
-def test_a_record_that_could_not_be_written_is_written_later(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_record_that_could_not_be_written_is_written_later(caplog):
     class FullDisk(SharedRecord):
         full = True
 

@@ -1,7 +1,5 @@
 """Missions by way of the map server: goals in words, robots that are away, a server that is started again."""
 
-from __future__ import annotations
-
 import threading
 import time
 from dataclasses import replace
@@ -36,7 +34,7 @@ def standing(robot: str) -> AgentStatus:
     return AgentStatus(Status("standing", "", 0, 0, Pose2(), False), 1, robot, 1)
 
 
-def test_a_robot_is_sent_and_reports_and_all_can_see_it(house: House) -> None:
+def test_a_robot_is_sent_and_reports_and_all_can_see_it(house: House):
     link, control = house.robot()
     entry = house.entry("r0")
     assert entry.alive and entry.component == 0
@@ -61,9 +59,7 @@ def test_a_robot_is_sent_and_reports_and_all_can_see_it(house: House) -> None:
     assert house.entry("r0").status.mission.reason == "a wall"
 
 
-def test_no_mission_is_older_than_what_waiting_for_it_has_returned(
-    house: House, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_mission_is_older_than_what_waiting_for_it_has_returned(house: House, monkeypatch):
     link, control = house.robot()
     report = house.person.go("r0", str(THERE))
     # A server that is slow: the person hears the robot's last status first.
@@ -95,14 +91,14 @@ def test_no_mission_is_older_than_what_waiting_for_it_has_returned(
         ("50,50", "nothing is mapped within 2 m of 50,50: the nearest node is r0.1"),
     ],
 )
-def test_a_goal_that_does_not_exist_is_refused_at_once(house: House, goal: str, reason: str) -> None:
+def test_a_goal_that_does_not_exist_is_refused_at_once(house: House, goal: str, reason: str):
     _, control = house.robot()
     with pytest.raises(InvalidValue, match=reason):
         house.person.go("r0", goal)
     assert control.report is None and house.person.missions() == ()
 
 
-def test_what_a_robot_without_nodes_is_sent_to_is_not_called_its_start(house: House) -> None:
+def test_what_a_robot_without_nodes_is_sent_to_is_not_called_its_start(house: House):
     house.robot("r7")
     with pytest.raises(InvalidValue, match=r"^goal r9\.1\.1 is not in the merged map"):
         house.person.go("r7", "r9.1.1")
@@ -116,9 +112,7 @@ def test_what_a_robot_without_nodes_is_sent_to_is_not_called_its_start(house: Ho
         ("50,50", "^nothing is mapped within 2 m of 50,50"),
     ],
 )
-def test_a_place_on_the_way_that_does_not_exist_is_not_called_the_goal(
-    house: House, via: str, reason: str
-) -> None:
+def test_a_place_on_the_way_that_does_not_exist_is_not_called_the_goal(house: House, via: str, reason: str):
     link, control = house.robot()
     with pytest.raises(InvalidValue, match=reason):
         house.person.go("r0", str(THERE), via=[str(THERE), via])
@@ -129,7 +123,7 @@ def test_a_place_on_the_way_that_does_not_exist_is_not_called_the_goal(
         house.person.go("r0", str(THERE), via=["kitchen"])
 
 
-def test_a_position_leads_to_the_nearest_node(house: House) -> None:
+def test_a_position_leads_to_the_nearest_node(house: House):
     house.robot()
     merged = house.server._worker.current().merged
     place = merged.pose(THERE)
@@ -138,7 +132,7 @@ def test_a_position_leads_to_the_nearest_node(house: House) -> None:
     assert merged.pose(report.order.node).distance(place) < 0.05
 
 
-def test_a_robot_that_is_away_gets_its_newest_mission_when_it_is_back(house: House) -> None:
+def test_a_robot_that_is_away_gets_its_newest_mission_when_it_is_back(house: House):
     house.robot_that_left()
     first = house.person.go("r0", str(THERE))
     assert first.state is MissionState.SENT and "when it is back" in first.reason
@@ -153,7 +147,7 @@ def test_a_robot_that_is_away_gets_its_newest_mission_when_it_is_back(house: Hou
 
 
 @pytest.mark.parametrize("by", ["name", "all", "http"])
-def test_a_robot_that_is_away_gets_no_mission_from_before_it_was_stopped(house: House, by: str) -> None:
+def test_a_robot_that_is_away_gets_no_mission_from_before_it_was_stopped(house: House, by: str):
     """The stop failed, and the robot drove off once it was back."""
     house.robot_that_left()
     assert house.person.go("r0", str(THERE)).state is MissionState.SENT
@@ -169,9 +163,7 @@ def test_a_robot_that_is_away_gets_no_mission_from_before_it_was_stopped(house: 
     assert control.report is not None and control.report.order.kind is MissionKind.STOP
 
 
-def test_a_robot_that_drives_is_stopped_before_a_server_says_who_is_away(
-    house: House, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_robot_that_drives_is_stopped_before_a_server_says_who_is_away(house: House, monkeypatch):
     _, control = house.robot()
     asked: list[bool] = []
 
@@ -185,7 +177,7 @@ def test_a_robot_that_drives_is_stopped_before_a_server_says_who_is_away(
     assert asked == [True]
 
 
-def test_a_goal_is_of_the_map_that_a_robot_makes_now(house: House) -> None:
+def test_a_goal_is_of_the_map_that_a_robot_makes_now(house: House):
     """Right after a start of the server its status has not come, and after its own its last one is older."""
     bus, first = house.bus(), min(house.mapped.truth)
     alive = bus.announce(KEYS.agent_alive(ROBOT))
@@ -201,7 +193,7 @@ def test_a_goal_is_of_the_map_that_a_robot_makes_now(house: House) -> None:
         house.person.go("r0", "home")
 
 
-def test_a_robot_whose_map_is_retired_hears_why_it_has_no_home(house: House) -> None:
+def test_a_robot_whose_map_is_retired_hears_why_it_has_no_home(house: House):
     house.robot()
     eventually(lambda: house.entry("r0").alive)
     house.person.retire(str(ROBOT), because="before the move")
@@ -212,7 +204,7 @@ def test_a_robot_whose_map_is_retired_hears_why_it_has_no_home(house: House) -> 
         house.person.go("r0", "home")
 
 
-def test_a_mission_for_a_robot_that_stays_away_expires(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_mission_for_a_robot_that_stays_away_expires(house: House, monkeypatch):
     house.robot_that_left()
     monkeypatch.setattr(mission_relay, "EXPIRY", 0.0)
     house.person.explore("r0")
@@ -220,12 +212,12 @@ def test_a_mission_for_a_robot_that_stays_away_expires(house: House, monkeypatch
     assert "did not answer within 0 s" in house.person.missions()[-1].reason
 
 
-def test_a_robot_that_was_never_heard_of_gets_no_mission(house: House) -> None:
+def test_a_robot_that_was_never_heard_of_gets_no_mission(house: House):
     with pytest.raises(InvalidValue, match="no robot r7 has been heard of"):
         house.person.explore("r7")
 
 
-def test_the_refusal_names_the_robots_that_there_are(house: House) -> None:
+def test_the_refusal_names_the_robots_that_there_are(house: House):
     with pytest.raises(InvalidValue, match=r"no robot r7 has been heard of$"):
         house.person.explore("r7")
     house.robot()
@@ -235,7 +227,7 @@ def test_the_refusal_names_the_robots_that_there_are(house: House) -> None:
             house.person.explore(name)
 
 
-def test_a_robot_says_nothing_of_the_missions_of_others(house: House) -> None:
+def test_a_robot_says_nothing_of_the_missions_of_others(house: House):
     """Neither in its status, nor as the answer to an order of its own."""
     link, control = house.robot()
     report = house.person.explore("r0")
@@ -259,7 +251,7 @@ def test_a_robot_says_nothing_of_the_missions_of_others(house: House) -> None:
 
 
 @pytest.mark.slow
-def test_one_robot_displaces_no_missions_of_others(house: House) -> None:
+def test_one_robot_displaces_no_missions_of_others(house: House):
     """By very many missions with stamps of the far future, which it says that it has, or is to get."""
     house.robot()
     report = house.person.explore("r0")
@@ -285,7 +277,7 @@ def test_one_robot_displaces_no_missions_of_others(house: House) -> None:
     assert house.person.go("r0", str(THERE)) in house.person.missions()
 
 
-def test_a_robot_that_says_it_is_very_far_away_hides_no_other(house: House) -> None:
+def test_a_robot_that_says_it_is_very_far_away_hides_no_other(house: House):
     """Where it is by its own words lies beyond the range of messages."""
     house.robot()
     liar, there = house.bus(), Pose2(1e6, 1e6, 0.0)
@@ -302,7 +294,7 @@ def test_a_robot_that_says_it_is_very_far_away_hides_no_other(house: House) -> N
         assert entry.merged_from_robot is not None and entry.component == 0
 
 
-def test_a_robot_that_was_stopped_on_its_way_is_shown_where_it_stands(house: House) -> None:
+def test_a_robot_that_was_stopped_on_its_way_is_shown_where_it_stands(house: House):
     house.robot()
     bus, aside = house.bus(), Pose2(0.1, 0.0, 0.2)
     node = min(house.mapped.truth)  # the merged frame is that of the smallest node
@@ -314,7 +306,7 @@ def test_a_robot_that_was_stopped_on_its_way_is_shown_where_it_stands(house: Hou
     assert known is not None and known.vector == pytest.approx(aside.vector)
 
 
-def test_a_robot_does_not_say_what_was_ordered(house: House) -> None:
+def test_a_robot_does_not_say_what_was_ordered(house: House):
     house.robot()
     report = house.person.explore("r0")
     other = replace(report.order, kind=MissionKind.STOP, by="bert", stamp_ns=1)
@@ -325,9 +317,7 @@ def test_a_robot_does_not_say_what_was_ordered(house: House) -> None:
 
 
 @pytest.mark.parametrize("by_http", [False, True])
-def test_no_robot_keeps_others_from_being_stopped(
-    house: House, monkeypatch: pytest.MonkeyPatch, by_http: bool
-) -> None:
+def test_no_robot_keeps_others_from_being_stopped(house: House, monkeypatch, by_http: bool):
     """Robots that hang, that answer nonsense, and after whose mission none can come."""
     _, control = house.robot()
     monkeypatch.setattr(mission_relay, "ANSWER", 20.0)
@@ -372,9 +362,7 @@ def test_no_robot_keeps_others_from_being_stopped(
         assert "a0" in errors[0]
 
 
-def test_robots_that_hang_keep_no_other_from_a_mission_that_waits(
-    house: House, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_robots_that_hang_keep_no_other_from_a_mission_that_waits(house: House, monkeypatch):
     """Their own time to answer is waited for once, and not once for each of them."""
     monkeypatch.setattr(mission_relay, "ANSWER", 0.2)
     over, bus = threading.Event(), house.bus()
@@ -396,7 +384,7 @@ def test_robots_that_hang_keep_no_other_from_a_mission_that_waits(
     over.set()
 
 
-def test_a_mission_of_far_ahead_is_refused(house: House) -> None:
+def test_a_mission_of_far_ahead_is_refused(house: House):
     """Behind the greatest stamp no order could come, not even to stop."""
     _, control = house.robot()
     for stamp_ns in (MAX_STAMP_NS, time.time_ns() + 2 * 86_400 * 10**9):
@@ -407,7 +395,7 @@ def test_a_mission_of_far_ahead_is_refused(house: House) -> None:
     assert house.person.explore("r0").state is MissionState.RUNNING
 
 
-def test_without_a_server_orders_go_to_the_robot_directly(house: House) -> None:
+def test_without_a_server_orders_go_to_the_robot_directly(house: House):
     link, control = house.robot()
     other, _ = house.robot("r1")
     house.stop_server()
@@ -427,7 +415,7 @@ def test_without_a_server_orders_go_to_the_robot_directly(house: House) -> None:
 
 
 @pytest.mark.parametrize("with_server", [True, False])
-def test_a_person_whose_clock_is_behind_can_still_stop_a_robot(house: House, with_server: bool) -> None:
+def test_a_person_whose_clock_is_behind_can_still_stop_a_robot(house: House, with_server: bool):
     _, control = house.robot()
     # By an hour: what is a day ahead no server hands on.
     ahead = MissionOrder("late", "r0", MissionKind.EXPLORE, time.time_ns() + 3_600_000_000_000, "bob")
@@ -441,7 +429,7 @@ def test_a_person_whose_clock_is_behind_can_still_stop_a_robot(house: House, wit
 
 
 @pytest.mark.parametrize("with_server", [True, False])
-def test_a_direct_order_of_far_ahead_leaves_later_orders(house: House, with_server: bool) -> None:
+def test_a_direct_order_of_far_ahead_leaves_later_orders(house: House, with_server: bool):
     """The robot takes it, as its own clock may be wrong; what is ordered later holds all the same."""
     _, control = house.robot()
     control.take(MissionOrder("absurd", "r0", MissionKind.EXPLORE, MAX_STAMP_NS, "eve"))
@@ -458,5 +446,5 @@ def test_a_direct_order_of_far_ahead_leaves_later_orders(house: House, with_serv
         assert [known.get(which) for which in ("absurd", "again")].count(MissionState.RUNNING) == 0
 
 
-def test_the_map_comes_as_a_map_file(house: House) -> None:
+def test_the_map_comes_as_a_map_file(house: House):
     assert len(house.person.content.poses) == 7

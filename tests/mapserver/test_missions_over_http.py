@@ -1,7 +1,5 @@
 """Missions over HTTP: what is taken and refused, and what the JSON says."""
 
-from __future__ import annotations
-
 import http.client
 
 import pytest
@@ -20,7 +18,7 @@ THERE = NodeId("r0", 1, 3)
 LIFT = PortalStop("east lift", PortalMeans.LIFT, THERE, NodeId("r1", 1, 5), "2")
 
 
-def test_robots_are_sent_stopped_and_seen(house: House) -> None:
+def test_robots_are_sent_stopped_and_seen(house: House):
     _, control = house.robot()
     with Web(("127.0.0.1", 0), house.server) as web:
         (robot,) = ask(web, "GET", "/robots")[1]["robots"]
@@ -42,7 +40,7 @@ def test_robots_are_sent_stopped_and_seen(house: House) -> None:
         connection.close()
 
 
-def test_a_long_goal_is_refused_and_not_cut(house: House) -> None:
+def test_a_long_goal_is_refused_and_not_cut(house: House):
     """Of the position 0,99 with many zeros the second number was cut to 0, and the robot drove."""
     _, control = house.robot()
     far = f"0.{'0' * 59},0099"
@@ -55,7 +53,7 @@ def test_a_long_goal_is_refused_and_not_cut(house: House) -> None:
     assert control.report is None
 
 
-def test_a_robot_at_a_portal_takes_it_from_any_client_that_it_was_taken_through(house: House) -> None:
+def test_a_robot_at_a_portal_takes_it_from_any_client_that_it_was_taken_through(house: House):
     link, control = house.robot()
     asking = Status(
         "waiting at a portal", "take me up", 7, 0, Pose2(), False, "goto", portal=PortalWait(LIFT)
@@ -109,7 +107,7 @@ def test_a_robot_at_a_portal_takes_it_from_any_client_that_it_was_taken_through(
         ),
     ],
 )
-def test_nonsense_is_refused(house: House, path: str, status: int, reason: str) -> None:
+def test_nonsense_is_refused(house: House, path: str, status: int, reason: str):
     _, control = house.robot()
     with Web(("127.0.0.1", 0), house.server) as web:
         got, answer = ask(web, "POST", path)
@@ -122,7 +120,7 @@ def test_nonsense_is_refused(house: House, path: str, status: int, reason: str) 
     assert control.report is not None
 
 
-def test_robots_are_moved_from_this_machine_and_its_own_pages_alone(house: House) -> None:
+def test_robots_are_moved_from_this_machine_and_its_own_pages_alone(house: House):
     _, control = house.robot()
     with Web(("127.0.0.1", 0), house.server) as web:
         assert ask(web, "POST", "/robots/r0/stop", Origin="http://evil.example")[0] == 403

@@ -1,7 +1,5 @@
 """The board, the alerts and the page: they name metrics and labels that a real scrape has, and no others."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator
@@ -64,7 +62,7 @@ def check(query: str, labels: dict[str, set[str]]) -> set[str]:
     return asked
 
 
-def test_every_panel_of_the_board_asks_for_what_is_there(labels: dict[str, set[str]]) -> None:
+def test_every_panel_of_the_board_asks_for_what_is_there(labels: dict[str, set[str]]):
     board = json.loads((FOLDER / "grafana.json").read_text())
     panels = [panel for panel in board["panels"] if panel["type"] != "row"]
     assert len(panels) > 15
@@ -86,7 +84,7 @@ def test_every_panel_of_the_board_asks_for_what_is_there(labels: dict[str, set[s
     assert len({panel["id"] for panel in board["panels"]}) == len(board["panels"])
 
 
-def test_whatever_an_alert_watches_is_on_the_board() -> None:
+def test_whatever_an_alert_watches_is_on_the_board():
     """`MapweaveMapOld` came, and no panel showed for how long changes had waited."""
     board, alerts = ((FOLDER / name).read_text() for name in ("grafana.json", "alerts.yml"))
     watched = {*re.findall(r"\bmapweave_\w+", "\n".join(re.findall("expr:.*", alerts)))}
@@ -94,7 +92,7 @@ def test_whatever_an_alert_watches_is_on_the_board() -> None:
     assert watched <= {*re.findall(r"\bmapweave_\w+", board)}
 
 
-def test_every_alert_asks_for_what_is_there(labels: dict[str, set[str]]) -> None:
+def test_every_alert_asks_for_what_is_there(labels: dict[str, set[str]]):
     (group,) = YAML(typ="safe").load(FOLDER / "alerts.yml")["groups"]
     assert {"MapweaveRobotLagging", "MapweaveGap", "MapweaveStoreFailing"} <= {
         r["alert"] for r in group["rules"]
@@ -108,7 +106,7 @@ def test_every_alert_asks_for_what_is_there(labels: dict[str, set[str]]) -> None
         promql.parse_duration(rule["for"])
 
 
-def test_the_scrape_goes_where_http_serves() -> None:
+def test_the_scrape_goes_where_http_serves():
     config: dict[str, Any] = YAML(typ="safe").load(FOLDER / "prometheus.yml")
     (job,) = config["scrape_configs"]
     assert job["job_name"] == "mapweave" and job["scheme"] == "https"
@@ -116,7 +114,7 @@ def test_the_scrape_goes_where_http_serves() -> None:
     assert config["rule_files"] == ["alerts.yml"]
 
 
-def test_the_page_lists_every_metric(labels: dict[str, set[str]]) -> None:
+def test_the_page_lists_every_metric(labels: dict[str, set[str]]):
     page = (ROOT / "docs" / "monitoring.md").read_text()
     listed = {
         name: {*re.findall(r"`(\w+)`", more)}

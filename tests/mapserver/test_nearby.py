@@ -1,7 +1,5 @@
 """Which robots are around one: by what each says of itself, through the merged map."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -44,7 +42,7 @@ def request(robot: str, number: int, pose: Pose2, *newer: NodeId) -> NearbyReque
     return NearbyRequest(robot, starts, 0.03, 0.02, 0.16, 0.3, 0.25)
 
 
-def test_the_pose_is_the_others_as_the_asking_robot_sees_it(merged: MergedMap) -> None:
+def test_the_pose_is_the_others_as_the_asking_robot_sees_it(merged: MergedMap):
     nearby = Nearby()
     here, there = Pose2(0.5, 0.2, 1.0), Pose2(-0.4, 0.1, 0.7)
     assert nearby.ask(request("r0", 0, here), merged, 10.0).robots == ()
@@ -60,7 +58,7 @@ def test_the_pose_is_the_others_as_the_asking_robot_sees_it(merged: MergedMap) -
     assert seen.sigma == pytest.approx(math.hypot(0.03, 0.03, aside, MAP_SIGMA))
 
 
-def test_maps_that_are_not_joined_and_what_is_old_give_nothing(merged: MergedMap) -> None:
+def test_maps_that_are_not_joined_and_what_is_old_give_nothing(merged: MergedMap):
     nearby = Nearby()
     for robot, number in (("r0", 0), ("r1", 1), ("r2", 2)):
         nearby.ask(request(robot, number, Pose2()), merged, 0.0)
@@ -73,7 +71,7 @@ def test_maps_that_are_not_joined_and_what_is_old_give_nothing(merged: MergedMap
     assert "merged map yet" in nearby.ask(lost, merged, 2.0).reason
 
 
-def test_near_robots_are_those_that_a_search_of_all_finds(merged: MergedMap) -> None:
+def test_near_robots_are_those_that_a_search_of_all_finds(merged: MergedMap):
     """Over the cells' borders, after moves, and with more robots than are remembered."""
     random, nearby, at = np.random.default_rng(0), Nearby(), dict[str, Pose2]()
     for tick in range(400):
@@ -86,7 +84,7 @@ def test_near_robots_are_those_that_a_search_of_all_finds(merged: MergedMap) -> 
         at[robot] = pose
 
 
-def test_robots_without_end_are_not_remembered(merged: MergedMap, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_robots_without_end_are_not_remembered(merged: MergedMap, monkeypatch):
     monkeypatch.setattr("mapweave.mapserver.nearby.MOST_ROBOTS", 5)
     nearby = Nearby()
     for k in range(40):
@@ -94,7 +92,7 @@ def test_robots_without_end_are_not_remembered(merged: MergedMap, monkeypatch: p
         assert [one.robot for one in answer.robots] == [f"r{n}" for n in range(k - 1, max(k - 6, -1), -1)]
 
 
-def test_the_order_of_those_that_ask_at_once_changes_no_answer(merged: MergedMap) -> None:
+def test_the_order_of_those_that_ask_at_once_changes_no_answer(merged: MergedMap):
     def play(*order: str) -> dict[tuple[str, float], NearbyAnswer]:
         nearby, out = Nearby(), {}
         for now in (0.0, 0.5, 1.0):
@@ -106,7 +104,7 @@ def test_the_order_of_those_that_ask_at_once_changes_no_answer(merged: MergedMap
     assert play("r0", "r1", "r3") == play("r3", "r1", "r0")
 
 
-def test_only_a_robot_seen_twice_at_one_place_stands_at_a_node(merged: MergedMap) -> None:
+def test_only_a_robot_seen_twice_at_one_place_stands_at_a_node(merged: MergedMap):
     """Robots of 0.16 m around the second node, (3, 1), seen from both nodes of the map."""
     nearby = Nearby()
     from_first = PLACES[0].inverse() @ PLACES[1]
@@ -129,7 +127,7 @@ def test_only_a_robot_seen_twice_at_one_place_stands_at_a_node(merged: MergedMap
     assert standing(1, 0.16, 15.1 + KEPT) == [], "who is silent is gone"
 
 
-def test_a_robot_has_left_once_it_is_known_elsewhere(merged: MergedMap) -> None:
+def test_a_robot_has_left_once_it_is_known_elsewhere(merged: MergedMap):
     nearby, frame = Nearby(), merged.graphs[0].anchor
     there = PLACES[1].x, PLACES[1].y
 
@@ -146,7 +144,7 @@ def test_a_robot_has_left_once_it_is_known_elsewhere(merged: MergedMap) -> None:
 
 
 @pytest.mark.parametrize("field", ["radius", "height"])
-def test_no_robot_is_as_large_as_a_room(field: str) -> None:
+def test_no_robot_is_as_large_as_a_room(field: str):
     """It would stand in the way of all others, and in all of their images."""
     honest = NearbyRequest("r0", ((NodeId("r0", 1, 1), Pose2()),), 9.0, 0.02, 0.16, 0.3, 0.25)
     assert decode(encode(honest), NearbyRequest) == honest

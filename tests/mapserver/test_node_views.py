@@ -1,7 +1,5 @@
 """What a map server takes of a robot as the image of a node, and passes on."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor, wait
@@ -71,7 +69,7 @@ def pixels(jpeg: bytes) -> np.ndarray:
     return np.asarray(cv2.imdecode(np.frombuffer(jpeg, np.uint8), cv2.IMREAD_UNCHANGED))
 
 
-def test_a_view_is_encoded_again_and_asked_for_once(views: NodeViews, robot: HandRobot) -> None:
+def test_a_view_is_encoded_again_and_asked_for_once(views: NodeViews, robot: HandRobot):
     hidden = b"<script>alert(1)</script>"
     robot.give(JPEG[:2] + b"\xff\xfe" + struct.pack(">H", 2 + len(hidden)) + hidden + JPEG[2:])
     got = views.view(NODE)
@@ -80,7 +78,7 @@ def test_a_view_is_encoded_again_and_asked_for_once(views: NodeViews, robot: Han
     assert np.abs(pixels(got).astype(int) - pixels(JPEG)).mean() < 6.0
 
 
-def test_few_views_are_remembered(views: NodeViews, robot: HandRobot, monkeypatch) -> None:
+def test_few_views_are_remembered(views: NodeViews, robot: HandRobot, monkeypatch):
     monkeypatch.setattr(node_views, "MOST_CACHED", 2)
     first, second, third = sorted(two_maps().maps[NODE.map].nodes)[:3]
     for node in (first, second, first, third, first, second):
@@ -111,7 +109,7 @@ GARBAGE = {
 
 
 @pytest.mark.parametrize(("sent", "words"), GARBAGE.values(), ids=GARBAGE)
-def test_garbage_is_refused_in_one_line(views: NodeViews, robot: HandRobot, sent: bytes, words: str) -> None:
+def test_garbage_is_refused_in_one_line(views: NodeViews, robot: HandRobot, sent: bytes, words: str):
     robot.give(sent)
     with pytest.raises(NoView) as refused:
         views.view(NODE)
@@ -121,9 +119,7 @@ def test_garbage_is_refused_in_one_line(views: NodeViews, robot: HandRobot, sent
     assert views.view(NODE)
 
 
-def test_a_size_that_is_no_size_in_the_head_is_not_decoded(
-    views: NodeViews, robot: HandRobot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_size_that_is_no_size_in_the_head_is_not_decoded(views: NodeViews, robot: HandRobot, monkeypatch):
     """A decoder allocates memory for as many pixels as the head says."""
 
     def decoder(*_: object) -> None:
@@ -136,15 +132,13 @@ def test_a_size_that_is_no_size_in_the_head_is_not_decoded(
             views.view(NODE)
 
 
-def test_the_view_of_another_node_is_refused(views: NodeViews, robot: HandRobot) -> None:
+def test_the_view_of_another_node_is_refused(views: NodeViews, robot: HandRobot):
     robot.gives = lambda node: encode(ViewImage(OTHER, JPEG))
     with pytest.raises(NoView, match=f"it is of {OTHER}"):
         views.view(NODE)
 
 
-def test_a_robot_that_hangs_holds_up_few_people(
-    views: NodeViews, robot: HandRobot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_robot_that_hangs_holds_up_few_people(views: NodeViews, robot: HandRobot, monkeypatch):
     monkeypatch.setattr(node_views, "PATIENCE", 60.0)
     held: list[Request] = []
     robot.bus.close()
@@ -165,7 +159,7 @@ def test_a_robot_that_hangs_holds_up_few_people(
     assert views.view(NODE)
 
 
-def test_a_busy_robot_is_asked_again_later(views: NodeViews, robot: HandRobot) -> None:
+def test_a_busy_robot_is_asked_again_later(views: NodeViews, robot: HandRobot):
     """That it has no view would be wrong."""
     robot.gives = lambda node: Busy(3.0)
     with pytest.raises(Busy) as refused:
@@ -173,7 +167,7 @@ def test_a_busy_robot_is_asked_again_later(views: NodeViews, robot: HandRobot) -
     assert refused.value.retry_after == pytest.approx(3.0)
 
 
-def test_why_there_is_none(hub: MemoryHub, views: NodeViews, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_why_there_is_none(hub: MemoryHub, views: NodeViews, monkeypatch):
     with pytest.raises(InvalidValue, match="has no node 9999"):
         views.view(NodeId("r0", 1, 9999))
     with pytest.raises(NoView, match="r0 is away, or keeps no views"):

@@ -1,7 +1,5 @@
 """The whole map as an answer: it blocks no other question, and costs one pack a merge."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator
@@ -63,7 +61,7 @@ def served(mapped_room, monkeypatch: pytest.MonkeyPatch) -> Iterator[Served]:
     served.bus.close()
 
 
-def test_everything_else_is_answered_while_the_map_is_packed(served: Served) -> None:
+def test_everything_else_is_answered_while_the_map_is_packed(served: Served):
     served.go_on.clear()
     with ThreadPoolExecutor(1) as pool:
         asked = pool.submit(served.ask, MAP)
@@ -77,7 +75,7 @@ def test_everything_else_is_answered_while_the_map_is_packed(served: Served) -> 
         assert unpack_map_file(asked.result(30).payload).kind == "merged"
 
 
-def test_the_same_map_is_packed_once(served: Served) -> None:
+def test_the_same_map_is_packed_once(served: Served):
     first = served.ask(MAP).payload
     assert served.ask(MAP).payload == first and served.packs == 1
     served.server._history.failed("something")
@@ -85,7 +83,7 @@ def test_the_same_map_is_packed_once(served: Served) -> None:
     assert served.packs == 2 and "something" in answer[-1].words
 
 
-def test_a_crowd_costs_two_packs_at_most(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_crowd_costs_two_packs_at_most(served: Served, monkeypatch):
     served.go_on.clear()
     with ThreadPoolExecutor(20) as pool:
         asked = [pool.submit(served.ask, MAP)]
@@ -101,9 +99,7 @@ def test_a_crowd_costs_two_packs_at_most(served: Served, monkeypatch: pytest.Mon
     assert served.packs <= 2
 
 
-def test_a_map_that_cannot_be_packed_is_refused_and_the_next_is_not(
-    served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_that_cannot_be_packed_is_refused_and_the_next_is_not(served: Served, monkeypatch):
     with monkeypatch.context() as broken:
 
         def fail(*_: object) -> bytes:

@@ -1,7 +1,5 @@
 """Ways past places and robots: which edges pass them, what that costs, and who is avoided."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 
@@ -37,7 +35,7 @@ def stops(answer: RouteAnswer) -> list[int]:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_edges_that_pass_a_place_are_those_that_points_along_them_show(router: Router, seed: int) -> None:  # noqa: F811
+def test_edges_that_pass_a_place_are_those_that_points_along_them_show(router: Router, seed: int):  # noqa: F811
     rng = np.random.default_rng(seed)
     (x, y), reach = rng.uniform([-1.0, -1.0], [9.0, 6.0]), rng.uniform(0.05, 1.5)
     edges = router.roads.union.edges.values()
@@ -49,7 +47,7 @@ def test_edges_that_pass_a_place_are_those_that_points_along_them_show(router: R
     )
 
 
-def test_an_obstacle_is_placed_by_its_node(router: Router) -> None:  # noqa: F811
+def test_an_obstacle_is_placed_by_its_node(router: Router):  # noqa: F811
     assert placed(Obstacle(NodeId("z", 1, 1), 0.0, 0.0, 1.0), router.roads) is None
     disc = placed(Obstacle(node(3), 0.5, 0.25, 0.3), router.roads)
     assert disc is not None
@@ -57,7 +55,7 @@ def test_an_obstacle_is_placed_by_its_node(router: Router) -> None:  # noqa: F81
     assert (disc.x, disc.y, disc.reach) == pytest.approx((here.x, here.y, 0.3)) and math.isinf(disc.cost)
 
 
-def test_a_barred_place_closes_every_edge_through_it_and_the_way_in(router: Router) -> None:  # noqa: F811
+def test_a_barred_place_closes_every_edge_through_it_and_the_way_in(router: Router):  # noqa: F811
     """A robot before an obstacle at (3.4, 0): nodes beyond are within reach of a straight entry."""
     blocked = Disc(0, 3.4, 0.0, 0.3)
     start, here = node(3), Pose2(0.05, 0.0)
@@ -71,7 +69,7 @@ def test_a_barred_place_closes_every_edge_through_it_and_the_way_in(router: Rout
     assert router.past([Disc(0, 3.4, 2.5, 0.3)]).route(start, node(5)).legs, "what is elsewhere is in no way"
 
 
-def test_a_way_through_a_dear_place_pays_once_however_many_edges_it_has_there(router: Router) -> None:  # noqa: F811
+def test_a_way_through_a_dear_place_pays_once_however_many_edges_it_has_there(router: Router):  # noqa: F811
     for reach in (0.3, 0.7, 1.2, 2.6):
         costs = Discs(router.roads, [Disc(0, 4.5, 0.0, reach, 8.0)]).costs
         way = [frozenset(pair) for pair in pairwise(map(node, range(9)))]
@@ -120,7 +118,7 @@ def ring() -> Router:
     return Router(merger.merged())
 
 
-def test_another_way_is_taken_at_once_and_the_reason_said(ring: Router) -> None:
+def test_another_way_is_taken_at_once_and_the_reason_said(ring: Router):
     fleet = Fleet(ring)
     assert stops(fleet.way(0, 4)) == [0, 1, 2, 3, 4] and fleet.searches == 1, "without robots one search"
     fleet.stand("r1", 2)
@@ -131,7 +129,7 @@ def test_another_way_is_taken_at_once_and_the_reason_said(ring: Router) -> None:
     assert stops(both) == [0, 1, 2, 3, 4] and both.detour == "", "past one of them, then by the shorter way"
 
 
-def test_who_stands_beside_the_way_drives_or_has_asked_only_once_is_in_no_way(ring: Router) -> None:
+def test_who_stands_beside_the_way_drives_or_has_asked_only_once_is_in_no_way(ring: Router):
     fleet = Fleet(ring)
     fleet.stand("r1", 2, aside=0.6)
     fleet.stand("r2", 2, seconds=1.0)
@@ -141,7 +139,7 @@ def test_who_stands_beside_the_way_drives_or_has_asked_only_once_is_in_no_way(ri
     assert stops(fleet.way(0, 4)) == [0, 1, 2, 3, 4], "a robot on its way leaves"
 
 
-def test_where_there_is_no_other_way_it_leads_past_the_robot(router: Router) -> None:  # noqa: F811
+def test_where_there_is_no_other_way_it_leads_past_the_robot(router: Router):  # noqa: F811
     """The corridor's ends are joined by nothing else: the way leads past the robot."""
     fleet = Fleet(router)
     fleet.stand("r1", 4)

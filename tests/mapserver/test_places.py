@@ -1,11 +1,8 @@
 """Named places by way of the map server: made, used wherever a node is, kept, and taken back."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 from types import SimpleNamespace
 from urllib.parse import quote
 
@@ -44,7 +41,7 @@ from tests.waiting import eventually
 THERE = NodeId("r0", 1, 3)
 
 
-def test_a_place_stands_wherever_a_node_may_stand_and_outlasts_the_server(house: House) -> None:
+def test_a_place_stands_wherever_a_node_may_stand_and_outlasts_the_server(house: House):
     person, (link, _) = house.person, house.robot()
     said = person.annotate("place", "kitchen", because="the sink", node=str(THERE))
     assert said == f'place kitchen is node {THERE}, by anna: "the sink"'
@@ -90,9 +87,7 @@ def test_a_place_stands_wherever_a_node_may_stand_and_outlasts_the_server(house:
     assert unpack_map_file(person.map_bytes()).annotations == made and len(made) == 3
 
 
-def test_a_letter_with_an_accent_is_the_same_however_it_is_written(
-    house: House, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_letter_with_an_accent_is_the_same_however_it_is_written(house: House, tmp_path, capsys):
     """As one character, as most keyboards do, or as a letter with an accent behind it."""
     one, two = "caf\u00e9", "cafe\u0301"
     person, path = house.person, tmp_path / "room.mapweave"
@@ -117,7 +112,7 @@ def test_a_letter_with_an_accent_is_the_same_however_it_is_written(
     assert Annotations((Annotation(two, Place(THERE), False, "anna", 1),)).last("place", one) is not None
 
 
-def test_a_long_reason_is_no_error_of_what_is_kept(house: House) -> None:
+def test_a_long_reason_is_no_error_of_what_is_kept(house: House):
     """What an entry says and what the one before has said is more than the answer holds."""
     for note in ("a", "b"):
         said = house.person.annotate(
@@ -127,7 +122,7 @@ def test_a_long_reason_is_no_error_of_what_is_kept(house: House) -> None:
     assert len(house.person.annotations().made) == 2
 
 
-def test_an_annotation_is_tried_before_it_is_kept(house: House) -> None:
+def test_an_annotation_is_tried_before_it_is_kept(house: House):
     """On the page and over HTTP it could be; by shell and in Python a mistake had to be made first."""
     person = house.person
     said = person.annotate("place", "kitchen", node=str(THERE), check=True)
@@ -154,8 +149,8 @@ def test_an_annotation_is_tried_before_it_is_kept(house: House) -> None:
     ],
 )
 def test_an_annotation_of_a_file_is_tried_before_it_is_kept(
-    fetched: MapFile, tmp_path: Path, capsys: pytest.CaptureFixture[str], command: list[str], words: str
-) -> None:
+    fetched: MapFile, tmp_path, capsys, command: list[str], words: str
+):
     path = tmp_path / "room.mapweave"
     write_map_file(path, replace(fetched, annotations=record("kitchen", Place(THERE)).made))
     before = path.read_bytes()
@@ -165,7 +160,7 @@ def test_an_annotation_of_a_file_is_tried_before_it_is_kept(
     assert path.read_bytes() == before
 
 
-def test_places_over_http(house: House) -> None:
+def test_places_over_http(house: House):
     with Web(("127.0.0.1", 0), house.server) as web:
         body = {"name": "Küche", "body": {"kind": "place", "node": "r0.1.3"}, "because": "tea"}
         status, posted = ask(web, "POST", "/annotations?by=bob", body)
@@ -258,7 +253,7 @@ def merged(fetched: MapFile) -> MergedMap:
     return merged_of(fetched)
 
 
-def test_very_many_floors_of_a_part_are_as_many_as_a_message_holds(merged: MergedMap) -> None:
+def test_very_many_floors_of_a_part_are_as_many_as_a_message_holds(merged: MergedMap):
     maps = [MapId("r0", number) for number in range(5)]
     labels = Annotations(tuple(
         Annotation(str(which), Floor(NodeId(*which, 1), f"{which.epoch}" * 64), False, "anna", 1)
@@ -275,7 +270,7 @@ def record(name: str, place: Place) -> Annotations:
     return Annotations((Annotation(name, place, False, "anna", 1),))
 
 
-def test_a_place_whose_node_is_superseded_is_the_nearest_active_node(merged: MergedMap) -> None:
+def test_a_place_whose_node_is_superseded_is_the_nearest_active_node(merged: MergedMap):
     away = {node: merged.pose(node).distance(merged.pose(THERE)) for node in merged.poses if node != THERE}
     nearest = min(away, key=away.__getitem__)
     older = replace(merged, superseded={THERE: Superseded(max(away, key=away.__getitem__), 9, 0.1, 0.1)})
@@ -283,7 +278,7 @@ def test_a_place_whose_node_is_superseded_is_the_nearest_active_node(merged: Mer
     assert found.node == nearest and "r0.1.3 is superseded" in found.note
 
 
-def test_a_place_whose_node_is_in_no_map_any_more_says_why(merged: MergedMap) -> None:
+def test_a_place_whose_node_is_in_no_map_any_more_says_why(merged: MergedMap):
     kitchen = record("kitchen", Place(NodeId("r9", 1, 1)))
     with pytest.raises(InvalidValue, match=r"place kitchen is at r9\.1\.1, which is not in the merged map"):
         PlaceResolver(Router(merged), kitchen).resolve("kitchen")
@@ -294,7 +289,7 @@ def test_a_place_whose_node_is_in_no_map_any_more_says_why(merged: MergedMap) ->
         PlaceResolver(Router(none), record("kitchen", Place(THERE))).resolve("kitchen")
 
 
-def test_a_place_whose_node_is_retired_is_the_nearest_one_of_its_map(merged: MergedMap) -> None:
+def test_a_place_whose_node_is_retired_is_the_nearest_one_of_its_map(merged: MergedMap):
     left = {node: placement for node, placement in merged.poses.items() if node != THERE}
     without = replace(merged, poses=left, components=(frozenset(left),))
     at = merged.maps[THERE.map].nodes[THERE].map_from_robot.mean
@@ -304,7 +299,7 @@ def test_a_place_whose_node_is_retired_is_the_nearest_one_of_its_map(merged: Mer
     assert found.node == nearest and "r0.1.3 takes no part" in found.note
 
 
-def test_an_area_is_the_active_node_next_to_its_centre(merged: MergedMap) -> None:
+def test_an_area_is_the_active_node_next_to_its_centre(merged: MergedMap):
     anchor, (x, y) = merged.pose(THERE), (merged.pose(THERE).x, merged.pose(THERE).y)
     area = Area.of_merged(
         min(merged.poses),
@@ -320,7 +315,7 @@ def test_an_area_is_the_active_node_next_to_its_centre(merged: MergedMap) -> Non
         PlaceResolver(Router(merged), record("yard", Place(area=shifted))).resolve("yard")
 
 
-def test_the_narrowest_place_names_a_position(merged: MergedMap) -> None:
+def test_the_narrowest_place_names_a_position(merged: MergedMap):
     first, second = sorted(merged.poses)[:2]
     entries = [
         Annotation("house", Place(area=Area.around(first, 9.0)), False, "", 1),
@@ -336,9 +331,7 @@ def test_the_narrowest_place_names_a_position(merged: MergedMap) -> None:
     assert places.name_at(1, merged.pose(first)) == ""
 
 
-def test_places_of_a_map_file_from_the_shell(
-    fetched: MapFile, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_places_of_a_map_file_from_the_shell(fetched: MapFile, tmp_path, capsys):
     path, other = tmp_path / "room.mapweave", tmp_path / "other.mapweave"
     write_map_file(path, fetched)
 
@@ -387,7 +380,7 @@ def test_places_of_a_map_file_from_the_shell(
     assert len(read_map_file(both).annotations) == 4
 
 
-def test_a_floor_parts_maps_and_answers_name_it(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_floor_parts_maps_and_answers_name_it(tmp_path, capsys):
     """Two robots in twin rooms, which a running server has merged, until people say that they are not one."""
     rng, path = np.random.default_rng(6), tmp_path / "s0.sqlite"
     world, maps = room(0, 0, 5, 4, 700, rng), [MapId("r0", 1), MapId("r1", 1)]
@@ -429,7 +422,7 @@ def test_a_floor_parts_maps_and_answers_name_it(tmp_path: Path, capsys: pytest.C
         one.close()
 
 
-def test_a_map_that_a_server_is_given_brings_its_annotations(fetched: MapFile, tmp_path: Path) -> None:
+def test_a_map_that_a_server_is_given_brings_its_annotations(fetched: MapFile, tmp_path):
     named = replace(fetched, annotations=record("kitchen", Place(THERE)).made)
     hub = MemoryHub()
     bus, mine = MemoryBus(hub), MemoryBus(hub)

@@ -1,9 +1,5 @@
 """Images of plans on the server's disk."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
@@ -17,7 +13,7 @@ def png(grey: int, side: int = 4) -> bytes:
     return bytes(cv2.imencode(".png", np.full((side, side), grey, np.uint8))[1].tobytes())
 
 
-def test_images_are_kept_by_content_and_outlast_a_restart(tmp_path: Path) -> None:
+def test_images_are_kept_by_content_and_outlast_a_restart(tmp_path):
     store = tmp_path / "s0.sqlite"
     images = PlanImages(store, ())
     first, again, other = images.put(png(1)), images.put(png(1)), images.put(png(2))
@@ -35,7 +31,7 @@ def test_images_are_kept_by_content_and_outlast_a_restart(tmp_path: Path) -> Non
     assert images.put(png(1)) == first and images.get(first.sha256) == png(1)
 
 
-def test_what_is_no_image_and_too_many_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_no_image_and_too_many_are_refused(tmp_path, monkeypatch):
     images = PlanImages(tmp_path / "s0.sqlite", ())
     for data in (b"", b"GIF89a", bytes(2**24 + 1)):
         with pytest.raises(InvalidValue, match="a plan is a PNG file"):

@@ -1,14 +1,11 @@
 """Floor plans and pins of a running server, of its map file, and over HTTP."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math
 import re
 from contextlib import nullcontext
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import cv2
@@ -70,7 +67,7 @@ def with_plan(house: House) -> Fleet:
     return house.person
 
 
-def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> None:
+def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House):
     fleet = house.person
     assert house.server.settle(20.0)
     with pytest.raises(InvalidValue, match="the image of this plan is not on the server"):
@@ -99,7 +96,7 @@ def test_a_plan_lies_under_the_map_of_a_server_and_outlasts_it(house: House) -> 
     assert fleet.plans().plans == () and map_of(fleet).images == {}
 
 
-def test_a_plan_that_no_message_holds_is_refused(house: House) -> None:
+def test_a_plan_that_no_message_holds_is_refused(house: House):
     """It would cost people the answer about all plans."""
     fleet = with_plan(house)
     places = ((1e6, 1e6, 1.0, 1.0), (1e6, -1e6, 11.0, 1.0), (-1e6, 1e6, 1.0, 11.0))
@@ -109,7 +106,7 @@ def test_a_plan_that_no_message_holds_is_refused(house: House) -> None:
     assert [plan.name for plan in fleet.plans().plans] == ["flat"]
 
 
-def test_a_pinned_frame_is_what_everything_of_a_server_is_in(house: House) -> None:
+def test_a_pinned_frame_is_what_everything_of_a_server_is_in(house: House):
     fleet, node, pose = with_plan(house), NodeId("r0", 1, 3), Pose2(50.0, -20.0, 1.5)
     before = fleet.plans().plan("flat").part().plan_from_merged @ pose_of(fleet, node)
     said = fleet.annotate("pin", str(node), node=str(node), merged_from_node=packed(pose))
@@ -133,7 +130,7 @@ def test_a_pinned_frame_is_what_everything_of_a_server_is_in(house: House) -> No
         fleet.annotate("pin", str(node), node=str(node), merged_from_node=[2e5, 0.0, 0.0])
 
 
-def test_an_image_comes_in_pieces_and_in_order(house: House) -> None:
+def test_an_image_comes_in_pieces_and_in_order(house: House):
     fleet, rng = house.person, np.random.default_rng(0)
     noise = rng.integers(0, 255, (900, 900, 3)).astype(np.uint8)
     png = cv2.imencode(".png", noise)[1].tobytes()
@@ -150,7 +147,7 @@ def test_an_image_comes_in_pieces_and_in_order(house: House) -> None:
     assert len(plans._incoming) == 4
 
 
-def test_plans_over_http(house: House) -> None:
+def test_plans_over_http(house: House):
     assert house.server.settle(20.0)
     with Web(("127.0.0.1", 0), house.server) as served:
         jpeg = cv2.imencode(".jpg", np.full((500, 400), 200, np.uint8))[1].tobytes()
@@ -173,7 +170,7 @@ def test_plans_over_http(house: House) -> None:
         assert ask(served, "POST", "/plans", b"a page")[0] == 400
 
 
-def test_answers_and_goals_in_coordinates_of_a_plan(house: House) -> None:
+def test_answers_and_goals_in_coordinates_of_a_plan(house: House):
     """Of robots and photographs, over HTTP and in Python; what is no plan is refused, and not passed over."""
     fleet = with_plan(house)
     house.robot()
@@ -222,7 +219,7 @@ def test_answers_and_goals_in_coordinates_of_a_plan(house: House) -> None:
         fleet.status(plan="none")
 
 
-def test_a_photograph_is_placed_on_the_plan_of_a_file(house: House) -> None:
+def test_a_photograph_is_placed_on_the_plan_of_a_file(house: House):
     fleet = with_plan(house)
     node = sorted(house.mapped.truth)[2]
     answer = house.server.locate(lambda: house.mapped.view(node), 1).result(20.0)
@@ -240,7 +237,7 @@ def test_a_photograph_is_placed_on_the_plan_of_a_file(house: House) -> None:
         office.relocalize(blank, camera, plan="none")
 
 
-def test_a_position_on_a_plan_under_two_parts_needs_to_know_where_the_robot_is(house: House) -> None:
+def test_a_position_on_a_plan_under_two_parts_needs_to_know_where_the_robot_is(house: House):
     fleet = with_plan(house)
     plan = fleet.plans().plan("flat")
     two = replace(plan, parts=(*plan.parts, replace(plan.part(), component=1)))
@@ -253,7 +250,7 @@ def test_a_position_on_a_plan_under_two_parts_needs_to_know_where_the_robot_is(h
         goal_on_plan("400,500", plan, 0, fleet.resolve)
 
 
-def test_a_plan_is_tried_over_http_before_it_is_kept(house: House) -> None:
+def test_a_plan_is_tried_over_http_before_it_is_kept(house: House):
     """The image may come with its map.yaml; the fit comes without anything being kept."""
     assert house.server.settle(20.0)
     described = "image: flat.pgm\nresolution: 0.02\norigin: [1.0, -2.0, 0.5]\nnegate: 1\n"
@@ -297,9 +294,7 @@ def test_a_plan_is_tried_over_http_before_it_is_kept(house: House) -> None:
         assert house.server.plans().plans == ()
 
 
-def test_a_plan_of_a_server_is_drawn(
-    house: House, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_plan_of_a_server_is_drawn(house: House, tmp_path, monkeypatch, capsys):
     """Before, `-o` was taken for where a changed record goes, and refused."""
     assert house.server.settle(20.0)
     house.person.put_plan_image(PNG.png)
@@ -311,7 +306,7 @@ def test_a_plan_of_a_server_is_drawn(
     assert cv2.imread(str(picture)).shape[0] > 300
 
 
-def test_a_pixel_outside_of_the_image_is_refused(house: House) -> None:
+def test_a_pixel_outside_of_the_image_is_refused(house: House):
     """Of a pixel with a zero too many it was said that some pair is wrong."""
     assert house.server.settle(20.0)
     house.person.put_plan_image(PNG.png)
@@ -324,9 +319,7 @@ def test_a_pixel_outside_of_the_image_is_refused(house: House) -> None:
     assert house.server.plans().plans == ()
 
 
-def test_a_map_yaml_whose_image_is_missing_is_named(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_map_yaml_whose_image_is_missing_is_named(tmp_path, capsys):
     described = tmp_path / "map.yaml"
     described.write_text("image: flat.pgm\nresolution: 0.02\norigin: [1.0, -2.0, 0.5]\nnegate: 1\n")
     assert main(["plan", "add", str(described), "--pair", "r0.1.3=1,2"]) == FAILED
@@ -335,9 +328,7 @@ def test_a_map_yaml_whose_image_is_missing_is_named(
 
 
 @pytest.mark.slow
-def test_plans_and_pins_of_a_map_file_from_the_shell(
-    house: House, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_plans_and_pins_of_a_map_file_from_the_shell(house: House, tmp_path, capsys):
     path, image = tmp_path / "room.mapweave", tmp_path / "flat.pgm"
     house.person.annotate("place", "door", node="r0.1.9")
     write_map_file(path, map_of(house.person))
@@ -419,9 +410,7 @@ def test_plans_and_pins_of_a_map_file_from_the_shell(
         (["map", "pin", "--undo"], "name the node", USAGE),
     ],
 )
-def test_mistakes_are_refused_in_one_line(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], words: list[str], reason: str, status: int
-) -> None:
+def test_mistakes_are_refused_in_one_line(tmp_path, capsys, words: list[str], reason: str, status: int):
     path = tmp_path / "room.mapweave"
     write_map_file(path, map_file_of(two_maps()))
     before = path.read_bytes()

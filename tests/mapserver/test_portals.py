@@ -1,7 +1,5 @@
 """Routes over several floors, against relaxation over one list of edges; portals that are mistakes."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace
@@ -66,7 +64,7 @@ lifts = st.tuples(st.sampled_from([(0, 1), (1, 2), (2, 0)]), numbers, numbers).m
     st.lists(lifts, max_size=5, unique=True), st.lists(st.booleans(), min_size=5, max_size=5),
     st.lists(st.sampled_from([0.5, 1.0, 4.0]), min_size=5, max_size=5), st.data(),
 )  # fmt: skip
-def test_a_way_through_portals_is_the_cheapest_that_there_is(house, pairs, closed, factors, data) -> None:
+def test_a_way_through_portals_is_the_cheapest_that_there_is(house, pairs, closed, factors, data):
     entries = [said(f"lift {k}", Portal(*pair, PortalMeans.LIFT)) for k, pair in enumerate(pairs)]
     entries += [said(f"c{k}", Closure(pair)) for k, pair in enumerate(pairs) if closed[k]]
     entries += [
@@ -122,7 +120,7 @@ def relaxed(edges: list[tuple[NodeId, NodeId, float]], start: NodeId) -> dict[No
     return cost
 
 
-def test_an_explanation_names_the_portal_and_the_floors(house) -> None:
+def test_an_explanation_names_the_portal_and_the_floors(house):
     lift = said("east lift", Portal(at(0, 2), at(1, 0), PortalMeans.LIFT, "key: desk"))
     explanation = explain_route(house.at(Annotations((*LABELS, lift)), 0), at(0, 0), at(1, 1))
     assert "on floor 1, through lift 'east lift' to floor 2" in explanation.reason
@@ -134,7 +132,7 @@ def test_an_explanation_names_the_portal_and_the_floors(house) -> None:
     assert not blocked.legs and "blocked" in blocked.reason
 
 
-def test_a_portal_at_a_retired_node_is_named_where_it_is_missed(house) -> None:
+def test_a_portal_at_a_retired_node_is_named_where_it_is_missed(house):
     lift = said("east lift", Portal(at(0, 4), at(1, 4), PortalMeans.LIFT))
     annotations = Annotations((*LABELS, lift))
     retired = ManualConstraint(RetiredNodes((at(1, 4),)), True, "bob", 1, "a mirror")
@@ -151,7 +149,7 @@ def test_a_portal_at_a_retired_node_is_named_where_it_is_missed(house) -> None:
     )
 
 
-def test_a_door_is_a_way_within_one_part_that_a_robot_asks_to_be_taken_along(house) -> None:
+def test_a_door_is_a_way_within_one_part_that_a_robot_asks_to_be_taken_along(house):
     door = said("gate", Portal(at(0, 0), at(0, 8), PortalMeans.DOOR))
     router, around = house.at(Annotations((*LABELS, door)), 0), [(at(0, 0), at(0, 1)), (at(0, 0), at(0, 3))]
     through = router.route(at(0, 0), at(0, 8), around)
@@ -171,14 +169,14 @@ def test_a_door_is_a_way_within_one_part_that_a_robot_asks_to_be_taken_along(hou
         (Floor(at(1, 0), "1"), "map b.1 cannot be on floor 1: portal west is a lift"),
     ],
 )  # fmt: skip
-def test_portals_and_labels_that_contradict_each_other_are_refused(house, body: Body, words: str) -> None:
+def test_portals_and_labels_that_contradict_each_other_are_refused(house, body: Body, words: str):
     record = Annotations((*LABELS[:2], said("west", Portal(at(0, 3), at(1, 4), PortalMeans.LIFT))))
     name = str(body.node.map) if isinstance(body, Floor) else "east"
     with pytest.raises(InvalidValue, match=words):
         check_annotation(house.merged, record, said(name, body), ManualConstraints())
 
 
-def test_a_door_is_refused_where_the_map_has_its_sides_far_apart() -> None:
+def test_a_door_is_refused_where_the_map_has_its_sides_far_apart():
     """A corridor of 12 m: within one component the map says how far two nodes are from each other."""
     merger, which = Merger(), MapId("a", 1)
     nodes = [place_node(at(0, n), (float(n), 0.0)) for n in range(13)]
@@ -202,7 +200,7 @@ def test_a_door_is_refused_where_the_map_has_its_sides_far_apart() -> None:
         check(12, PortalMeans.LIFT)
 
 
-def test_a_portal_goes_and_comes_again_and_bad_ones_are_no_values(house) -> None:
+def test_a_portal_goes_and_comes_again_and_bad_ones_are_no_values(house):
     lift = said("lift", Portal(at(0, 3), at(1, 4), PortalMeans.LIFT))
     gone = replace(lift, removed=True)
     check_annotation(house.merged, Annotations((*LABELS, lift)), gone, ManualConstraints())

@@ -1,7 +1,5 @@
 """Merged poses are published to agents: those that moved noticeably, and all on request."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -91,7 +89,7 @@ def zenoh() -> Iterator[ZenohFleet]:
     fleet.close()
 
 
-def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) -> None:
+def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet):
     result = Received(memory)
     (first,) = result.tell(graph(A))
     assert set(first.placed) == set(A) and first.after == 0 and first.sequence == 1
@@ -104,14 +102,14 @@ def test_small_motions_are_not_published_until_they_add_up(memory: MemoryFleet) 
     assert turned.placed[A[2]].merged_from_node.vector == pytest.approx([2.12, 0, math.radians(1.1)])
 
 
-def test_a_map_beyond_the_range_of_messages_costs_no_other_its_poses(memory: MemoryFleet) -> None:
+def test_a_map_beyond_the_range_of_messages_costs_no_other_its_poses(memory: MemoryFleet):
     """Though its robot comes before the other in the alphabet."""
     result, far = Received(memory), NodeId("a0", 1, 1)
     (news,) = result.tell(graph([far], 2e6), graph(A))
     assert set(news.placed) == set(A)
 
 
-def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> None:
+def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet):
     result = Received(memory)
     result.tell(graph(A), graph(B))
     one = graph(A)
@@ -125,7 +123,7 @@ def test_only_moved_nodes_are_published_to_their_agents(memory: MemoryFleet) -> 
     assert {place.frame for place in PoseNews.decode(reply.payload, "r1").placed.values()} == {A[0]}
 
 
-def test_removed_nodes_are_published(memory: MemoryFleet) -> None:
+def test_removed_nodes_are_published(memory: MemoryFleet):
     result = Received(memory)
     result.tell(graph(A))
     (news,) = result.tell(graph(A[:-1]))
@@ -135,7 +133,7 @@ def test_removed_nodes_are_published(memory: MemoryFleet) -> None:
     assert set(whole.placed) == set(A[:-1]) and whole.after == 0 and whole.sequence == 2
 
 
-def test_much_is_published_in_pieces_and_rarely(memory: MemoryFleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_much_is_published_in_pieces_and_rarely(memory: MemoryFleet, monkeypatch):
     monkeypatch.setattr(pose_broadcast, "MOST", 2)
     result = Received(memory)
     pieces = result.tell(graph(A))
@@ -160,7 +158,7 @@ def at(poses: MergedPoses, node: NodeId, x: float) -> Callable[[], bool]:
     return there
 
 
-def test_lost_changes_are_pulled_over_zenoh(zenoh: ZenohFleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lost_changes_are_pulled_over_zenoh(zenoh: ZenohFleet, monkeypatch):
     """A late agent, lost news, lost last news, a server that starts again, and one that knows less."""
     monkeypatch.setattr(pose_broadcast, "EVERY", 0.0)
     monkeypatch.setattr(pose_broadcast, "BEAT", 0.0)
@@ -199,9 +197,7 @@ def test_lost_changes_are_pulled_over_zenoh(zenoh: ZenohFleet, monkeypatch: pyte
     broadcast.close()
 
 
-def test_a_map_server_reports_its_merged_map(
-    zenoh: ZenohFleet, mapped_room: Callable[[], MappedRoom]
-) -> None:
+def test_a_map_server_reports_its_merged_map(zenoh: ZenohFleet, mapped_room: Callable[[], MappedRoom]):
     """From the store on the disk to an agent in another session, twice: the server starts again."""
     room = mapped_room()
     poses = kept(zenoh.join())

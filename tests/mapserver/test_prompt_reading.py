@@ -1,7 +1,5 @@
 """A store that does not answer holds up no one who asks how the server is."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator
@@ -20,8 +18,8 @@ def fleet(tmp_path: Path) -> Iterator[Fleet]:
 
 
 def test_the_status_of_a_server_whose_store_does_not_answer_is_given_and_names_that(
-    fleet: Fleet, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    fleet: Fleet, monkeypatch
+):
     before = fleet.server.status()
     assert before["event"] == ""
     answers = threading.Event()

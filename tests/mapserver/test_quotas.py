@@ -1,7 +1,5 @@
 """A robot that asks without end: it is refused, others are answered, and people see whose fault it is."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator
 
@@ -30,7 +28,7 @@ def house(mapped_room) -> Iterator[House]:
     house.close()
 
 
-def test_a_robot_asks_at_its_rate_in_the_long_run() -> None:
+def test_a_robot_asks_at_its_rate_in_the_long_run():
     bucket, allowed = TokenBucket(5.0, 0.0), 0
     for tick in range(10_000):
         now = tick * 0.01
@@ -42,9 +40,7 @@ def test_a_robot_asks_at_its_rate_in_the_long_run() -> None:
     assert bucket.wait(1.0, 100.0) == pytest.approx(10.2, abs=0.21), "a debt is waited for"
 
 
-def test_a_robot_that_asks_too_much_is_refused_and_shown_and_others_are_answered(
-    house: House, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_robot_that_asks_too_much_is_refused_and_shown_and_others_are_answered(house: House, caplog):
     asker, key = house.bus(), KEYS.any_known()
     around = encode(KnownRequest(ROBOT, 0.0, 0.0, 9.0))
     most = round(BURST * QuotaSettings().questions)
@@ -62,7 +58,7 @@ def test_a_robot_that_asks_too_much_is_refused_and_shown_and_others_are_answered
     assert lines[0] == "r7 is over its quota: 1 question held back so far" and len(lines) < 12
 
 
-def test_a_robot_reserves_and_says_where_it_is_for_itself_alone(house: House) -> None:
+def test_a_robot_reserves_and_says_where_it_is_for_itself_alone(house: House):
     asker = house.bus()
     start = NodeId(*ROBOT, 1)
     for_r8 = encode(ReserveRequest("r8", start, Pose2(), ()))
@@ -75,13 +71,13 @@ def test_a_robot_reserves_and_says_where_it_is_for_itself_alone(house: House) ->
     assert not asker.ask(sent_by(KEYS.any_nearby(), "r8"), about_r8, 20.0)[0].error
 
 
-def test_a_robot_is_localized_in_its_own_name(house: House) -> None:
+def test_a_robot_is_localized_in_its_own_name(house: House):
     view = encode_view(house.mapped.view(min(house.mapped.truth)))
     (reply,) = house.bus().ask(sent_by(KEYS.any_relocalize(), "r8"), view, 20.0)
     assert not reply.error
 
 
-def test_one_question_of_a_robot_is_open_at_a_time() -> None:
+def test_one_question_of_a_robot_is_open_at_a_time():
     admission = AdmissionControl(AdmissionSettings(1), executor=LockstepSchedule().executor(1))
 
     def ask_again() -> float:
@@ -94,7 +90,7 @@ def test_one_question_of_a_robot_is_open_at_a_time() -> None:
     assert admission.submit(lambda: "again", 1, asker="r7").result() == "again"
 
 
-def test_changes_of_a_robot_wait_behind_its_own_to_be_merged(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_changes_of_a_robot_wait_behind_its_own_to_be_merged(monkeypatch):
     schedule, order = LockstepSchedule(), []
     worker = MergeWorker(schedule)
     monkeypatch.setattr(worker._merger, "on_change", lambda change: order.append(change.map.agent))
@@ -107,7 +103,7 @@ def test_changes_of_a_robot_wait_behind_its_own_to_be_merged(monkeypatch: pytest
     assert order[:4] == ["r7", "r8", "r7", "r8"] and len(order) == 52
 
 
-def test_names_without_end_are_forgotten(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_without_end_are_forgotten(monkeypatch):
     monkeypatch.setattr("mapweave.mapserver.quotas.MOST_ROBOTS", 10)
     quotas = Quotas(clock=lambda: 0.0)
     for number in range(100):

@@ -1,7 +1,5 @@
 """One robot at a time where two cannot pass: leases by the ground that robots cover."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -57,7 +55,7 @@ class Traffic:
         return self.reservations.ask(request, self.router, self.now)
 
 
-def test_the_way_of_a_lone_robot_is_free_as_far_as_it_may_hold_it(router: Router) -> None:
+def test_the_way_of_a_lone_robot_is_free_as_far_as_it_may_hold_it(router: Router):
     traffic = Traffic(router)
     assert traffic.ask("r0", 0, 1, 2, 3, 4) == ReserveAnswer(4, "", None, "")
     assert AHEAD == 10.0
@@ -65,7 +63,7 @@ def test_the_way_of_a_lone_robot_is_free_as_far_as_it_may_hold_it(router: Router
     assert 8 <= long.granted < 13 and long.holder == "", "it holds no more than the next 10 m"
 
 
-def test_the_ways_of_robots_are_known_while_they_drive(router: Router) -> None:
+def test_the_ways_of_robots_are_known_while_they_drive(router: Router):
     traffic = Traffic(router)
     traffic.ask("r0", 0, 1, 2, 3, 4)
     traffic.ask("r1", 12, 13, 14)
@@ -77,7 +75,7 @@ def test_the_ways_of_robots_are_known_while_they_drive(router: Router) -> None:
     assert traffic.reservations.ways(1.0) == {"r0": way}
 
 
-def test_a_way_that_no_robot_drives_takes_no_time_and_holds_nothing(router: Router) -> None:
+def test_a_way_that_no_robot_drives_takes_no_time_and_holds_nothing(router: Router):
     """A robot may say that it is a thousand kilometres away, or that it drives to and fro without end."""
     traffic = Traffic(router)
     for ask in (
@@ -98,7 +96,7 @@ def test_a_way_that_no_robot_drives_takes_no_time_and_holds_nothing(router: Rout
     assert traffic.reservations.room_for("r0", node(2), Pose2(1e6, 0.0, 0.0), router, traffic.now) is None
 
 
-def test_no_robot_holds_a_leg_of_any_length(router: Router) -> None:
+def test_no_robot_holds_a_leg_of_any_length(router: Router):
     """Of a first leg of 900 m, straight through the corridor, it held all: no other robot drove any more."""
     for begin in (-900.0, 20.0):
         traffic = Traffic(router)
@@ -125,7 +123,7 @@ def two_robots(joined: bool) -> Router:
     return Router(merger.merged())
 
 
-def test_a_robot_is_as_large_as_it_says_itself_and_as_no_other_says() -> None:
+def test_a_robot_is_as_large_as_it_says_itself_and_as_no_other_says():
     """A node on its way is of a robot of 5 m: it was taken for as large, and waited for one 3 m ahead."""
     router, nearby = two_robots(joined=True), Nearby()
     here, near, far = NodeId("r0", 1, 0), NodeId("r9", 1, 0), NodeId("r9", 1, 1)
@@ -140,7 +138,7 @@ def test_a_robot_is_as_large_as_it_says_itself_and_as_no_other_says() -> None:
     assert reservations.ask(way, router, 0.0).granted == 2
 
 
-def test_nothing_is_held_on_a_way_through_another_part_of_the_map() -> None:
+def test_nothing_is_held_on_a_way_through_another_part_of_the_map():
     """Poses of nodes that are not joined are in different frames."""
     router = two_robots(joined=False)
     reservations = Reservations(Nearby().standing)
@@ -150,7 +148,7 @@ def test_nothing_is_held_on_a_way_through_another_part_of_the_map() -> None:
     assert reservations.ways(0.0) == {}
 
 
-def test_who_comes_second_waits_until_the_first_has_passed(router: Router) -> None:
+def test_who_comes_second_waits_until_the_first_has_passed(router: Router):
     """The first drives 2 to 6; the second comes from the niche, and behind it."""
     traffic = Traffic(router)
     assert traffic.ask("r0", 2, 3, 4, 5, 6).granted == 4
@@ -163,13 +161,13 @@ def test_who_comes_second_waits_until_the_first_has_passed(router: Router) -> No
     assert traffic.ask("r2", 1, 2, 3, 4, 5).granted == 2, "now the other one holds the crossing"
 
 
-def test_beside_each_other_is_room_for_both(router: Router) -> None:
+def test_beside_each_other_is_room_for_both(router: Router):
     traffic = Traffic(router)
     assert traffic.ask("r0", 0, 1, 2, 3).granted == 3
     assert traffic.ask("r1", 13, 12, 11, 10) == ReserveAnswer(3, "", None, "")
 
 
-def test_a_robot_that_died_releases_its_way(router: Router) -> None:
+def test_a_robot_that_died_releases_its_way(router: Router):
     traffic = Traffic(router)
     traffic.ask("r0", 3, 4, 5)
     assert traffic.ask("r1", 6, 5, 4).granted == 0
@@ -179,14 +177,14 @@ def test_a_robot_that_died_releases_its_way(router: Router) -> None:
     assert traffic.ask("r1", 6, 5, 4) == ReserveAnswer(2, "", None, "")
 
 
-def test_a_robot_that_has_arrived_releases_its_way(router: Router) -> None:
+def test_a_robot_that_has_arrived_releases_its_way(router: Router):
     traffic = Traffic(router)
     traffic.ask("r0", 3, 4, 5)
     traffic.reservations.ask(ReserveRequest("r0", node(5), Pose2(), ()), router, 0.0)
     assert traffic.ask("r1", 6, 5, 4).granted == 2
 
 
-def test_of_two_head_on_the_later_one_steps_aside_into_the_niche(router: Router) -> None:
+def test_of_two_head_on_the_later_one_steps_aside_into_the_niche(router: Router):
     traffic = Traffic(router)
     traffic.ask("r0", 1, 2, 3, 4)
     traffic.ask("r1", 7, 6, 5)
@@ -206,7 +204,7 @@ def test_of_two_head_on_the_later_one_steps_aside_into_the_niche(router: Router)
     assert (waits.granted, waits.holder, waits.aside) == (0, "r0", None), "and the second waits there"
 
 
-def test_the_robot_with_the_shorter_way_aside_steps_aside(router: Router) -> None:
+def test_the_robot_with_the_shorter_way_aside_steps_aside(router: Router):
     """It set out first, yet stands beside the niche; the other would have to go back by the hall."""
     traffic = Traffic(router)
     traffic.ask("r0", 4, 5, 6, 7, off=0.3)
@@ -218,7 +216,7 @@ def test_the_robot_with_the_shorter_way_aside_steps_aside(router: Router) -> Non
     assert (beside.granted, beside.holder, beside.aside) == (0, "r1", node(9))
 
 
-def test_a_robot_does_not_step_aside_to_where_the_other_will_box_it_in(router: Router) -> None:
+def test_a_robot_does_not_step_aside_to_where_the_other_will_box_it_in(router: Router):
     """r1 wants to node 1. Node 0 behind that is nearer to r0 than the niche, and a dead end."""
     traffic = Traffic(router)
     for _ in range(3):
@@ -227,7 +225,7 @@ def test_a_robot_does_not_step_aside_to_where_the_other_will_box_it_in(router: R
     assert waits.aside == node(9)
 
 
-def test_no_robot_steps_aside_to_where_a_third_one_waits(router: Router) -> None:
+def test_no_robot_steps_aside_to_where_a_third_one_waits(router: Router):
     """Two head-on; the niche is nearest, and taken. Both waited for ever, since neither could have it."""
     traffic = Traffic(router)
     traffic.ask("r2", 9, 4, 5)
@@ -241,7 +239,7 @@ def test_no_robot_steps_aside_to_where_a_third_one_waits(router: Router) -> None
     assert second.aside == node(8), "the end of the corridor behind it, past where the first one wants to"
 
 
-def test_robots_side_by_side_may_part(router: Router) -> None:
+def test_robots_side_by_side_may_part(router: Router):
     """They stand nearer to each other than two robots ever pass: away from each other both may drive."""
     traffic = Traffic(router)
     assert traffic.ask("r0", 4, 5, 6, off=0.2).granted == 2
@@ -249,7 +247,7 @@ def test_robots_side_by_side_may_part(router: Router) -> None:
     assert traffic.ask("r1", 4, 3, 2, off=-0.2).granted == 2
 
 
-def test_who_has_parked_holds_its_place_but_not_the_way_past_it(router: Router) -> None:
+def test_who_has_parked_holds_its_place_but_not_the_way_past_it(router: Router):
     """At 4, on no way: others drive by, but do not get to where it stands."""
     traffic = Traffic(router)
     parked = NearbyRequest("r9", ((node(4), Pose2(0.1)),), 0.01, 0.01, 0.16, 0.3, 0.3)
@@ -265,7 +263,7 @@ def test_who_has_parked_holds_its_place_but_not_the_way_past_it(router: Router) 
     assert traffic.ask("r0", 2, 3, 4) == ReserveAnswer(2, "", None, ""), "it is silent for 16 s"
 
 
-def test_who_has_parked_in_a_way_is_sent_to_the_nearest_node_off_it(router: Router) -> None:
+def test_who_has_parked_in_a_way_is_sent_to_the_nearest_node_off_it(router: Router):
     """At 5 in the corridor, which another one drives along to its end: into the niche."""
     for goal, room in ((8, 9), (5, None), (3, None)):
         traffic = Traffic(router)
@@ -285,7 +283,7 @@ def test_who_has_parked_in_a_way_is_sent_to_the_nearest_node_off_it(router: Rout
         assert aside("r9") is None, "who wanted to pass is gone"
 
 
-def test_of_what_is_not_on_the_map_nothing_is_held(router: Router) -> None:
+def test_of_what_is_not_on_the_map_nothing_is_held(router: Router):
     traffic = Traffic(router)
     assert traffic.ask("r0", 98, 99).granted == 1
     assert traffic.ask("r1", 0, 99).granted == 1
@@ -299,7 +297,7 @@ robots = st.sampled_from(["r0", "r1", "r2"])
 @given(st.lists(st.tuples(robots, st.integers(0, 8), st.integers(0, 3)), max_size=20))
 def test_robots_that_drive_no_further_than_granted_never_meet(
     router: Router, drives: list[tuple[str, int, int]]
-) -> None:
+):
     """By brute force: any robot, to any goal, as far as it likes of what it is granted, in any order."""
     traffic, at, held = Traffic(router), {"r0": 0, "r1": 4, "r2": 8}, dict[str, range]()
     for robot, start in at.items():

@@ -1,7 +1,5 @@
 """How many statuses a server asks of its robots: as many together, however many they are."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from contextlib import closing
 from dataclasses import replace
@@ -71,7 +69,7 @@ def listening(hub: MemoryHub) -> Iterator[Listening]:
 )
 def test_the_period_of_statuses_grows_with_the_number_of_robots(
     listening: Listening, robots: int, period: float
-) -> None:
+):
     roster = listening.roster
     tokens = listening.come(MapId(f"r{k}", 1) for k in range(robots))
     eventually(lambda: roster.status_period() == period and roster.alive("r0") is bool(robots))
@@ -80,7 +78,7 @@ def test_the_period_of_statuses_grows_with_the_number_of_robots(
     eventually(lambda: roster.status_period() == 0.0)
 
 
-def test_robots_that_begin_together_report_apart_after_two_periods(listening: Listening) -> None:
+def test_robots_that_begin_together_report_apart_after_two_periods(listening: Listening):
     """In step, 1000 robots filled two cores for half a second, five times in 12.5 s."""
     listening.come(MapId(f"r{k}", 1) for k in range(1000))
     eventually(lambda: listening.roster.status_period() == 2.5)
@@ -92,7 +90,7 @@ def test_robots_that_begin_together_report_apart_after_two_periods(listening: Li
         assert np.count_nonzero((times >= begin) & (times < begin + 0.5)) < 2 * 0.5 * rate
 
 
-def test_a_robot_that_reports_far_too_often_is_reminded(listening: Listening) -> None:
+def test_a_robot_that_reports_far_too_often_is_reminded(listening: Listening):
     roster, reminded = listening.roster, list[MapId]()
     roster.remind = reminded.append
 
@@ -123,9 +121,7 @@ def test_a_robot_that_reports_far_too_often_is_reminded(listening: Listening) ->
 
 
 @pytest.mark.parametrize("comes_first", [False, True])
-def test_a_robot_that_makes_no_node_hears_how_rarely_to_report(
-    hub: MemoryHub, tmp_path: Path, comes_first: bool
-) -> None:
+def test_a_robot_that_makes_no_node_hears_how_rarely_to_report(hub: MemoryHub, tmp_path, comes_first: bool):
     """It is acknowledged nothing new: 1000 such robots sent 2000 statuses a second."""
     bus = MemoryBus(hub)
     with MapServer(bus, KEYS, tmp_path / "s0.sqlite", "s0"):
@@ -162,7 +158,7 @@ def test_a_robot_that_makes_no_node_hears_how_rarely_to_report(
             replicator.close()
 
 
-def test_a_robot_that_reports_as_rarely_as_it_may_is_not_called_silent() -> None:
+def test_a_robot_that_reports_as_rarely_as_it_may_is_not_called_silent():
     """It looks every half second whether a status is due. The page has the same limit as the command."""
     assert SILENT > LONGEST_STATUS_PERIOD + 0.5
     page = Path(http.__file__).parent / "static" / "robot_panel.js"
@@ -170,7 +166,7 @@ def test_a_robot_that_reports_as_rarely_as_it_may_is_not_called_silent() -> None
 
 
 @pytest.mark.slow
-def test_one_answer_holds_all_robots_whatever_they_do() -> None:
+def test_one_answer_holds_all_robots_whatever_they_do():
     node = NodeId("r0", 1, 3)
     wait = PortalWait(PortalStop("lift", PortalMeans.LIFT, node, node._replace(number=4)))
     order = MissionOrder("m", "r0", MissionKind.GO, 1, "anna", node, "kitchen", MAX_VIA * (node,))
@@ -184,7 +180,7 @@ def test_one_answer_holds_all_robots_whatever_they_do() -> None:
     assert decode(encode(FleetStatus(entries)), FleetStatus).robots == entries
 
 
-def test_a_robot_that_is_alive_under_many_maps_is_named_and_harms_itself_alone(listening: Listening) -> None:
+def test_a_robot_that_is_alive_under_many_maps_is_named_and_harms_itself_alone(listening: Listening):
     roster, quotas = listening.roster, listening.quotas
     tokens = listening.come(MapId("r3", epoch) for epoch in range(40))
     listening.come([MapId("r1", 1)])

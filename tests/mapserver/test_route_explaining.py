@@ -1,7 +1,5 @@
 """Why a route leads so, and what is missing where there is none, against every way there could be."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -86,7 +84,7 @@ def least_gaps(router: Router, start: NodeId, goal: NodeId) -> int:
     )
 
 
-def test_a_way_that_no_robot_has_driven_is_explained_as_it_is_given(router: Router) -> None:
+def test_a_way_that_no_robot_has_driven_is_explained_as_it_is_given(router: Router):
     start, goal = nodes_of(ME)[0], nodes_of(OTHER)[2]
     explanation, answer = explain_route(router, start, goal), router.route(start, goal)
     assert explanation.found
@@ -96,7 +94,7 @@ def test_a_way_that_no_robot_has_driven_is_explained_as_it_is_given(router: Rout
     assert words.startswith("ties poses, not driven: ")
 
 
-def test_edges_that_only_constrain_poses_are_named_with_what_they_lack(apart: Router) -> None:
+def test_edges_that_only_constrain_poses_are_named_with_what_they_lack(apart: Router):
     router, start, goal = apart, nodes_of(ME)[0], nodes_of(OTHER)[2]
     explanation = explain_route(router, start, goal)
     assert not explanation.found and not explanation.hops and explanation.apart is None
@@ -112,7 +110,7 @@ def test_edges_that_only_constrain_poses_are_named_with_what_they_lack(apart: Ro
     assert "there is no way" in words[0] and "what is missing" in words[1] and gap.words in words[2]
 
 
-def test_the_explained_route_is_the_one_that_robots_get(router: Router) -> None:
+def test_the_explained_route_is_the_one_that_robots_get(router: Router):
     start, goal = nodes_of(ME)[0], nodes_of(ME)[2]
     explanation = explain_route(router, start, goal)
     legs = router.route(start, goal).legs
@@ -124,7 +122,7 @@ def test_the_explained_route_is_the_one_that_robots_get(router: Router) -> None:
     assert f"cost {sum(hop.cost for hop in explanation.hops):.2f} m" in explanation.reason
 
 
-def test_blocked_edges_are_explained_with_and_without_another_way(router: Router) -> None:
+def test_blocked_edges_are_explained_with_and_without_another_way(router: Router):
     one, two, three = nodes_of(ME)
     explanation = explain_route(router, one, three, blocked=[(two, one)])
     legs = router.route(one, three, blocked=[(two, one)]).legs
@@ -136,7 +134,7 @@ def test_blocked_edges_are_explained_with_and_without_another_way(router: Router
     assert "is blocked" in explanation.reason and "reported as blocked" in explanation.gaps[0].words
 
 
-def test_recently_blocked_edges_are_reported(router: Router) -> None:
+def test_recently_blocked_edges_are_reported(router: Router):
     one, two, _ = nodes_of(ME)
     free, wary = explain_route(router, one, two), explain_route(router, one, two, wary=[(one, two)])
     if [hop.b for hop in wary.hops] == [two]:
@@ -147,7 +145,7 @@ def test_recently_blocked_edges_are_reported(router: Router) -> None:
     assert wary.gaps, "the way that would be cheaper is reported"
 
 
-def test_unconnected_maps_are_explained_instead_of_a_route(router: Router, sent: bool) -> None:
+def test_unconnected_maps_are_explained_instead_of_a_route(router: Router, sent: bool):
     explanation = explain_route(router, nodes_of(ME)[0], nodes_of(FAR)[0])
     if sent:
         explanation = decode(encode(explanation), RouteExplanation)
@@ -158,7 +156,7 @@ def test_unconnected_maps_are_explained_instead_of_a_route(router: Router, sent:
     assert json_values(explanation)["apart"]["second"] == "c.1"
 
 
-def test_pieces_of_one_map_are_not_joined_as_maps() -> None:
+def test_pieces_of_one_map_are_not_joined_as_maps():
     """A robot that was carried from room to room: nothing in its own map says where the second one is."""
     rng, merger = np.random.default_rng(3), Merger()
     for number, first in ((0, 1), (1, 101)):
@@ -186,7 +184,7 @@ def renumbered(change: NodePut | EdgePut, more: int) -> NodePut | EdgePut:
     return EdgePut(replace(edge, id=later(edge.id), a=later(edge.a), b=later(edge.b)))
 
 
-def test_a_retired_map_is_explained_with_the_persons_name() -> None:
+def test_a_retired_map_is_explained_with_the_persons_name():
     merger = fleet()
     merger.constrain(
         ManualConstraints([ManualConstraint(RetiredMap(OTHER), True, "anna", 10**18, "burnt down")])
@@ -195,7 +193,7 @@ def test_a_retired_map_is_explained_with_the_persons_name() -> None:
     assert not explanation.found and "anna" in explanation.reason and "burnt down" in explanation.reason
 
 
-def test_unknown_ids_are_refused_with_the_known_range(router: Router) -> None:
+def test_unknown_ids_are_refused_with_the_known_range(router: Router):
     with pytest.raises(InvalidValue, match=r"map a\.1 has no node 9; of its 3 nodes the nearest are 1, 3, 5"):
         explain_route(router, nodes_of(ME)[0], NodeId(*ME, 9))
     with pytest.raises(InvalidValue, match=r"there is no map z\.1"):
@@ -205,7 +203,7 @@ def test_unknown_ids_are_refused_with_the_known_range(router: Router) -> None:
     assert explain_route(router, *nodes_of(ME)[:1] * 2).found
 
 
-def test_questions_and_answers_come_through_the_wire(router: Router) -> None:
+def test_questions_and_answers_come_through_the_wire(router: Router):
     one, two, three = nodes_of(ME)
     request = ExplainRequest((one, three), True, ((one, two), (two, three)))
     assert decode(encode(request), ExplainRequest) == request

@@ -1,7 +1,5 @@
 """Closures and preferences on a grid of corridors, against another search on another graph."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -76,7 +74,7 @@ factors = st.sampled_from([0.2, 0.5, 3.0, 10.0])
     st.lists(boxes, max_size=2), st.lists(steps, max_size=4),
     st.lists(st.tuples(boxes | steps, factors), max_size=3), st.data(),
 )  # fmt: skip
-def test_routes_are_the_cheapest_without_what_is_closed(grid, areas, edges, preferred, data) -> None:
+def test_routes_are_the_cheapest_without_what_is_closed(grid, areas, edges, preferred, data):
     start, goal = (at(*data.draw(st.tuples(*[st.integers(0, SIZE - 1)] * 2))) for _ in range(2))
     entries = [said(f"c{k}", Closure(None, rectangle(*box))) for k, box in enumerate(areas)]
     entries += [said(f"e{k}", Closure(step)) for k, step in enumerate(edges)]
@@ -119,7 +117,7 @@ def nodes_of(router: Router, start: NodeId, goal: NodeId, **more: object) -> lis
     return [leg.node.id for leg in router.route(start, goal, **more).legs]  # type: ignore[arg-type]
 
 
-def test_a_closure_holds_between_its_times_alone(grid) -> None:
+def test_a_closure_holds_between_its_times_alone(grid):
     record = law(said("door", Closure((at(1, 0), at(2, 0)), None, 2 * HOUR, 3 * HOUR)))
     straight = [at(x, 0) for x in range(SIZE)]
     assert nodes_of(grid.at(record, HOUR), at(0, 0), at(4, 0)) == straight
@@ -129,7 +127,7 @@ def test_a_closure_holds_between_its_times_alone(grid) -> None:
     assert nodes_of(grid.at(withdrawn, 2 * HOUR), at(0, 0), at(4, 0)) == straight
 
 
-def test_an_explanation_names_who_closed_the_way_until_when_and_the_detour(grid) -> None:
+def test_an_explanation_names_who_closed_the_way_until_when_and_the_detour(grid):
     router = grid.at(law(said("door", Closure((at(1, 0), at(2, 0)), None, None, 4 * HOUR))), 0)
     explanation = explain_route(router, at(0, 0), at(4, 0))
     assert explanation.found and len(explanation.hops) == 6
@@ -146,7 +144,7 @@ def test_an_explanation_names_who_closed_the_way_until_when_and_the_detour(grid)
         node_of_goal(str(at(4, 0)), MAP, PlaceResolver(grid.at(inside, 0), inside))
 
 
-def test_an_explanation_names_who_prefers_a_way(grid) -> None:
+def test_an_explanation_names_who_prefers_a_way(grid):
     row = Preference(0.2, None, rectangle(-0.5, 0.5, 4.5, 1.5))
     explanation = explain_route(grid.at(law(said("row", row)), 0), at(0, 0), at(4, 0))
     preferred = 'row is preferred by anna (cost times 0.2): "wet floor"'
@@ -156,7 +154,7 @@ def test_an_explanation_names_who_prefers_a_way(grid) -> None:
     assert f"cost {total:.2f} m" in explanation.reason
 
 
-def test_a_way_that_is_avoided_is_named_and_no_detour_is_said_where_the_other_is_no_longer(grid) -> None:
+def test_a_way_that_is_avoided_is_named_and_no_detour_is_said_where_the_other_is_no_longer(grid):
     """Rules act on the cost, a detour is one in metres: of two ways of one length neither is one."""
     here, there = at(0, 0), at(1, 1)
     first = explain_route(grid, here, there).hops[0].b
@@ -186,7 +184,7 @@ def test_a_way_that_is_avoided_is_named_and_no_detour_is_said_where_the_other_is
 
 
 @pytest.mark.parametrize("factor", [0.5, 4.0])
-def test_an_edge_has_its_factor_once(grid, factor: float) -> None:
+def test_an_edge_has_its_factor_once(grid, factor: float):
     """It crosses its own barrier, as parallel edges of other robots do."""
     pair = at(1, 0), at(2, 0)
     rules = grid.at(law(said("mat", Preference(factor, pair))), 0).rules
@@ -197,7 +195,7 @@ def test_an_edge_has_its_factor_once(grid, factor: float) -> None:
     assert [entry.name for entry in closed[frozenset(pair)]] == ["door"]
 
 
-def test_a_route_that_begins_in_a_closed_area_says_so(grid) -> None:
+def test_a_route_that_begins_in_a_closed_area_says_so(grid):
     entry = said("kitchen", Closure(None, rectangle(-0.5, -0.5, 1.5, 4.5)))
     explanation = explain_route(grid.at(law(entry), 0), at(0, 0), at(4, 0))
     assert explanation.found and explanation.reason.endswith(
@@ -210,7 +208,7 @@ def test_a_route_that_begins_in_a_closed_area_says_so(grid) -> None:
     assert "kitchen" not in outside.reason and "kitchen" not in outside.hops[0].words
 
 
-def test_ways_that_are_no_edges_are_not_closed_or_preferred(grid) -> None:
+def test_ways_that_are_no_edges_are_not_closed_or_preferred(grid):
     """A barrier between nodes that nothing joins would hold for the ways of others between the two."""
     wrong = said("door", Closure((at(0, 0), at(4, 0))))
     with pytest.raises(InvalidValue, match=r"no edge joins a.1.1 and a.1.5 \(a.1.1 has edges to nodes a.1.2"):
@@ -227,7 +225,7 @@ def test_ways_that_are_no_edges_are_not_closed_or_preferred(grid) -> None:
     check_edge(grid, law(door), said("shut", Closure((at(4, 0), at(0, 0)))))
 
 
-def test_a_robot_in_an_area_that_is_closed_may_leave_it(grid) -> None:
+def test_a_robot_in_an_area_that_is_closed_may_leave_it(grid):
     router = grid.at(law(said("middle", Closure(None, rectangle(0.6, 0.6, 3.4, 3.4)))), 0)
     way = nodes_of(router, at(2, 2), at(2, 4), start_from_robot=Pose2())
     assert way in ([at(2, 3), at(2, 4)], [at(2, 2), at(2, 3), at(2, 4)])
@@ -235,7 +233,7 @@ def test_a_robot_in_an_area_that_is_closed_may_leave_it(grid) -> None:
     assert not router.route(at(2, 2), at(2, 1)).legs, "but not to another node within"
 
 
-def test_parallel_corridor_edges_of_another_robot_are_closed_too(grid) -> None:
+def test_parallel_corridor_edges_of_another_robot_are_closed_too(grid):
     """A closed edge is a barrier: an edge that crosses it, of any robot, is closed; one beside it is not."""
     rules = grid.at(law(said("door", Closure((at(1, 1), at(3, 1))))), 0).rules
     assert rules.closed.keys() == {frozenset((at(1, 1), at(3, 1)))} | {

@@ -1,7 +1,5 @@
 """Where a route begins for a robot that stands between nodes."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -46,20 +44,18 @@ def begin(row: tuple[Router, list[NodeId]], x: float, y: float, goal: int, **arg
 
 
 @pytest.mark.parametrize("x", [0.25, 0.4, 0.7])
-def test_a_robot_on_an_edge_goes_on_and_not_back_to_its_beginning(
-    row: tuple[Router, list[NodeId]], x: float
-) -> None:
+def test_a_robot_on_an_edge_goes_on_and_not_back_to_its_beginning(row: tuple[Router, list[NodeId]], x: float):
     assert begin(row, x, 0.1, goal=4) == 2
     assert begin(row, x, 0.1, goal=0) in (0, 1), "and the other way round"
 
 
-def test_away_from_the_edge_or_with_it_blocked_nothing_is_cheaper(row: tuple[Router, list[NodeId]]) -> None:
+def test_away_from_the_edge_or_with_it_blocked_nothing_is_cheaper(row: tuple[Router, list[NodeId]]):
     nodes = row[1]
     assert begin(row, 0.1, 0.4, goal=4) == 1
     assert begin(row, 0.2, 0.0, goal=4, blocked=[(nodes[2], nodes[1])]) != 2
 
 
-def test_the_first_leg_leads_from_the_node_that_the_robot_knows(row: tuple[Router, list[NodeId]]) -> None:
+def test_the_first_leg_leads_from_the_node_that_the_robot_knows(row: tuple[Router, list[NodeId]]):
     router, nodes = row
     first = router.route(nodes[1], nodes[4], start_from_robot=Pose2(0.5, 0.0, 0.0)).legs[0]
     assert first.node.id == nodes[2]
@@ -75,7 +71,7 @@ class OutOfSight(ReachabilityCache):
         return replace(found, in_view=min(found.in_view, LEAST - 1))
 
 
-def test_a_link_that_the_servo_could_not_drive_ties_maps_and_leads_nowhere() -> None:
+def test_a_link_that_the_servo_could_not_drive_ties_maps_and_leads_nowhere():
     """Two robots see one wall from three metres apart; then a robot drives from one to the other."""
     rng = np.random.default_rng(1)
     world, other = room(0, 0, 9, 4, 1400, rng), MapId("b", 1)

@@ -1,10 +1,7 @@
 """Schedules: the same jobs in the same order, on threads or driven in lock-step."""
 
-from __future__ import annotations
-
 import threading
 import time
-from pathlib import Path
 
 import pytest
 
@@ -24,9 +21,7 @@ def ended(schedule: Schedule) -> None:
 
 
 @pytest.mark.parametrize("make", [LiveSchedule, LockstepSchedule])
-def test_posted_jobs_run_in_order_and_a_defect_in_one_ends_no_other(
-    make: type[Schedule], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_posted_jobs_run_in_order_and_a_defect_in_one_ends_no_other(make: type[Schedule], caplog):
     schedule, done = make(), list[int]()
 
     def fails() -> None:
@@ -42,9 +37,7 @@ def test_posted_jobs_run_in_order_and_a_defect_in_one_ends_no_other(
     assert "a background job failed" in caplog.text
 
 
-def test_closing_interrupts_a_long_job_at_its_next_pause_and_drops_what_waits(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_closing_interrupts_a_long_job_at_its_next_pause_and_drops_what_waits(caplog):
     schedule, began, undone = LiveSchedule(), threading.Event(), list[str]()
 
     def long_job() -> None:
@@ -62,7 +55,7 @@ def test_closing_interrupts_a_long_job_at_its_next_pause_and_drops_what_waits(
     assert caplog.text == "", "this is no defect"
 
 
-def test_closing_says_when_something_still_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_closing_says_when_something_still_runs(monkeypatch):
     monkeypatch.setattr("mapweave.mapserver.schedule.ENDING", 0.05)
     schedule, began, go = LiveSchedule(), threading.Event(), threading.Event()
 
@@ -79,7 +72,7 @@ def test_closing_says_when_something_still_runs(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize("make", [LiveSchedule, LockstepSchedule])
-def test_idle_work_goes_on_until_nothing_is_left(make: type[Schedule]) -> None:
+def test_idle_work_goes_on_until_nothing_is_left(make: type[Schedule]):
     schedule, left = make(), [5]
 
     def idle() -> float | None:
@@ -96,7 +89,7 @@ def test_idle_work_goes_on_until_nothing_is_left(make: type[Schedule]) -> None:
     ended(schedule)
 
 
-def test_idle_work_is_not_put_off_for_ever_by_jobs_that_keep_coming() -> None:
+def test_idle_work_is_not_put_off_for_ever_by_jobs_that_keep_coming():
     schedule, ran, stop = LiveSchedule(), threading.Event(), threading.Event()
     schedule.idle(ran.set)
     schedule.start()
@@ -114,7 +107,7 @@ def test_idle_work_is_not_put_off_for_ever_by_jobs_that_keep_coming() -> None:
     ended(schedule)
 
 
-def test_periodic_jobs_do_not_wait_for_long_ones() -> None:
+def test_periodic_jobs_do_not_wait_for_long_ones():
     schedule, beats, go = LiveSchedule(), list[float](), threading.Event()
     schedule.every(0.01, lambda: beats.append(schedule.monotonic()))
     schedule.start()
@@ -127,7 +120,7 @@ def test_periodic_jobs_do_not_wait_for_long_ones() -> None:
     assert len(beats) == count
 
 
-def test_in_lockstep_work_runs_on_demand_in_simulated_time() -> None:
+def test_in_lockstep_work_runs_on_demand_in_simulated_time():
     schedule, done = LockstepSchedule(), list[str]()
     schedule.every(1.0, lambda: done.append("beat"))
     schedule.start()
@@ -147,7 +140,7 @@ def test_in_lockstep_work_runs_on_demand_in_simulated_time() -> None:
     assert done == ["job", "beat"] and schedule.time_ns() == 1_900_000_000
 
 
-def test_in_lock_step_time_passes_while_nothing_is_mapped(tmp_path: Path) -> None:
+def test_in_lock_step_time_passes_while_nothing_is_mapped(tmp_path):
     """Leases of robots that only drive expire by it."""
     schedule, keys, hub = LockstepSchedule(), Keys("demo"), MemoryHub()
     status = AgentStatus(Status("driving", "", 3, 40, Pose2(), False), 7_000_000_000, "r0", 1)
@@ -159,7 +152,7 @@ def test_in_lock_step_time_passes_while_nothing_is_mapped(tmp_path: Path) -> Non
     bus.close()
 
 
-def test_the_background_gives_way_and_is_not_starved() -> None:
+def test_the_background_gives_way_and_is_not_starved():
     schedule, busy, done = LiveSchedule(), threading.Event(), list[float]()
     busy.set()
     schedule.give_way(busy.is_set)

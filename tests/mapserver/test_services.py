@@ -107,9 +107,7 @@ class Gate:
         monkeypatch.setattr(owner, name, held)
 
 
-def test_slow_questions_block_no_other_and_excess_is_refused(
-    served: Served, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_slow_questions_block_no_other_and_excess_is_refused(served: Served, monkeypatch):
     gate = Gate(monkeypatch, Relocalizer, "answer")
     with ThreadPoolExecutor(12) as askers:
         waiting = [askers.submit(served.where, None, seed) for seed in range(12)]
@@ -133,7 +131,7 @@ def test_slow_questions_block_no_other_and_excess_is_refused(
     assert served.server.status()["answered"] == 6
 
 
-def test_a_long_merge_holds_up_no_question(served: Served, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_merge_holds_up_no_question(served: Served, monkeypatch):
     gate = Gate(monkeypatch, Merger, "merged")
     served.server._worker._dirty = True
     settling = threading.Thread(target=served.server.settle, args=(20.0,))
@@ -146,7 +144,7 @@ def test_a_long_merge_holds_up_no_question(served: Served, monkeypatch: pytest.M
     settling.join(20)
 
 
-def test_every_node_is_found_by_many_at_once(served: Served) -> None:
+def test_every_node_is_found_by_many_at_once(served: Served):
     """The same questions one after the other and all at once have the same answers."""
     questions = [(node, seed) for node in served.nodes for seed in (1, 2)]
     alone = [served.where(*question).payload for question in questions]
@@ -162,16 +160,14 @@ def test_every_node_is_found_by_many_at_once(served: Served) -> None:
         assert true.distance(best.node_from_robot.mean) < 0.25
 
 
-def test_in_lockstep_questions_are_answered_in_sequence(mapped_room) -> None:
+def test_in_lockstep_questions_are_answered_in_sequence(mapped_room):
     with Served(mapped_room(), lockstep=True) as served, ThreadPoolExecutor(20) as askers:
         replies = [future.result(20) for future in [askers.submit(served.where) for _ in range(20)]]
     assert {reply.error for reply in replies} == {""}
     assert len({reply.payload for reply in replies}) == 1
 
 
-def test_errors_are_reported_and_cost_no_worker(
-    served: Served, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_errors_are_reported_and_cost_no_worker(served: Served, monkeypatch, caplog):
     (reply,) = served.asker.ask(KEYS.relocalize("s0"), b"garbage", 5.0)
     assert reply.error.startswith("view:")
     assert reply.retry_after == 0.0
@@ -187,9 +183,7 @@ def test_errors_are_reported_and_cost_no_worker(
     assert not served.where().error
 
 
-def test_a_merge_that_fails_is_logged_and_the_next_one_succeeds(
-    served: Served, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_merge_that_fails_is_logged_and_the_next_one_succeeds(served: Served, monkeypatch, caplog):
     def broken(self: Merger) -> MergedMap:
         raise ZeroDivisionError("a defect")
 
@@ -206,7 +200,7 @@ def test_a_merge_that_fails_is_logged_and_the_next_one_succeeds(
     assert not served.where().error
 
 
-def test_the_index_is_searched_while_it_grows(mapped_room) -> None:
+def test_the_index_is_searched_while_it_grows(mapped_room):
     """Against the same index without concurrent use."""
     room = mapped_room()
     rng = np.random.default_rng(9)
@@ -237,7 +231,7 @@ def test_the_index_is_searched_while_it_grows(mapped_room) -> None:
     assert {n for n, _ in index.query(view, 80)} == {n for n, _ in alone.query(view, 80)}
 
 
-def test_a_place_that_one_robot_could_not_pass_is_barred_for_it_and_dear_for_others(mapped_room) -> None:
+def test_a_place_that_one_robot_could_not_pass_is_barred_for_it_and_dear_for_others(mapped_room):
     """A robot stands there by its own word: once it has left, the place is free."""
     with Served(mapped_room(), lockstep=True) as served:
         roads = served.server._answers().router.roads

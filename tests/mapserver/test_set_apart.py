@@ -1,7 +1,5 @@
 """No map ends the fleet: what a robot may legally send, and what it may not, also over restarts."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator
@@ -181,7 +179,7 @@ def whereabouts(answers: list[RelocalizeAnswer]) -> list[tuple[object, ...]]:
 
 
 @pytest.mark.parametrize("name", list(attacks()))
-def test_three_changes_of_one_robot_end_nothing(name: str, tmp_path: Path) -> None:
+def test_three_changes_of_one_robot_end_nothing(name: str, tmp_path):
     path = tmp_path / "s0.sqlite"
     stored(path, sound_logs()).close()
     with serving(path) as fleet:
@@ -216,8 +214,8 @@ def fails_with(monkeypatch: pytest.MonkeyPatch, bad: MapId) -> None:
 
 
 def test_a_map_that_breaks_the_merge_is_set_apart_over_restarts_and_can_be_retired(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+    tmp_path, monkeypatch, caplog
+):
     path = tmp_path / "s0.sqlite"
     stored(path, sound_logs()).close()
     fails_with(monkeypatch, BAD)
@@ -252,9 +250,7 @@ def test_a_map_that_breaks_the_merge_is_set_apart_over_restarts_and_can_be_retir
         assert "there is no map x.9" in never.error
 
 
-def test_a_map_can_be_retired_when_nothing_can_be_merged(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_can_be_retired_when_nothing_can_be_merged(tmp_path, monkeypatch):
     path = tmp_path / "s0.sqlite"
     stored(path, {BAD: messages(BAD, [NodePut(node(1))])}).close()
 
@@ -333,7 +329,7 @@ def beside(tmp_path: Path) -> Iterator[Beside]:
 
 
 @pytest.mark.slow
-def test_nodes_that_show_the_same_break_nothing(beside: Beside) -> None:
+def test_nodes_that_show_the_same_break_nothing(beside: Beside):
     """They are linked with correct maps, and may move these; nothing fails, and no map is left out."""
     seen = [body.node for _, body in beside.sound if isinstance(body, NodePut)]
     linked = 0
@@ -359,7 +355,7 @@ def test_nodes_that_show_the_same_break_nothing(beside: Beside) -> None:
     assert linked > 5
 
 
-def test_a_content_whose_loops_have_singular_covariances_changes_nothing(beside: Beside) -> None:
+def test_a_content_whose_loops_have_singular_covariances_changes_nothing(beside: Beside):
     beside.check(2209)
 
 
@@ -374,13 +370,13 @@ def test_a_content_whose_loops_have_singular_covariances_changes_nothing(beside:
     ],
     ids=str,
 )
-def test_random_legal_contents_change_nothing_for_sound_robots(beside: Beside, seeds: range) -> None:
+def test_random_legal_contents_change_nothing_for_sound_robots(beside: Beside, seeds: range):
     for seed in seeds:
         beside.check(seed)
 
 
 @pytest.mark.slow
-def test_a_robot_that_never_pauses_holds_up_nobodys_map() -> None:
+def test_a_robot_that_never_pauses_holds_up_nobodys_map():
     """It puts one of its nodes 200 times a second."""
     worker = MergeWorker(LiveSchedule(), 1.0)
     worker.start()

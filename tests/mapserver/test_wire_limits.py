@@ -1,7 +1,5 @@
 """Values that messages have no room for cost one candidate, never the answer."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -41,7 +39,7 @@ def place(number: int, node_from_robot: PoseGaussian, merged_from_robot: PoseGau
 )
 def test_values_out_of_range_are_left_out(
     certainty: Certainty, places: list[tuple[PoseGaussian, PoseGaussian]], left: tuple[Certainty, list[int]]
-) -> None:
+):
     candidates = tuple(place(k, *poses) for k, poses in enumerate(places, start=1))
     answer = within_range(RelocalizeAnswer(certainty, candidates, "words"))
     back = decode(encode(answer), RelocalizeAnswer)
@@ -51,7 +49,7 @@ def test_values_out_of_range_are_left_out(
     )
 
 
-def test_a_node_where_no_robot_can_be_is_no_second_place() -> None:
+def test_a_node_where_no_robot_can_be_is_no_second_place():
     two, rng = Two(), np.random.default_rng(2)
     (node,), _ = take_map(two.worlds[HERE], C, [Pose2(2.1, 1.95, 0.15)], rng)
     (other,), _ = take_map(two.worlds[HERE], C, [Pose2(2.8, 2.0, 0.2)], rng)
@@ -67,7 +65,7 @@ def test_a_node_where_no_robot_can_be_is_no_second_place() -> None:
     encode(within_range(answer))
 
 
-def test_a_view_without_a_heading_is_not_published() -> None:
+def test_a_view_without_a_heading_is_not_published():
     two, rng = Two(), np.random.default_rng(2)
     tour = [Pose2(1.5 + 0.7 * k, 2.0, 0.2 * k) for k in range(4)]
     nodes, edges = take_map(two.worlds[HERE], C, tour, rng)
@@ -83,7 +81,7 @@ def test_a_view_without_a_heading_is_not_published() -> None:
     assert len(result.views) == 3
 
 
-def test_a_route_goes_around_legs_that_no_robot_drives() -> None:
+def test_a_route_goes_around_legs_that_no_robot_drives():
     two = Two()
     start, middle, goal = sorted(two.truth)[:3]
     nodes = {name: two.merger.node(name) for name in (start, middle, goal)}

@@ -1,5 +1,7 @@
 """What the tests of commands need: a recording, a taken port, an unused endpoint."""
 
+from __future__ import annotations
+
 import signal
 import socket
 from collections.abc import Iterator

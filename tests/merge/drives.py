@@ -5,8 +5,6 @@ new epoch, the robot wanders. Its nodes are linked with nodes of its own drive a
 Some links are false: places that look alike (see `merge_fleets`).
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterator, Set

@@ -1,7 +1,5 @@
 """Random lives of fleets, whose merges from standing decisions are compared with fresh merges."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapweave.hybridmap.area import Area

@@ -1,7 +1,5 @@
 """A large building whose links are all true becomes one map, at once and without a link refused."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -10,7 +8,7 @@ from synthetic.building import Building
 
 
 @pytest.mark.scenario
-def test_ten_thousand_nodes_with_true_links_become_one_map() -> None:
+def test_ten_thousand_nodes_with_true_links_become_one_map():
     """What was left of strain between rounds once made two true ways of joining contradict each other."""
     building = Building.draw(100, 100, seed=3)
     result = np.ones(building.rooms.shape, np.bool_)

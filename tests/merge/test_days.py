@@ -1,7 +1,5 @@
 """A robot that drives through one hall every day: what stands, and what falls when others contradict it."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np
@@ -77,7 +75,7 @@ def check(merged: MergedMap, fresh: MergedMap) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("seed", "false_share"), [(61, 0.3), (60, 0.0), (62, 0.5)])
-def test_standing_decisions_agree_with_deciding_everything(seed: int, false_share: float) -> None:
+def test_standing_decisions_agree_with_deciding_everything(seed: int, false_share: float):
     """Batch merges of all days are the second opinion.
 
     In 24 of 25 such lives every merge had the same links. In the other a drive had been joined, rightly, that
@@ -90,7 +88,7 @@ def test_standing_decisions_agree_with_deciding_everything(seed: int, false_shar
 
 
 @pytest.mark.slow
-def test_constraints_apply_to_standing_decisions() -> None:
+def test_constraints_apply_to_standing_decisions():
     daily = Daily(5)
     merged = daily.live(6)
     pair = merged.links[len(merged.links) // 2].pair
@@ -110,7 +108,7 @@ def test_constraints_apply_to_standing_decisions() -> None:
     check(merged, daily.rebuilt())
 
 
-def test_maps_and_nodes_of_earlier_days_are_retired() -> None:
+def test_maps_and_nodes_of_earlier_days_are_retired():
     daily = Daily(6)
     daily.live(6)
     daily.constraints = ManualConstraints([ManualConstraint(RetiredMap(MapId("r0", 2)), True, "anna", 1)])
@@ -130,7 +128,7 @@ def test_maps_and_nodes_of_earlier_days_are_retired() -> None:
 
 
 @pytest.mark.parametrize("seed", [9, 11])
-def test_a_false_join_is_undone_when_later_maps_contradict_it(seed: int) -> None:
+def test_a_false_join_is_undone_when_later_maps_contradict_it(seed: int):
     """The second drive is joined to the wrong place by links that agree; nothing contradicts them then."""
     daily, rng = Daily(seed), np.random.default_rng(seed)
     first, second = daily.drive(), daily.drive()

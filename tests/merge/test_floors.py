@@ -1,7 +1,5 @@
 """Maps on different floors are never one, however alike they are."""
 
-from __future__ import annotations
-
 from collections import Counter
 from dataclasses import replace
 from types import SimpleNamespace
@@ -38,7 +36,7 @@ pairs = st.tuples(st.sampled_from(NAMES), st.sampled_from(NAMES)).filter(lambda 
     st.lists(st.tuples(pairs, st.integers(10, 60)), max_size=12),
     st.dictionaries(st.sampled_from(NAMES), st.sampled_from(["first", "second", "third"])),
 )
-def test_no_component_has_two_floors_and_no_link_is_excluded_without_need(drawn, floors) -> None:
+def test_no_component_has_two_floors_and_no_link_is_excluded_without_need(drawn, floors):
     links = [link(*pair, shared) for pair, shared in drawn]
     excluded = across_floors(links, floors)
     left = {one.maps for one in links} - excluded.keys()
@@ -66,7 +64,7 @@ def components(edges: set[tuple[MapId, MapId]]) -> list[set[MapId]]:
     return parts
 
 
-def test_a_map_without_a_label_goes_with_those_it_has_most_in_common_with() -> None:
+def test_a_map_without_a_label_goes_with_those_it_has_most_in_common_with():
     a, b, c, d = NAMES[:4]
     links = [link(a, c, 30), link(b, c, 20), link(c, d, 40), link(b, d, 12)]
     excluded = across_floors(links, {a: "first", b: "second"})
@@ -86,7 +84,7 @@ def test_a_map_without_a_label_goes_with_those_it_has_most_in_common_with() -> N
         ({(0, 1): 30}, ""),
     ],
 )
-def test_what_a_label_parts_counts_maps_that_are_on_a_floor_by_inference(ties, words) -> None:
+def test_what_a_label_parts_counts_maps_that_are_on_a_floor_by_inference(ties, words):
     """A map without a label goes with the better supported side, and its links with the other one fall."""
     links = tuple(link(NAMES[a], NAMES[b], shared) for (a, b), shared in ties.items())
     which = [tuple(NAMES[k]) for k in sorted({end for pair in ties for end in pair})]
@@ -109,7 +107,7 @@ def parts(merged: MergedMap) -> Counter[frozenset[MapId]]:
     return Counter(frozenset(node.map for node in component) for component in merged.components)
 
 
-def test_twin_rooms_on_two_floors_are_kept_apart(twins: dict[MapId, HybridMap]) -> None:
+def test_twin_rooms_on_two_floors_are_kept_apart(twins: dict[MapId, HybridMap]):
     a, b, c = NAMES[:3]
     assert parts(merge_parts(twins, ManualConstraints())) == {frozenset((a, b, c)): 1}, "they look the same"
     floors = {a: "first", b: "second"}

@@ -1,7 +1,5 @@
 """Merging from standing decisions against fresh merges, over random lives of fleets."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -36,7 +34,7 @@ def contents(merged: MergedMap) -> tuple[object, ...]:
 @pytest.mark.parametrize(
     ("seed", "false_share"), first_quick([(1, 0.3), (3, 0.5), (0, 0.0), (2, 0.3), (4, 0.0), (5, 0.6)], 1)
 )
-def test_islands_and_memory_change_nothing(seed: int, false_share: float) -> None:
+def test_islands_and_memory_change_nothing(seed: int, false_share: float):
     """For any changes in any order: the outcome is that of a fresh merge, to the last bit."""
     pauses: list[None] = []
     life, islands = Life(seed, false_share), Islands(pause=lambda: pauses.append(None))
@@ -60,9 +58,7 @@ def test_islands_and_memory_change_nothing(seed: int, false_share: float) -> Non
 
 
 @pytest.mark.parametrize(("seed", "false_share"), first_quick([(41, 0.3), (40, 0.0), (42, 0.5)], 1))
-def test_joint_decisions_agree_with_a_fresh_merge(
-    seed: int, false_share: float, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_joint_decisions_agree_with_a_fresh_merge(seed: int, false_share: float, monkeypatch):
     """However it began: once too much has changed, nothing of what stood has a say."""
     monkeypatch.setattr(islands_module, "CHANGED", -1.0)
     life, islands = Life(seed, false_share), Islands(exact=0)
@@ -76,7 +72,7 @@ def test_joint_decisions_agree_with_a_fresh_merge(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("seed", [43, 44, 45])
-def test_standing_decisions_agree_with_a_fresh_merge(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_standing_decisions_agree_with_a_fresh_merge(seed: int, monkeypatch):
     """Nothing is ever decided again here, and few nodes are moved at a time."""
     monkeypatch.setattr(islands_module, "CHANGED", math.inf)
     monkeypatch.setattr(component_solver, "WHOLE", 0)
@@ -95,7 +91,7 @@ def test_standing_decisions_agree_with_a_fresh_merge(seed: int, monkeypatch: pyt
 
 
 @pytest.mark.parametrize(("seed", "false_share"), first_quick([(47, 0.3), (46, 0.0), (48, 0.3)], 1))
-def test_standing_decisions_agree_with_a_fresh_merge_after_any_changes(seed: int, false_share: float) -> None:
+def test_standing_decisions_agree_with_a_fresh_merge_after_any_changes(seed: int, false_share: float):
     """Nodes, links, manual constraints and retired maps come and go."""
     life, islands = Life(seed, false_share), Islands(exact=0)
     apart = links = 0
@@ -120,7 +116,7 @@ def test_standing_decisions_agree_with_a_fresh_merge_after_any_changes(seed: int
 
 @pytest.mark.slow
 @pytest.mark.parametrize("exact", [0, 600])
-def test_links_by_hand_and_retired_nodes_hold_in_whatever_order_all_comes(exact: int) -> None:
+def test_links_by_hand_and_retired_nodes_hold_in_whatever_order_all_comes(exact: int):
     """Small islands against a merge from nothing; large ones in what no order may change."""
     life, islands = Life(51, 0.3), Islands(exact=exact)
     by_hand = retired = contradicted = 0
@@ -144,7 +140,7 @@ def test_links_by_hand_and_retired_nodes_hold_in_whatever_order_all_comes(exact:
 
 
 @pytest.mark.slow
-def test_all_is_decided_together_now_and_then_only(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_all_is_decided_together_now_and_then_only(monkeypatch):
     times: list[bool] = []
     real = islands_module.decide
     monkeypatch.setattr(
@@ -162,7 +158,7 @@ def test_all_is_decided_together_now_and_then_only(monkeypatch: pytest.MonkeyPat
 
 
 @pytest.mark.slow
-def test_large_islands_repeat_themselves_to_the_last_bit(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_large_islands_repeat_themselves_to_the_last_bit(monkeypatch):
     monkeypatch.setattr(component_solver, "WHOLE", 0)
     monkeypatch.setattr(component_solver, "LEAST", 12)
     collected = []
@@ -176,7 +172,7 @@ def test_large_islands_repeat_themselves_to_the_last_bit(monkeypatch: pytest.Mon
     assert collected[0] == collected[1]
 
 
-def test_untouched_components_are_kept() -> None:
+def test_untouched_components_are_kept():
     life, islands = Life(7, 0.0), Islands(MergeSettings())
     for _ in range(60):
         life.step()

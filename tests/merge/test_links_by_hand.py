@@ -1,7 +1,5 @@
 """Links by hand: taken where images and map agree, refused with the evidence where they do not, and kept."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -92,7 +90,7 @@ def same(one: MergedMap, other: MergedMap) -> bool:
     )
 
 
-def test_a_link_that_the_merge_lacks_joins_two_maps_at_the_right_pose(seam: Scene) -> None:
+def test_a_link_that_the_merge_lacks_joins_two_maps_at_the_right_pose(seam: Scene):
     before = seam.merger.merged()
     assert len(before.components) == 2 and not before.links
     effects = seam.ask(Linked(FIRST, LAST))
@@ -112,7 +110,7 @@ def test_a_link_that_the_merge_lacks_joins_two_maps_at_the_right_pose(seam: Scen
     assert same(seam.merger.merged(), before), "to the bit"
 
 
-def test_a_link_stays_when_the_robot_maps_on_and_an_undone_one_waits(seam: Scene) -> None:
+def test_a_link_stays_when_the_robot_maps_on_and_an_undone_one_waits(seam: Scene):
     seam.ask(Linked(LAST, FIRST))
     nodes, edges = take_map(seam.world, B, [Pose2(2.7, 2.4, 2.05 + 1.0 * k) for k in range(5)], seam.rng)
     for change in numbered(B, changes_of(nodes[3:], edges[2:]), 90):
@@ -135,9 +133,7 @@ def test_a_link_stays_when_the_robot_maps_on_and_an_undone_one_waits(seam: Scene
         (RetiredArea(Area(node(A, 1), ((-5, -5), (5, -5), (5, 5), (-5, 5)))), "the area of 4 corners"),
     ],
 )
-def test_a_link_at_a_node_that_is_retired_a_moment_before_is_refused(
-    seam: Scene, about: Subject, words: str
-) -> None:
+def test_a_link_at_a_node_that_is_retired_a_moment_before_is_refused(seam: Scene, about: Subject, words: str):
     """Before the merge with the retirement it was taken, and had no effect."""
     before = seam.merger.merged()
     retired = ManualConstraint(about, True, "anna", 1, "a mirror")
@@ -153,7 +149,7 @@ def test_a_link_at_a_node_that_is_retired_a_moment_before_is_refused(
     assert check_manual_constraint(seam.merger.merged(), taken_back, linked).constraint.holds
 
 
-def test_images_that_do_not_agree_are_refused_unless_a_person_knows_better(seam: Scene) -> None:
+def test_images_that_do_not_agree_are_refused_unless_a_person_knows_better(seam: Scene):
     pair = node(A, 1), node(B, 5)
     with pytest.raises(InvalidValue, match=r"do not show one place: \d+ features? match"):
         seam.ask(Linked(*pair))
@@ -175,7 +171,7 @@ def test_images_that_do_not_agree_are_refused_unless_a_person_knows_better(seam:
         seam.ask(Linked(*other, seam.true(*other) @ Pose2(2.0, 0.0, 0.0)), because="sure")
 
 
-def test_a_loop_by_hand_must_fit_the_robots_own_way() -> None:
+def test_a_loop_by_hand_must_fit_the_robots_own_way():
     """Two rooms that look the same, in one drive: images cannot tell them apart, the drive can."""
     one = room(0, 0, 5, 4, 500, np.random.default_rng(1))
     scene = Scene(one + one.moved(EAST))
@@ -209,7 +205,7 @@ def test_a_loop_by_hand_must_fit_the_robots_own_way() -> None:
     assert errors[1] < MOST_SIGMA_XY and errors[1] < errors[0] / 2
 
 
-def test_robots_that_would_have_been_in_one_place_at_one_time_are_not_linked() -> None:
+def test_robots_that_would_have_been_in_one_place_at_one_time_are_not_linked():
     one = room(0, 0, 5, 4, 600, np.random.default_rng(1))
     scene = Scene(one + one.moved(EAST))
     walk = [Pose2(1.0 + 0.3 * k, 2.0, 0.1 * k) for k in range(8)]
@@ -222,7 +218,7 @@ def test_robots_that_would_have_been_in_one_place_at_one_time_are_not_linked() -
     assert not scene.constraints.made
 
 
-def test_what_contradicts_a_link_later_is_reported_and_the_link_stays(seam: Scene) -> None:
+def test_what_contradicts_a_link_later_is_reported_and_the_link_stays(seam: Scene):
     """A person is wrong by a metre, and then the robots see what is so."""
     wrong = seam.true(LAST, node(B, 5)) @ Pose2(1.0, 0.5, 0.0)
     seam.ask(Linked(LAST, node(B, 5), wrong), because="a guess")
@@ -245,7 +241,7 @@ def test_what_contradicts_a_link_later_is_reported_and_the_link_stays(seam: Scen
     assert not seam.merger.merged().contradicted
 
 
-def test_links_by_hand_and_labels_of_floors_know_of_each_other(seam: Scene) -> None:
+def test_links_by_hand_and_labels_of_floors_know_of_each_other(seam: Scene):
     seam.constraints = ManualConstraints(floors={A: "1", B: "2"})
     with pytest.raises(InvalidValue, match=rf"cannot be linked: {LAST} is on floor 1, {FIRST} on floor 2"):
         seam.ask(Linked(LAST, FIRST))
@@ -264,7 +260,7 @@ def test_links_by_hand_and_labels_of_floors_know_of_each_other(seam: Scene) -> N
     check_annotation(merged, Annotations((first,)), second, undone)
 
 
-def test_a_place_at_a_retired_node_is_refused_with_what_retired_it(seam: Scene) -> None:
+def test_a_place_at_a_retired_node_is_refused_with_what_retired_it(seam: Scene):
     retired = ManualConstraint(RetiredNodes((LAST,)), True, "anna", 10**18, "a mirror")
     seam.merger.constrain(ManualConstraints([retired]))
     merged, kitchen = seam.merger.merged(), Annotation("kitchen", Place(LAST), False, "anna", 1)
@@ -280,7 +276,7 @@ def test_a_place_at_a_retired_node_is_refused_with_what_retired_it(seam: Scene) 
     check_annotation(seam.merger.merged(), Annotations(()), kitchen, taken_back)
 
 
-def test_a_drive_from_map_to_map_is_evidence_against_labels_and_likeness_is_not() -> None:
+def test_a_drive_from_map_to_map_is_evidence_against_labels_and_likeness_is_not():
     scene = Scene(room(0, 0, 6, 5, 700, np.random.default_rng(1)))
     for which in (A, B):
         scene.drive(which, [Pose2(2.5, 2.5, 1.0 * k) for k in range(3)])

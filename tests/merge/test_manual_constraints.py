@@ -1,7 +1,5 @@
 """Excluded links are not merged, after any change, until the constraint is withdrawn."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -32,7 +30,7 @@ def between(merged: MergedMap) -> set[tuple[NodeId, NodeId]]:
     return {link.pair for link in merged.links if not link.within}
 
 
-def test_one_link_is_undone_and_comes_back(merger: Merger) -> None:
+def test_one_link_is_undone_and_comes_back(merger: Merger):
     before = merger.merged()
     pair = before.links[0].pair
     apart = ManualConstraint(Apart(pair), True, "anna", NOON, "two kitchens")
@@ -52,7 +50,7 @@ def test_one_link_is_undone_and_comes_back(merger: Merger) -> None:
         )
 
 
-def test_two_maps_are_kept_apart_and_new_links_do_not_join_them(merger: Merger) -> None:
+def test_two_maps_are_kept_apart_and_new_links_do_not_join_them(merger: Merger):
     assert merger.merged().joined(A, B)
     merger.constrain(ManualConstraints([ManualConstraint(Apart((A, B)), True, "anna", NOON)]))
     apart = merger.merged()
@@ -64,7 +62,7 @@ def test_two_maps_are_kept_apart_and_new_links_do_not_join_them(merger: Merger) 
     assert not merger.merged().joined(A, B)
 
 
-def test_unmerging_two_maps_joined_by_a_third_explains_how(merger: Merger) -> None:
+def test_unmerging_two_maps_joined_by_a_third_explains_how(merger: Merger):
     world = room(0, 0, 5, 4, 700, np.random.default_rng(3))
     third, rng = MapId("c", 1), np.random.default_rng(4)
     stops = [Pose2(2.45 + 0.05 * k, 2.05, 0.7 * k) for k in range(6)]
@@ -83,7 +81,7 @@ def test_unmerging_two_maps_joined_by_a_third_explains_how(merger: Merger) -> No
     assert apart.reason.startswith("a.1 and b.1 are not one map") and apart.over == ()
 
 
-def test_a_robot_s_own_loop_can_be_undone_and_its_way_cannot(merger: Merger) -> None:
+def test_a_robot_s_own_loop_can_be_undone_and_its_way_cannot(merger: Merger):
     hybrid_map = merger.maps[A]
     nodes = sorted(hybrid_map.nodes)
     way = next(e for e in hybrid_map.edges.values() if {e.a, e.b} == set(nodes[:2]))

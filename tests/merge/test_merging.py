@@ -96,7 +96,7 @@ def office_fleet() -> tuple[Fleet, MergedMap]:
     return fleet, fleet.merge()
 
 
-def test_three_maps_become_one(office_fleet: tuple[Fleet, MergedMap]) -> None:
+def test_three_maps_become_one(office_fleet: tuple[Fleet, MergedMap]):
     fleet, merged = office_fleet
     assert len(merged.components) == 1
     assert fleet.false_links(merged) == 0
@@ -107,7 +107,7 @@ def test_three_maps_become_one(office_fleet: tuple[Fleet, MergedMap]) -> None:
     assert {link.edge().kind for link in merged.links} == {EdgeKind.MERGED, EdgeKind.LOOP}
 
 
-def test_result_does_not_depend_on_order() -> None:
+def test_result_does_not_depend_on_order():
     fleet = three_robots(3, n=5)
     one, two = fleet.merge(), fleet.merge(order=-1)
     assert [link.pair for link in one.links] == [link.pair for link in two.links]
@@ -119,7 +119,7 @@ def test_result_does_not_depend_on_order() -> None:
         )
 
 
-def test_maps_of_different_places_stay_apart() -> None:
+def test_maps_of_different_places_stay_apart():
     rng = np.random.default_rng(4)
     rooms = office(rng)
     fleet = Fleet(rooms[0] + rooms[2], {A: tour(0, 0, 8, rng), B: tour(10, 0, 8, rng)}, rng)
@@ -132,7 +132,7 @@ def test_maps_of_different_places_stay_apart() -> None:
         assert merged.poses[first].merged_from_robot.mean.distance(own) < 1e-9
 
 
-def test_a_room_that_is_just_like_another_is_not_taken_for_it() -> None:
+def test_a_room_that_is_just_like_another_is_not_taken_for_it():
     """Rooms 0 and 2 look exactly alike. Both robots saw the room between them, and each saw one of them."""
     for seed in (5, 6):
         rng = np.random.default_rng(seed)
@@ -146,7 +146,7 @@ def test_a_room_that_is_just_like_another_is_not_taken_for_it() -> None:
         assert refused, "the alike rooms must have looked alike"
 
 
-def test_a_room_that_fits_two_others_equally_is_joined_to_neither() -> None:
+def test_a_room_that_fits_two_others_equally_is_joined_to_neither():
     """One robot saw two similar rooms, the other one of them: both sets have the same support."""
     rng = np.random.default_rng(7)
     left = room(0, 0, 5, 4, 600, rng)
@@ -172,7 +172,7 @@ def chain(agent: str, n: int) -> HybridMap:
     return HybridMap(changes_of(nodes, edges))
 
 
-def test_links_that_contradict_a_better_supported_way_round_are_refused() -> None:
+def test_links_that_contradict_a_better_supported_way_round_are_refused():
     """a-b and b-c are well supported, all along; a-c says something else at one place, and agrees on it."""
     maps = {MapId(agent, 1): chain(agent, 14) for agent in "abc"}
 
@@ -197,7 +197,7 @@ def test_links_that_contradict_a_better_supported_way_round_are_refused() -> Non
     assert len(agreeing.links) == 12
 
 
-def test_a_map_in_pieces_is_joined_piece_by_piece() -> None:
+def test_a_map_in_pieces_is_joined_piece_by_piece():
     whole = chain("a", 6)
     whole.apply(EdgeRetired(NodeId("a", 1, 6)))  # between nodes 5 and 7
     merged = merge_maps({A: whole}, [])
@@ -209,7 +209,7 @@ def refused_links(merged: MergedMap) -> list[RefusedLink]:
     return [refusal for refusal in merged.refused if refusal.link is not None]
 
 
-def test_explanations_and_summary(office_fleet: tuple[Fleet, MergedMap]) -> None:
+def test_explanations_and_summary(office_fleet: tuple[Fleet, MergedMap]):
     fleet, merged = office_fleet
     link = merged.links[0]
     assert "are linked: " in merged.explain(link.b, link.a)
@@ -228,12 +228,12 @@ def test_explanations_and_summary(office_fleet: tuple[Fleet, MergedMap]) -> None
     )
 
 
-def test_nothing_to_merge() -> None:
+def test_nothing_to_merge():
     assert merge_maps({}, []).summary() == "0 nodes, 0 maps, 0 components, 0 links, 0 refused"
     assert MergedMap.empty().components == ()
 
 
-def test_link_edges_have_ids_of_their_own_that_stay(office_fleet: tuple[Fleet, MergedMap]) -> None:
+def test_link_edges_have_ids_of_their_own_that_stay(office_fleet: tuple[Fleet, MergedMap]):
     _, merged = office_fleet
     ids = [link.edge().id for link in merged.links]
     assert len(set(ids)) == len(ids)

@@ -4,8 +4,6 @@ Which links are true is known: pruning joins nothing wrongly, and the nodes that
 all measurements of all days has them.
 """
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -84,7 +82,7 @@ def false_links(merged: MergedMap, true: set[Pair]) -> set[Pair]:
     ("seed", "false_share", "days"),
     first_quick([(70, 0.4, 5), (71, 0.4, 12), (72, 0.0, 12), (73, 0.2, 12), (74, 0.5, 12), (75, 0.6, 12)], 1),
 )
-def test_pruning_joins_nothing_wrongly(seed: int, false_share: float, days: int) -> None:
+def test_pruning_joins_nothing_wrongly(seed: int, false_share: float, days: int):
     pruned, whole = Pruned(seed, false_share), Daily(seed, false_share)
     for _ in range(days):
         pruned.day()

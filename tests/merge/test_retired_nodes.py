@@ -1,7 +1,5 @@
 """Retired nodes take no part in anything; the robot's way past them still ties the rest."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -49,7 +47,7 @@ def constrained(*subjects: Subject) -> ManualConstraints:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_bridges_keep_the_rest_where_all_measurements_put_it(seed: int) -> None:
+def test_bridges_keep_the_rest_where_all_measurements_put_it(seed: int):
     """Poses and covariances against the whole drive with the retired nodes as unknowns.
 
     Of a chain the two are the same to first order: a bridge is what marginalising the nodes leaves.
@@ -69,7 +67,7 @@ def test_bridges_keep_the_rest_where_all_measurements_put_it(seed: int) -> None:
         assert np.allclose(a.covariance, b.covariance, rtol=0.05, atol=1e-6)
 
 
-def test_where_several_ways_meet_bridges_lead_from_one_node_to_all_others() -> None:
+def test_where_several_ways_meet_bridges_lead_from_one_node_to_all_others():
     whole = HybridMap()
     rng = np.random.default_rng(1)
     fleet = draw_fleet(0.0, rng, FleetSettings(robots=1, nodes=6, true_links=0))
@@ -120,7 +118,7 @@ def check_out_of_use(merger: Merger, merged: MergedMap, gone: Sequence[NodeId]) 
     assert " retired by anna on " in Router(merged).route(min(merged.poses), gone[0]).reason
 
 
-def test_nodes_are_retired_and_come_back_to_the_bit(merger: Merger) -> None:
+def test_nodes_are_retired_and_come_back_to_the_bit(merger: Merger):
     before = merger.merged()
     assert len(before.components) == 1 and len(before.poses) == 24
     gone = ids(A, 7, 9, 11)
@@ -139,7 +137,7 @@ def test_nodes_are_retired_and_come_back_to_the_bit(merger: Merger) -> None:
     assert same(merger.merged(), before)
 
 
-def test_an_area_holds_for_all_maps_and_for_nodes_that_come_later(merger: Merger) -> None:
+def test_an_area_holds_for_all_maps_and_for_nodes_that_come_later(merger: Merger):
     before = merger.merged()
     (anchor,) = ids(B, 1)
     # Around the true stops 5 and 6, in the frame of a node that has turned by nothing.
@@ -164,7 +162,7 @@ def test_an_area_holds_for_all_maps_and_for_nodes_that_come_later(merger: Merger
     assert later.joined(third, A)
 
 
-def test_a_time_window_holds_for_nodes_that_come_later(merger: Merger) -> None:
+def test_a_time_window_holds_for_nodes_that_come_later(merger: Merger):
     seconds = 10**9
     window = RetiredWindow(A, 15 * seconds, 30 * seconds)
     merger.constrain(constrained(window))
@@ -181,7 +179,7 @@ def test_a_time_window_holds_for_nodes_that_come_later(merger: Merger) -> None:
     assert merger.merged().constraints.nodes.keys() == set(ids(A, *range(15, 31, 2)))
 
 
-def test_a_map_that_only_loops_hold_together_falls_apart_and_that_is_said_before() -> None:
+def test_a_map_that_only_loops_hold_together_falls_apart_and_that_is_said_before():
     fleet = draw_fleet(0.0, np.random.default_rng(2), FleetSettings(robots=1, nodes=8, true_links=0))
     ((map_id, whole),) = fleet.maps.items()
     nodes = sorted(whole.nodes)
@@ -208,7 +206,7 @@ def test_a_map_that_only_loops_hold_together_falls_apart_and_that_is_said_before
             check_manual_constraint(merger.merged(), ManualConstraints([asked]), wanted)
 
 
-def test_a_retirement_that_is_taken_back_says_what_others_still_retire(merger: Merger) -> None:
+def test_a_retirement_that_is_taken_back_says_what_others_still_retire(merger: Merger):
     seconds = 10**9
     (corner,) = ids(B, 1)
     outline = Area(corner, ((1.6, -0.5), (2.25, -0.5), (2.25, 0.5), (1.6, 0.5)))
@@ -243,7 +241,7 @@ def test_a_retirement_that_is_taken_back_says_what_others_still_retire(merger: M
     assert f"but node b.1.11 stays out of use: node b.1.11 is {by} 2" in said(area, third, area)
 
 
-def test_two_nodes_that_may_be_linked_again_stay_apart_while_their_maps_do(merger: Merger) -> None:
+def test_two_nodes_that_may_be_linked_again_stay_apart_while_their_maps_do(merger: Merger):
     pair = ManualConstraint(Apart(ids(A, 7) + ids(B, 7)), True, "anna", 1)
     maps = ManualConstraint(Apart((A, B)), True, "anna", 2, "two halls")
     asked = check_manual_constraint(

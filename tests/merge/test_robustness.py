@@ -31,7 +31,7 @@ def chi2(measurement: RelativePose, poses: dict[NodeId, Pose2]) -> float:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_graduation_finds_the_cheapest_set_of_all(seed: int) -> None:
+def test_graduation_finds_the_cheapest_set_of_all(seed: int):
     """Truncated least squares by trying every set of links that may be left out."""
     rng = np.random.default_rng(seed)
     ids = [NodeId("a", 1, k) for k in range(10)]
@@ -60,7 +60,7 @@ def test_graduation_finds_the_cheapest_set_of_all(seed: int) -> None:
 
 
 @pytest.mark.slow
-def test_half_of_the_links_may_be_false() -> None:
+def test_half_of_the_links_may_be_false():
     """Least squares alone is ruined; the others withstand. Not in every fleet."""
     names = ("least_squares", "gnc", "mapweave")
     ratios: dict[str, list[float]] = {name: [] for name in names}
@@ -79,7 +79,7 @@ def test_half_of_the_links_may_be_false() -> None:
         assert np.median(ratios[name]) < 1.1 and np.median(precisions[name]) == 1.0
 
 
-def test_too_few_links_between_two_maps_confirm_a_join_by_others() -> None:
+def test_too_few_links_between_two_maps_confirm_a_join_by_others():
     """One link from c to a and one to b: neither is enough alone, together and through a-b they are."""
     rng = np.random.default_rng(5)
     fleet = draw_fleet(0.0, rng, FleetSettings(robots=3, nodes=30, side=6.0, true_links=60))
@@ -97,7 +97,7 @@ def test_too_few_links_between_two_maps_confirm_a_join_by_others() -> None:
 
 
 @pytest.mark.parametrize("heading_sigma", [0.01, 0.1])
-def test_links_that_are_all_right_end_at_the_batch_optimum(heading_sigma: float) -> None:
+def test_links_that_are_all_right_end_at_the_batch_optimum(heading_sigma: float):
     """None is refused, and none held back: GTSAM's optimum of the whole graph."""
     graph = draw_grid(300, heading_sigma, np.random.default_rng([5, 0]))
     maps, links, nodes = split(graph, 2)
@@ -107,7 +107,7 @@ def test_links_that_are_all_right_end_at_the_batch_optimum(heading_sigma: float)
 
 
 @pytest.mark.parametrize("side", [10.0, 1000.0])
-def test_many_links_of_one_place_make_no_refused_link_likelier(side: float) -> None:
+def test_many_links_of_one_place_make_no_refused_link_likelier(side: float):
     """They are dependent: a link that all of them contradict stays refused, however many they are.
 
     However large the floor is: there a false link would hardly be so near, but one that is badly measured is.

@@ -1,7 +1,5 @@
 """A map with two robots' places in another arrangement is wrong; a place that looks the same is not."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np
@@ -74,7 +72,7 @@ def joined_with_copies(
     ("seed", "shift", "torn"),
     first_quick([(SEED, TORN, True), (SEED, Pose2(), False), (301, TORN, True), (302, TORN, True)], 1),
 )
-def test_two_robots_that_agree_contradict_a_torn_map(seed: int, shift: Pose2, torn: bool) -> None:
+def test_two_robots_that_agree_contradict_a_torn_map(seed: int, shift: Pose2, torn: bool):
     """It has their places in another arrangement; in theirs it is one map with them."""
     merged = joined_with_copies(draw_fleet(seed, SCENES["house"], OdometryFault.NONE, stops=2), shift)
     assert merged.wrong.keys() == ({ODD} if torn else set())
@@ -83,9 +81,7 @@ def test_two_robots_that_agree_contradict_a_torn_map(seed: int, shift: Pose2, to
 
 
 @pytest.mark.parametrize(("shift", "torn"), [(TORN, True), (Pose2(), False)])
-def test_nodes_that_are_a_little_off_are_of_no_other_place(
-    fleet: FaultyFleet, shift: Pose2, torn: bool
-) -> None:
+def test_nodes_that_are_a_little_off_are_of_no_other_place(fleet: FaultyFleet, shift: Pose2, torn: bool):
     """They counted as of another one: a map with everything nearly where it is seemed torn."""
     merged = joined_with_copies(fleet, shift, in_turns=True, off=Pose2(0.5, 0.4, 0.0))
     found = [*merged.links, *(r.link for r in merged.refused if r.link is not None)]
@@ -103,7 +99,7 @@ def test_nodes_that_are_a_little_off_are_of_no_other_place(
 
 
 @pytest.mark.slow
-def test_altered_copies_behind_a_true_drive_are_found_out_by_their_arrangement(fleet: FaultyFleet) -> None:
+def test_altered_copies_behind_a_true_drive_are_found_out_by_their_arrangement(fleet: FaultyFleet):
     """Copies of two robots' places, each robot's in its own frame: their map contradicts those that agree."""
     sound = {map_id: content for map_id, content in fleet.maps.items() if map_id != ODD}
     lie = altered_places(LieInputs(ODD, fleet.maps[ODD], sound, np.random.default_rng(SEED)))

@@ -19,7 +19,7 @@ LEAST_SOLVED = 10
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(3, 40))
-def test_both_forms_are_the_same_to_rounding(seed: int, n: int) -> None:
+def test_both_forms_are_the_same_to_rounding(seed: int, n: int):
     rng = np.random.default_rng(seed)
     (forward, true), (backward, _) = scene(n, rng, False), scene(max(n // 2, 1), rng, True)
     stack = stack_sightings([forward, backward], 0.01)
@@ -46,7 +46,7 @@ def test_both_forms_are_the_same_to_rounding(seed: int, n: int) -> None:
         np.testing.assert_allclose(first, second, rtol=1e-6, atol=1e-7 * scale)
 
 
-def test_nothing_is_compiled_while_a_robot_drives() -> None:
+def test_nothing_is_compiled_while_a_robot_drives():
     """Every array comes in the type that the kernels are compiled for beforehand."""
     rng = np.random.default_rng(1)
     (forward, true), (backward, _) = scene(20, rng, False), scene(10, rng, True)

@@ -1,7 +1,5 @@
 """Photographs brought to level, against the truth of a synthetic world; and their unknown scale."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -28,7 +26,7 @@ def scene(seed: int, off: Pose2) -> tuple[Node, object, np.random.Generator]:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_pitch_roll_and_rise_do_not_move_the_robot(seed: int) -> None:
+def test_pitch_roll_and_rise_do_not_move_the_robot(seed: int):
     rng = np.random.default_rng(seed + 100)
     off = Pose2(*rng.uniform([-0.5, -0.2, -0.15], [0.1, 0.2, 0.15]))
     pitch, roll = rng.normal(0.0, math.radians(1.5), 2)
@@ -57,7 +55,7 @@ def test_pitch_roll_and_rise_do_not_move_the_robot(seed: int) -> None:
     assert miss < before
 
 
-def test_a_level_photograph_stays_as_it_is() -> None:
+def test_a_level_photograph_stays_as_it_is():
     node, view, rng = scene(3, Pose2(-0.2, 0.05, 0.03))
     held = photograph(node)
     recognition = recognise(held, view, None, rng)
@@ -67,7 +65,7 @@ def test_a_level_photograph_stays_as_it_is() -> None:
     assert np.allclose(levelled.node.landmarks.depths, held.landmarks.depths, rtol=0.02)
 
 
-def test_the_scale_is_a_share_of_the_way_to_the_photograph() -> None:
+def test_the_scale_is_a_share_of_the_way_to_the_photograph():
     off = Pose2(-0.5, 0.1, 0.05)
     node, view, rng = scene(2, off)
     recognition = recognise(photograph(node), view, None, rng)
@@ -80,7 +78,7 @@ def test_the_scale_is_a_share_of_the_way_to_the_photograph() -> None:
 
 
 @pytest.mark.parametrize("scale", [0.75, 1.3])
-def test_a_measured_node_gives_a_photograph_its_scale(scale: float) -> None:
+def test_a_measured_node_gives_a_photograph_its_scale(scale: float):
     """Registered with a node whose depths are measured, a photograph has its true pose."""
     rng = np.random.default_rng(5)
     world, at, off = room(0.0, 0.0, 6.0, 5.0, 900, rng), Pose2(2.0, 2.5, 0.1), Pose2(-0.4, 0.2, -0.1)

@@ -23,7 +23,7 @@ def brute_force(a: np.ndarray, b: np.ndarray, s: MatchSettings, noise: float) ->
 
 @settings(max_examples=40, deadline=None)
 @given(st.integers(1, 12), st.integers(1, 12), st.integers(0, 10**6), st.sampled_from([0.0, 0.006]))
-def test_against_brute_force(n: int, m: int, seed: int, noise: float) -> None:
+def test_against_brute_force(n: int, m: int, seed: int, noise: float):
     rng = np.random.default_rng(seed)
     a = rng.normal(0, 0.12, (n, 32)).astype(np.float32)
     b = np.concatenate([a[: n // 2] + rng.normal(0, 0.04, (n // 2, 32)), rng.normal(0, 0.12, (m, 32))])
@@ -35,7 +35,7 @@ def test_against_brute_force(n: int, m: int, seed: int, noise: float) -> None:
 
 @settings(max_examples=50, deadline=None)
 @given(st.integers(0, 2**32 - 1), st.integers(1, 20), st.integers(1, 20))
-def test_nearest_and_second_are_exact(seed: int, n: int, m: int) -> None:
+def test_nearest_and_second_are_exact(seed: int, n: int, m: int):
     rng = np.random.default_rng(seed)
     a, b = random_codes(n, rng), random_codes(m, rng)
     exact = ((a[:, None].astype(int) - b[None].astype(int)) ** 2).sum(axis=2)
@@ -53,7 +53,7 @@ def random_codes(n: int, rng: np.random.Generator) -> np.ndarray:
     return rng.integers(0, 64, (n, 32), dtype=np.uint8)
 
 
-def test_no_feature_is_used_twice_and_the_best_come_first() -> None:
+def test_no_feature_is_used_twice_and_the_best_come_first():
     """The trap of a one-way test: everything in a low-texture image matches the same few features."""
     rng = np.random.default_rng(3)
     one = random_codes(1, rng)
@@ -70,13 +70,13 @@ def test_no_feature_is_used_twice_and_the_best_come_first() -> None:
     assert (np.diff(np.linalg.norm(a[pairs[:, 0]] - b[pairs[:, 1]], axis=1)) > -1e-3).all()
 
 
-def test_nothing_matches_nothing() -> None:
+def test_nothing_matches_nothing():
     none, some = np.zeros((0, 32), np.uint8), np.zeros((4, 32), np.uint8)
     for a, b in ((none, some), (some, none), (none, none)):
         assert match(a, b).shape == (0, 2)
         assert match(a, b).dtype == np.int64
 
 
-def test_a_single_candidate_is_judged_by_distance_alone() -> None:
+def test_a_single_candidate_is_judged_by_distance_alone():
     codes = np.arange(64, dtype=np.uint8).reshape(2, 32)
     assert match(codes[:1], codes[:1]).tolist() == [[0, 0]]

@@ -44,7 +44,7 @@ def error(result: Pose2, true: Pose2) -> float:
 
 @settings(max_examples=25, deadline=None)
 @given(st.integers(0, 10**6))
-def test_exact_points_give_the_exact_pose(seed: int) -> None:
+def test_exact_points_give_the_exact_pose(seed: int):
     rng = np.random.default_rng(seed)
     true = random_pose(rng)
     points, pixels = seen_points(true, 12, rng)
@@ -54,7 +54,7 @@ def test_exact_points_give_the_exact_pose(seed: int) -> None:
 
 
 @pytest.mark.parametrize("inverted", [False, True])
-def test_minimal_solutions_are_exact(inverted: bool) -> None:
+def test_minimal_solutions_are_exact(inverted: bool):
     rng = np.random.default_rng(3)
     true = random_pose(rng)
     points, pixels = seen_points(true.inverse() if inverted else true, 30, rng)
@@ -86,7 +86,7 @@ def noisy_problem(
     return true, known, covariances, pixels + rng.normal(0, 0.7, pixels.shape)
 
 
-def test_covariance_is_calibrated() -> None:
+def test_covariance_is_calibrated():
     rng = np.random.default_rng(6)
     distances = []
     for _ in range(250):
@@ -102,7 +102,7 @@ def test_covariance_is_calibrated() -> None:
 
 
 @pytest.mark.slow
-def test_common_scale_error_is_covered() -> None:
+def test_common_scale_error_is_covered():
     """All depths 2 % too long together, as after a drive with a wrong wheel radius."""
     rng = np.random.default_rng(7)
     covered = {}
@@ -126,7 +126,7 @@ def test_common_scale_error_is_covered() -> None:
     assert covered[0.02] < 4.0 < covered[0.0]
 
 
-def test_optimum_against_scipy_with_points_as_variables() -> None:
+def test_optimum_against_scipy_with_points_as_variables():
     """The eliminated points must give the same pose as a full least squares over pose and points."""
     rng = np.random.default_rng(8)
     true, points, covariances, pixels = noisy_problem(rng, n=18, depth_share=0.08)
@@ -205,7 +205,7 @@ def compared_with_scipy(seed: int, pitch: float) -> tuple[np.ndarray, Callable[[
 
 @settings(max_examples=12, deadline=None, derandomize=True)
 @given(st.integers(0, 10**6), st.floats(-0.03, 0.03))
-def test_pitch_against_scipy_with_points_and_pitch_as_variables(seed: int, pitch: float) -> None:
+def test_pitch_against_scipy_with_points_and_pitch_as_variables(seed: int, pitch: float):
     """The same draws each time: in one of 500 more than two lie outside their gates by chance."""
     kept, _ = compared_with_scipy(seed, pitch)
     assert kept.sum() >= len(kept) - 2
@@ -217,14 +217,14 @@ def test_pitch_against_scipy_with_points_and_pitch_as_variables(seed: int, pitch
 @example(18, 0.0)
 @settings(max_examples=12, deadline=None)
 @given(st.integers(0, 10**6), st.floats(-0.03, 0.03))
-def test_inliers_are_those_that_fit_at_the_optimum_of_the_inliers(seed: int, pitch: float) -> None:
+def test_inliers_are_those_that_fit_at_the_optimum_of_the_inliers(seed: int, pitch: float):
     """It is an optimum of the truncated cost: all sightings are on the same sides of their gates by SciPy."""
     kept, alone = compared_with_scipy(seed, pitch)
     distance2 = np.array([alone(n) for n in range(len(kept))])
     assert (distance2[kept] < 1.03 * GATE).all() and (distance2[~kept] > 0.97 * GATE).all()
 
 
-def test_covariance_is_calibrated_where_cameras_look_differently_far_up() -> None:
+def test_covariance_is_calibrated_where_cameras_look_differently_far_up():
     """Pitch differences are drawn from the prior; a planar pose loses landmarks then, and is too sure."""
     rng = np.random.default_rng(16)
     distances: dict[float, list[float]] = {0.0: [], 0.01: []}
@@ -245,7 +245,7 @@ def test_covariance_is_calibrated_where_cameras_look_differently_far_up() -> Non
     assert np.mean(inliers[0.01]) > 0.95 > np.mean(inliers[0.0])
 
 
-def test_pitch_is_the_same_seen_from_either_side() -> None:
+def test_pitch_is_the_same_seen_from_either_side():
     """Points of the robot's own frame in the other camera's image show its pitch with the other sign."""
     rng = np.random.default_rng(17)
     true = Pose2(0.3, -0.1, 0.05)
@@ -258,7 +258,7 @@ def test_pitch_is_the_same_seen_from_either_side() -> None:
 
 
 @pytest.mark.parametrize("wrong_share", [0.3, 0.6])
-def test_wrong_matches_are_found_out(wrong_share: float) -> None:
+def test_wrong_matches_are_found_out(wrong_share: float):
     rng = np.random.default_rng(9)
     good = 0
     for _ in range(40):
@@ -272,7 +272,7 @@ def test_wrong_matches_are_found_out(wrong_share: float) -> None:
     assert good >= 39
 
 
-def test_pure_chance_gives_few_inliers() -> None:
+def test_pure_chance_gives_few_inliers():
     rng = np.random.default_rng(10)
     for _ in range(30):
         points, _ = seen_points(Pose2(), 40, rng)
@@ -280,7 +280,7 @@ def test_pure_chance_gives_few_inliers() -> None:
         assert fix is None or fix.inliers.sum() < 10
 
 
-def test_measured_depths_make_a_pose_more_certain() -> None:
+def test_measured_depths_make_a_pose_more_certain():
     rng = np.random.default_rng(12)
     true, points, covariances, pixels = noisy_problem(rng, n=15, depth_share=0.1)
     in_robot = true.inverse().apply(points)
@@ -303,7 +303,7 @@ def test_measured_depths_make_a_pose_more_certain() -> None:
 
 @pytest.mark.parametrize("n", [0, 1, 3, 4, 10])
 @pytest.mark.parametrize("kind", ["nan", "same point", "behind", "zero", "huge"])
-def test_degenerate_input_gives_none_or_a_pose_but_never_raises(n: int, kind: str) -> None:
+def test_degenerate_input_gives_none_or_a_pose_but_never_raises(n: int, kind: str):
     rng = np.random.default_rng(13)
     points, pixels = seen_points(Pose2(), n, rng)
     if kind == "nan":
@@ -323,7 +323,7 @@ def test_degenerate_input_gives_none_or_a_pose_but_never_raises(n: int, kind: st
         assert fix is None
 
 
-def test_same_seed_same_pose() -> None:
+def test_same_seed_same_pose():
     _, points, covariances, pixels = noisy_problem(np.random.default_rng(14), n=60)
     fixes = [
         solve_planar_pose(points, pixels, CAMERA, rng=np.random.default_rng(1), point_covariances=covariances)

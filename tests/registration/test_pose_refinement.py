@@ -1,7 +1,5 @@
 """Looking closer, against the truth of a synthetic world; averages against an optimum found by search."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -41,20 +39,20 @@ def looks(pixel_sigma: float, count: int = 60) -> tuple[np.ndarray, np.ndarray, 
     return np.array(first), np.array(closer), np.array(squared)
 
 
-def test_sharp_pixels_give_a_smaller_covariance() -> None:
+def test_sharp_pixels_give_a_smaller_covariance():
     first, closer, squared = looks(0.12)
     assert np.median(closer) < 0.9 * np.median(first)
     assert np.median(closer) < 0.003
     assert 0.5 < np.mean(squared) < 4.5, "3 is expected"
 
 
-def test_the_noise_of_blurred_pixels_is_estimated() -> None:
+def test_the_noise_of_blurred_pixels_is_estimated():
     first, closer, squared = looks(1.0)
     assert np.median(closer) < 1.15 * np.median(first)
     assert np.mean(squared) < 4.5
 
 
-def test_that_another_pose_may_be_the_true_one_stays_in_the_covariance() -> None:
+def test_that_another_pose_may_be_the_true_one_stays_in_the_covariance():
     rng, a = np.random.default_rng(3), Pose2(2.5, 2.0, 0.3)
     node = take_node(WORLD, NodeId("r0", 1, 1), a, HERE, rng, Sensing(pixel_sigma=0.1))
     view, _ = take_view(WORLD, a @ Pose2(0.03, 0.02, 0.01), rng, Sensing(pixel_sigma=0.12))
@@ -68,7 +66,7 @@ def test_that_another_pose_may_be_the_true_one_stays_in_the_covariance() -> None
     assert np.allclose(both.covariance, alone.covariance + spread, rtol=1e-6, atol=1e-12)
 
 
-def test_a_refinement_that_leaves_most_landmarks_out_is_not_taken() -> None:
+def test_a_refinement_that_leaves_most_landmarks_out_is_not_taken():
     """Landmarks up to 100 m away, of which every third pixel is off by more than the others."""
     street, rng = room(0, 0, 100, 80, 3000, np.random.default_rng(1)), np.random.default_rng(7)
     first, closer = [], []
@@ -91,7 +89,7 @@ def test_a_refinement_that_leaves_most_landmarks_out_is_not_taken() -> None:
     assert np.max(closer) < 1.2 * np.max(first), "it was 2.2 times"
 
 
-def test_an_average_is_where_the_likelihood_is_highest() -> None:
+def test_an_average_is_where_the_likelihood_is_highest():
     rng = np.random.default_rng(3)
     middle = Pose2(0.4, -0.2, 3.1)
     poses = []

@@ -114,7 +114,7 @@ def expected_ratios(sightings: Sightings, pose_vector: np.ndarray, pitch_sigma: 
 
 @settings(max_examples=15, deadline=None)
 @given(seeds, st.integers(3, 12))
-def test_likelihoods_are_those_of_a_gaussian(seed: int, n: int) -> None:
+def test_likelihoods_are_those_of_a_gaussian(seed: int, n: int):
     """Of a right match, with the depth's beside it, over that of a wrong one; nothing outside the gates."""
     rng = np.random.default_rng(seed)
     for inverted in (False, True):
@@ -129,7 +129,7 @@ def test_likelihoods_are_those_of_a_gaussian(seed: int, n: int) -> None:
 
 @settings(max_examples=15, deadline=None)
 @given(seeds, st.integers(3, 12))
-def test_linearised_against_finite_differences(seed: int, n: int) -> None:
+def test_linearised_against_finite_differences(seed: int, n: int):
     rng = np.random.default_rng(seed)
     (forward, true), (backward, _) = scene(n, rng, False), scene(n, rng, True)
     stack = stack_sightings([forward, backward], PITCH_SIGMA)
@@ -190,7 +190,7 @@ def test_linearised_against_finite_differences(seed: int, n: int) -> None:
         np.testing.assert_allclose(alone, np.linalg.inv(covariance), rtol=1e-3, atol=1e-6 * scale)
 
 
-def test_sightings_are_levelled_as_rays_turn() -> None:
+def test_sightings_are_levelled_as_rays_turn():
     rng = np.random.default_rng(5)
     for inverted, sign in ((False, 1.0), (True, -1.0)):
         sightings, _ = scene(20, rng, inverted)
@@ -199,7 +199,7 @@ def test_sightings_are_levelled_as_rays_turn() -> None:
             np.testing.assert_allclose(sightings.levelled(pitch).pixels, expected, atol=1e-9)
 
 
-def test_degenerate_points_determine_no_pose() -> None:
+def test_degenerate_points_determine_no_pose():
     assert determined(np.diag([1.0, 1.0, 1e-6]))
     assert not determined(np.diag([1.0, 1.0, 1e-12]))
     assert not determined(np.zeros((3, 3)))

@@ -46,7 +46,7 @@ def somewhere(rng: np.random.Generator) -> Pose2:
     return Pose2(*rng.uniform([1.5, 1.2, -3.1], [3.5, 2.8, 3.1]))
 
 
-def test_views_nearby_are_recognised_with_an_honest_pose() -> None:
+def test_views_nearby_are_recognised_with_an_honest_pose():
     rng = np.random.default_rng(2)
     distances, count = [], 0
     for _ in range(60):
@@ -62,7 +62,7 @@ def test_views_nearby_are_recognised_with_an_honest_pose() -> None:
 
 
 @pytest.mark.parametrize("pitch", [-0.012, 0.012])
-def test_a_camera_that_looks_further_up_or_down_recognises_as_much(pitch: float) -> None:
+def test_a_camera_that_looks_further_up_or_down_recognises_as_much(pitch: float):
     """0.7 degrees, 3 px: a planar pose is 7 of its sigmas off then."""
     rng, distances, shares = np.random.default_rng(12), [], []
     sharp = Sensing(pixel_sigma=0.3, depth_share=0.02)
@@ -80,7 +80,7 @@ def test_a_camera_that_looks_further_up_or_down_recognises_as_much(pitch: float)
     assert max(distances) < 20 and np.mean(distances) < 3.5
 
 
-def test_nodes_of_cameras_that_look_differently_far_up_are_registered() -> None:
+def test_nodes_of_cameras_that_look_differently_far_up_are_registered():
     """In one estimate with points of either: what one camera sees too low the other sees too high."""
     rng, found = np.random.default_rng(14), []
     for _ in range(30):
@@ -98,7 +98,7 @@ def test_nodes_of_cameras_that_look_differently_far_up_are_registered() -> None:
     assert max(found) < 20 and np.mean(found) < 3.5
 
 
-def test_pairs_are_the_same_landmarks() -> None:
+def test_pairs_are_the_same_landmarks():
     rng = np.random.default_rng(3)
     where = Pose2(2.5, 2.0, 0.3)
     seed = int(rng.integers(1000))
@@ -112,7 +112,7 @@ def test_pairs_are_the_same_landmarks() -> None:
     assert recognition.inliers == len(recognition.pairs) == recognition.evidence["inliers"]
 
 
-def test_views_of_elsewhere_are_not_recognised() -> None:
+def test_views_of_elsewhere_are_not_recognised():
     rng = np.random.default_rng(4)
     for _ in range(40):
         a = somewhere(rng)
@@ -121,7 +121,7 @@ def test_views_of_elsewhere_are_not_recognised() -> None:
         assert isinstance(verdict, RecognitionFailure) and verdict.reason
 
 
-def test_two_nodes_register_the_same_in_both_directions() -> None:
+def test_two_nodes_register_the_same_in_both_directions():
     rng = np.random.default_rng(5)
     distances, sure = [], []
     for _ in range(30):
@@ -140,7 +140,7 @@ def test_two_nodes_register_the_same_in_both_directions() -> None:
     assert np.mean(sure) > 10
 
 
-def test_depths_of_only_one_side_suffice_whichever_it_is() -> None:
+def test_depths_of_only_one_side_suffice_whichever_it_is():
     rng = np.random.default_rng(6)
     a = Pose2(2.5, 2.0, 0.3)
     b = a @ Pose2(0.2, -0.1, 0.1)
@@ -155,7 +155,7 @@ def test_depths_of_only_one_side_suffice_whichever_it_is() -> None:
         assert verdict.node_from_robot.mahalanobis2(true) < 16.3
 
 
-def test_depths_that_do_not_agree_are_refused() -> None:
+def test_depths_that_do_not_agree_are_refused():
     """A poster twice as large, twice as far away: every pixel fits, the depths do not."""
     rng = np.random.default_rng(7)
     a = Pose2(2.5, 2.0, 0.3)
@@ -175,9 +175,7 @@ def test_depths_that_do_not_agree_are_refused() -> None:
         ({"LEAST_SHARE": 1.01}, "of the matches agree"),
     ],
 )
-def test_each_rule_refuses_with_its_own_reason(
-    change: dict[str, float], word: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_rule_refuses_with_its_own_reason(change: dict[str, float], word: str, monkeypatch):
     for name, value in change.items():
         if name.isupper():
             monkeypatch.setattr(recognition, name, value)
@@ -191,8 +189,8 @@ def test_each_rule_refuses_with_its_own_reason(
 
 @pytest.mark.parametrize(("distance", "linked"), [(0.05, True), (0.5, False)])
 def test_a_rival_pose_nearer_than_the_position_may_be_uncertain_refuses_nothing(
-    distance: float, linked: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    distance: float, linked: bool, monkeypatch
+):
     """The landmarks are about 2 m away, and 6 % of that is allowed."""
     solve = recognition.solve_sightings
 
@@ -212,7 +210,7 @@ def test_a_rival_pose_nearer_than_the_position_may_be_uncertain_refuses_nothing(
         assert isinstance(verdict, RecognitionFailure) and "on the other side" in verdict.reason
 
 
-def test_a_patch_in_a_corner_does_not_make_a_place() -> None:
+def test_a_patch_in_a_corner_does_not_make_a_place():
     """The same small poster in another room: many inliers, all in one corner of the image."""
     rng = np.random.default_rng(9)
     a = Pose2(2.5, 2.0, 0.0)
@@ -227,7 +225,7 @@ def test_a_patch_in_a_corner_does_not_make_a_place() -> None:
     assert isinstance(examine_view(node, mixed, None, rng), RecognitionFailure)
 
 
-def test_empty_nodes_and_views_are_refused_in_words() -> None:
+def test_empty_nodes_and_views_are_refused_in_words():
     rng = np.random.default_rng(10)
     a = Pose2(2.5, 2.0, 0.0)
     empty = replace(node_at(a, rng), landmarks=Landmarks.empty())

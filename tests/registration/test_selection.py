@@ -55,13 +55,13 @@ def by_hand(landmarks: Landmarks, likely: np.ndarray, settings: SelectionSetting
 
 
 @pytest.mark.parametrize("n", [0, 1, 2, 25])
-def test_against_a_plain_loop(n: int) -> None:
+def test_against_a_plain_loop(n: int):
     some = candidates(n, n)
     likely = np.random.default_rng(n).uniform(0.3, 1.3, n)
     assert choose(some, likely, CAMERA, PLENTY).tolist() == by_hand(some, likely, PLENTY)
 
 
-def test_more_bytes_keep_more_of_the_same() -> None:
+def test_more_bytes_keep_more_of_the_same():
     some, likely = candidates(150, 1), np.random.default_rng(1).uniform(0.3, 1.3, 150)
     kept = [choose(some, likely, CAMERA, SelectionSettings(b)).tolist() for b in (700, 1000, 2000, 10_000)]
     for fewer, more in pairwise(kept):
@@ -70,7 +70,7 @@ def test_more_bytes_keep_more_of_the_same() -> None:
     assert len(kept[-1]) == 150
 
 
-def test_twins_come_last() -> None:
+def test_twins_come_last():
     """Similar landmarks are ambiguous, so no match of theirs passes the ratio test."""
     some = candidates(40, 2)
     some.codes[30:] = some.codes[30]
@@ -79,7 +79,7 @@ def test_twins_come_last() -> None:
     assert (distinctness(some, 0.5)[30:] == 0).all()
 
 
-def test_the_first_selected_landmarks_cover_the_image() -> None:
+def test_the_first_selected_landmarks_cover_the_image():
     """Nine tenths of the candidates are in one corner."""
     some = candidates(150, 3)
     some.pixels[:135] *= 0.2
@@ -88,12 +88,12 @@ def test_the_first_selected_landmarks_cover_the_image() -> None:
     assert (kept >= 135).sum() >= 12
 
 
-def test_tracked_and_strong_landmarks_come_first() -> None:
+def test_tracked_and_strong_landmarks_come_first():
     seen, rank = np.array([1.0, 0.0, 1.0]), np.array([0.0, 0.0, 0.9])
     likely = worth(seen, rank)
     assert likely[0] > likely[2] > likely[1] > 0
 
 
-def test_a_budget_that_makes_no_sense_is_refused() -> None:
+def test_a_budget_that_makes_no_sense_is_refused():
     with pytest.raises(InvalidValue):
         SelectionSettings(2 * FIXED_BYTES - 1)

@@ -1,7 +1,5 @@
 """Similarity transforms: against scipy, refits by brute force, and Monte Carlo."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -65,7 +63,7 @@ def by_scipy(a: Array, b: Array, covariance: Array, scale: float | None) -> tupl
 
 @given(transforms, st.integers(0, 2**32 - 1), st.integers(3, 9), st.booleans())
 @settings(max_examples=40, deadline=None)
-def test_exact_pairs_give_the_exact_transform(truth: Similarity, seed: int, count: int, known: bool) -> None:
+def test_exact_pairs_give_the_exact_transform(truth: Similarity, seed: int, count: int, known: bool):
     b = np.random.default_rng(seed).uniform(0.0, 100.0, (count, 2))
     fit = fit_similarity(truth.apply(b), b, np.eye(2 * count), truth.scale if known else None)
     assert np.allclose(fit.a_from_b.apply(b), truth.apply(b), atol=1e-6)
@@ -73,7 +71,7 @@ def test_exact_pairs_give_the_exact_transform(truth: Similarity, seed: int, coun
 
 
 @pytest.mark.parametrize("known", [None, TRUTH.scale])
-def test_the_optimum_is_that_of_scipy(known: float | None) -> None:
+def test_the_optimum_is_that_of_scipy(known: float | None):
     for seed in range(4):
         a, b, covariance = world(seed, 3 + seed)
         fit = fit_similarity(a, b, covariance, known)
@@ -84,7 +82,7 @@ def test_the_optimum_is_that_of_scipy(known: float | None) -> None:
 
 
 @pytest.mark.parametrize("known", first_quick([None, TRUTH.scale], 1))
-def test_the_covariance_is_that_of_many_trials(known: float | None) -> None:
+def test_the_covariance_is_that_of_many_trials(known: float | None):
     count, trials = 5, 1500
     _, b, covariance = world(1, count)
     noise = np.random.default_rng(7).multivariate_normal(np.zeros(2 * count), covariance, trials)
@@ -103,7 +101,7 @@ def test_the_covariance_is_that_of_many_trials(known: float | None) -> None:
     assert known is None or not predicted[3].any()
 
 
-def test_it_does_not_matter_which_point_is_held() -> None:
+def test_it_does_not_matter_which_point_is_held():
     """A motion of all points as one, however uncertain, changes the covariance and not the transform."""
     a, b, covariance = world(3, 6)
     moves = np.zeros((6, 2, 3))
@@ -120,7 +118,7 @@ def test_it_does_not_matter_which_point_is_held() -> None:
 
 
 @pytest.mark.parametrize("known", first_quick([None, TRUTH.scale], 1))
-def test_each_wrong_pair_is_named(known: float | None) -> None:
+def test_each_wrong_pair_is_named(known: float | None):
     named = 0
     for seed in range(20):
         count = 5 + seed % 4
@@ -140,7 +138,7 @@ def test_each_wrong_pair_is_named(known: float | None) -> None:
 
 @pytest.mark.parametrize("known", [None, TRUTH.scale])
 @pytest.mark.parametrize("sloppy", first_quick([1.0, 4.0], 1))
-def test_right_pairs_are_rarely_called_wrong(known: float | None, sloppy: float) -> None:
+def test_right_pairs_are_rarely_called_wrong(known: float | None, sloppy: float):
     """Also where a person clicks four times less exactly than assumed."""
     trials = 200
     false = 0
@@ -152,14 +150,14 @@ def test_right_pairs_are_rarely_called_wrong(known: float | None, sloppy: float)
     assert false <= 7
 
 
-def test_three_pairs_with_a_free_scale_cannot_name_the_wrong_one() -> None:
+def test_three_pairs_with_a_free_scale_cannot_name_the_wrong_one():
     a, b, covariance = world(5, 3)
     a[1] += 5.0
     assert wrong_pair(leave_one_out(a, b, covariance)) is None
     assert wrong_pair(leave_one_out(a, b, covariance, TRUTH.scale)) in (None, 1)
 
 
-def test_a_stretched_plan_contradicts_its_scale() -> None:
+def test_a_stretched_plan_contradicts_its_scale():
     a, b, covariance = world(11, 8, Similarity(1.0, 2.0, -0.4, 0.0512), correlated=False)
     scale, sigmas = scale_contradiction(a, b, covariance, 0.05)
     assert scale == pytest.approx(0.0512, rel=0.01)
@@ -171,9 +169,7 @@ def test_a_stretched_plan_contradicts_its_scale() -> None:
 
 @pytest.mark.parametrize("count", [3, 4])
 @pytest.mark.parametrize("given", [0.02, 0.1])
-def test_pairs_that_agree_on_another_scale_than_the_given_one_are_not_called_wrong(
-    count: int, given: float
-) -> None:
+def test_pairs_that_agree_on_another_scale_than_the_given_one_are_not_called_wrong(count: int, given: float):
     a, b, covariance = world(11, count, correlated=False)
     words = f"the given scale of {given:g} m/px does not fit: .* agree on 0.0(49|50)"
     with pytest.raises(InvalidValue, match=words):
@@ -185,7 +181,7 @@ def test_pairs_that_agree_on_another_scale_than_the_given_one_are_not_called_wro
 
 @pytest.mark.parametrize("count", [3, 4, 5, 8])
 @pytest.mark.parametrize("factor", [1.1, 1.5, 2.0])
-def test_a_wrong_scale_is_named_however_many_pairs_there_are(count: int, factor: float) -> None:
+def test_a_wrong_scale_is_named_however_many_pairs_there_are(count: int, factor: float):
     """Of more pairs the mirror image is clearly worse, also with a wrong scale."""
     for seed in range(5):
         a, b, covariance = world(seed, count)
@@ -194,7 +190,7 @@ def test_a_wrong_scale_is_named_however_many_pairs_there_are(count: int, factor:
 
 
 @pytest.mark.parametrize("off", [1.0, 2.0, 5.0])
-def test_a_wrong_pair_of_many_is_not_taken_for_a_wrong_scale(off: float) -> None:
+def test_a_wrong_pair_of_many_is_not_taken_for_a_wrong_scale(off: float):
     rng = np.random.default_rng(3)
     for seed in range(30):
         a, b, covariance = world(seed, 8)
@@ -202,7 +198,7 @@ def test_a_wrong_pair_of_many_is_not_taken_for_a_wrong_scale(off: float) -> None
         check_pairs(a, b, covariance, TRUTH.scale)
 
 
-def test_pairs_that_determine_nothing_are_refused() -> None:
+def test_pairs_that_determine_nothing_are_refused():
     plane = np.array([[0.0, 0.0], [400.0, 0.0], [100.0, 300.0], [350.0, 500.0]])
     loose = 0.01 * np.eye(8)
     check_pairs(TRUTH.apply(plane), plane, loose)

@@ -1,7 +1,5 @@
 """The old file or the new one, never a part of either."""
 
-from __future__ import annotations
-
 import errno
 import fcntl
 import os
@@ -35,7 +33,7 @@ def small_files() -> Iterator[None]:
         signal.signal(signal.SIGXFSZ, handler)
 
 
-def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_full_disk_leaves_the_old_file(tmp_path, monkeypatch):
     # Python would keep bytecode that is cut off.
     monkeypatch.setattr(sys, "dont_write_bytecode", True)
     path = tmp_path / "x"
@@ -46,7 +44,7 @@ def test_a_full_disk_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.Mon
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_interrupted_write_leaves_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "x"
     write_whole(path, b"old")
 
@@ -59,7 +57,7 @@ def test_an_interrupted_write_leaves_the_old_file(tmp_path: Path, monkeypatch: p
     assert path.read_bytes() == b"old" and list(tmp_path.iterdir()) == [path]
 
 
-def test_a_link_to_a_file_stays_a_link(tmp_path: Path) -> None:
+def test_a_link_to_a_file_stays_a_link(tmp_path):
     path, link = tmp_path / "x", tmp_path / "link"
     path.write_bytes(b"old")
     link.symlink_to(path)
@@ -67,7 +65,7 @@ def test_a_link_to_a_file_stays_a_link(tmp_path: Path) -> None:
     assert link.is_symlink() and path.read_bytes() == b"new"
 
 
-def test_a_pipe_is_written_into(tmp_path: Path) -> None:
+def test_a_pipe_is_written_into(tmp_path):
     pipe = tmp_path / "pipe"
     os.mkfifo(pipe)
     reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
@@ -86,7 +84,7 @@ def test_a_pipe_is_written_into(tmp_path: Path) -> None:
         ("file/x", "there is no folder .*file"),
     ],
 )
-def test_places_where_no_file_can_be(tmp_path: Path, place: str, words: str) -> None:
+def test_places_where_no_file_can_be(tmp_path, place: str, words: str):
     (tmp_path / "file").write_bytes(b"")
     for path in (tmp_path / place, Path("." if not place else f"{tmp_path}/{place}")):
         with pytest.raises(InvalidFile, match=words):
@@ -102,9 +100,7 @@ def test_places_where_no_file_can_be(tmp_path: Path, place: str, words: str) -> 
         (MAP_FILE + b"\x01", "a map file is there; give another name"),
     ],
 )
-def test_what_robots_have_made_is_not_written_over_with_something_else(
-    there: bytes, words: str, tmp_path: Path
-) -> None:
+def test_what_robots_have_made_is_not_written_over_with_something_else(there: bytes, words: str, tmp_path):
     path = tmp_path / "x"
     path.write_bytes(there)
     for data in (b"a picture", b"", memoryview(b"a picture")):
@@ -114,7 +110,7 @@ def test_what_robots_have_made_is_not_written_over_with_something_else(
     assert path.read_bytes() == there and list(tmp_path.iterdir()) == [path]
 
 
-def test_a_newer_map_takes_the_place_of_a_map_and_of_no_other_file(tmp_path: Path) -> None:
+def test_a_newer_map_takes_the_place_of_a_map_and_of_no_other_file(tmp_path):
     path, newer = tmp_path / "x", MAP_FILE + b"\x02"
     path.write_bytes(MAP_FILE + b"\x01")
     write_whole(path, newer)
@@ -130,9 +126,7 @@ def test_a_newer_map_takes_the_place_of_a_map_and_of_no_other_file(tmp_path: Pat
     assert path.read_bytes() == newer
 
 
-def test_a_disk_that_is_read_only_is_named_with_the_file_itself(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_is_read_only_is_named_with_the_file_itself(tmp_path, monkeypatch):
     """Not with the temporary file, which cannot be removed there either."""
     path = tmp_path / "x"
     write_whole(path, b"old")
@@ -146,7 +140,7 @@ def test_a_disk_that_is_read_only_is_named_with_the_file_itself(
         write_whole(path, b"new")
 
 
-def test_a_share_that_locks_no_folders_takes_changes(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_share_that_locks_no_folders_takes_changes(tmp_path, monkeypatch):
     """NFS locks only what is open for writing, which no folder is."""
     path, flock = tmp_path / "a.mapweave", fcntl.flock
     write_whole(path, b"before")
@@ -162,9 +156,7 @@ def test_a_share_that_locks_no_folders_takes_changes(tmp_path: Path, monkeypatch
     assert path.read_bytes() == b"after" and [*tmp_path.iterdir()] == [path]
 
 
-def test_who_waits_in_vain_for_another_command_changes_nothing(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_who_waits_in_vain_for_another_command_changes_nothing(tmp_path, monkeypatch):
     monkeypatch.setattr(atomic_file, "PATIENCE", 0.05)
     path = tmp_path / "a.mapweave"
     write_whole(path, b"before")

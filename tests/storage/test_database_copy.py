@@ -1,7 +1,5 @@
 """Copies of SQLite files that a process writes to; and which process such a file belongs to."""
 
-from __future__ import annotations
-
 import json
 import sqlite3
 import subprocess
@@ -40,7 +38,7 @@ def lines(path: Path) -> int:
         return int(copy.connection.execute("SELECT count(*) FROM line").fetchone()[0])
 
 
-def test_a_copy_is_of_one_moment_while_its_owner_writes_on(notes: Database, tmp_path: Path) -> None:
+def test_a_copy_is_of_one_moment_while_its_owner_writes_on(notes: Database, tmp_path):
     write(notes, 3000)
     seen: list[int] = []
 
@@ -58,7 +56,7 @@ def test_a_copy_is_of_one_moment_while_its_owner_writes_on(notes: Database, tmp_
     assert sorted(path.name for path in tmp_path.glob("*copy*")) == ["copy"]
 
 
-def test_a_file_that_no_process_has_open_is_copied_and_not_changed(notes: Database, tmp_path: Path) -> None:
+def test_a_file_that_no_process_has_open_is_copied_and_not_changed(notes: Database, tmp_path):
     write(notes, 10)
     notes.close()
     notes.path.chmod(0o600)
@@ -72,7 +70,7 @@ def test_a_file_that_no_process_has_open_is_copied_and_not_changed(notes: Databa
     assert (lines(tmp_path / "copy"), lines(notes.path)) == (11, 10)
 
 
-def test_nothing_is_written_over_and_nothing_half_done_stays(notes: Database, tmp_path: Path) -> None:
+def test_nothing_is_written_over_and_nothing_half_done_stays(notes: Database, tmp_path):
     write(notes, 10)
     there = tmp_path / "there"
     there.write_text("mine")
@@ -95,7 +93,7 @@ def test_nothing_is_written_over_and_nothing_half_done_stays(notes: Database, tm
     assert left == {"there", "late"}
 
 
-def test_a_damaged_file_is_not_taken_for_a_backup(notes: Database, tmp_path: Path) -> None:
+def test_a_damaged_file_is_not_taken_for_a_backup(notes: Database, tmp_path):
     write(notes, 500)
     notes.close()
     data = bytearray(notes.path.read_bytes())
@@ -109,7 +107,7 @@ def test_a_damaged_file_is_not_taken_for_a_backup(notes: Database, tmp_path: Pat
     assert "\n" not in str(error.value) and not list(tmp_path.glob("*copy*"))
 
 
-def test_a_file_belongs_to_one_owner_which_may_be_read(notes: Database, tmp_path: Path) -> None:
+def test_a_file_belongs_to_one_owner_which_may_be_read(notes: Database, tmp_path):
     write(notes, 1)
     with pytest.raises(InvalidFile, match="is in use by another process; stop it first"):
         Database(notes.path, *OPEN)
@@ -124,7 +122,7 @@ def test_a_file_belongs_to_one_owner_which_may_be_read(notes: Database, tmp_path
     assert [path.name for path in tmp_path.iterdir()] == ["notes.sqlite"], "neither lock nor log stays"
 
 
-def test_an_owner_that_is_killed_owns_no_longer_and_its_last_commits_are_copied(tmp_path: Path) -> None:
+def test_an_owner_that_is_killed_owns_no_longer_and_its_last_commits_are_copied(tmp_path):
     path = tmp_path / "notes.sqlite"
     program = (
         "import os, sys; from pathlib import Path\n"
@@ -142,7 +140,7 @@ def test_an_owner_that_is_killed_owns_no_longer_and_its_last_commits_are_copied(
     assert lines(path) == 8
 
 
-def test_among_many_that_want_a_file_there_is_one_owner_at_a_time(tmp_path: Path) -> None:
+def test_among_many_that_want_a_file_there_is_one_owner_at_a_time(tmp_path):
     path, inside, most, turns = tmp_path / "file", [0], [0], [0]
 
     def want() -> None:
@@ -219,7 +217,7 @@ print(json.dumps(said))
 
 
 @pytest.mark.slow
-def test_full_disks_are_named_and_left_as_they_were(tmp_path: Path) -> None:
+def test_full_disks_are_named_and_left_as_they_were(tmp_path):
     command = [*own_mounts(), sys.executable, "-c", FULL, str(tmp_path)]
     root = Path(__file__).parents[2]
     ran = subprocess.run(command, capture_output=True, text=True, timeout=120, cwd=root)
@@ -235,7 +233,7 @@ def test_full_disks_are_named_and_left_as_they_were(tmp_path: Path) -> None:
         assert "in use by" in line
 
 
-def test_a_program_that_writes_into_the_file_of_an_owner_is_waited_for(notes: Database) -> None:
+def test_a_program_that_writes_into_the_file_of_an_owner_is_waited_for(notes: Database):
     write(notes, 1)
     with closing(sqlite3.connect(notes.path, isolation_level=None)) as other:
         other.execute("BEGIN IMMEDIATE")

@@ -1,7 +1,5 @@
 """A full disk is one line of the log, and so is that it has room again, however much is written to it."""
 
-from __future__ import annotations
-
 import errno
 import os
 from contextlib import closing
@@ -33,7 +31,7 @@ def full(path: Path) -> FullDisk:
     return FullDisk.of_file(f"{path}: {WORDS}", path)
 
 
-def test_each_disk_is_one_line_until_it_has_room(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_each_disk_is_one_line_until_it_has_room(tmp_path, caplog):
     store, cache = tmp_path / "one" / "folder" / "s0.sqlite", tmp_path / "one" / "s0.sqlite.verdicts"
     elsewhere = tmp_path / "other" / "notes"
     for path in (store, cache, store, elsewhere, cache):
@@ -51,13 +49,11 @@ def test_each_disk_is_one_line_until_it_has_room(tmp_path: Path, caplog: pytest.
     assert logged(full(store)) and len(caplog.messages) == 2, "it is full once more"
 
 
-def test_other_errors_are_the_callers_to_log(caplog: pytest.LogCaptureFixture) -> None:
+def test_other_errors_are_the_callers_to_log(caplog):
     assert not logged(InvalidFile("damaged")) and not caplog.messages
 
 
-def test_a_database_that_takes_a_little_now_and_then_has_no_room_yet(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_database_that_takes_a_little_now_and_then_has_no_room_yet(monkeypatch, caplog):
     """Its pages have room for one change where its disk has none for ten: each was two lines of the log."""
     now = [0.0]
     monkeypatch.setattr(full_disks, "_full_disks", full_disks._FullDisks(lambda: now[0]))
@@ -73,9 +69,7 @@ def test_a_database_that_takes_a_little_now_and_then_has_no_room_yet(
     ]
 
 
-def test_a_database_on_a_full_disk_says_so_and_that_it_is_written_again(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_database_on_a_full_disk_says_so_and_that_it_is_written_again(tmp_path, monkeypatch, caplog):
     """A change that fits into a page that it has is written in between, and says nothing of the disk."""
     now = [0.0]
     monkeypatch.setattr(full_disks, "_full_disks", full_disks._FullDisks(lambda: now[0]))
@@ -104,9 +98,7 @@ def test_a_database_on_a_full_disk_says_so_and_that_it_is_written_again(
     ]
 
 
-def test_a_file_on_a_full_disk_says_so_and_that_it_is_written_again(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_file_on_a_full_disk_says_so_and_that_it_is_written_again(tmp_path, caplog):
     path = tmp_path / "one" / "file"
 
     def no_room(handle: int) -> None:

@@ -1,7 +1,5 @@
 """Images from disk: as they were written, or one line that says what is wrong."""
 
-from __future__ import annotations
-
 import re
 import struct
 import zlib
@@ -160,7 +158,7 @@ def test_a_device_is_no_image():
         read_grey(Path("/dev/zero"))
 
 
-def test_an_animated_png_is_decoded_as_a_still_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_animated_png_is_decoded_as_a_still_one(monkeypatch):
     """Of 50 megapixels it took 670 MB instead of 145, to show its first frame."""
 
     def chunk(kind: bytes, content: bytes) -> bytes:

@@ -1,7 +1,5 @@
 """Images of floor plans, and map.yaml files of Nav2."""
 
-from __future__ import annotations
-
 import hashlib
 import tracemalloc
 import zlib
@@ -25,7 +23,7 @@ COLOUR = np.dstack([GREY, 255 - GREY, GREY // 2])
     [*((suffix, GREY) for suffix in (".png", ".pgm", ".bmp", ".jpg")),
      *((suffix, COLOUR) for suffix in (".png", ".ppm", ".bmp", ".jpg"))],
 )  # fmt: skip
-def test_any_image_is_kept_as_a_png(tmp_path: Path, suffix: str, pixels: np.ndarray) -> None:
+def test_any_image_is_kept_as_a_png(tmp_path, suffix: str, pixels: np.ndarray):
     path = tmp_path / f"plan{suffix}"
     cv2.imwrite(str(path), pixels)
     expected = cv2.imread(str(path), cv2.IMREAD_COLOR)[:, :, ::-1]
@@ -43,7 +41,7 @@ def in_colour(pixels: np.ndarray) -> np.ndarray:
     return np.dstack([pixels] * 3) if pixels.ndim == 2 else pixels
 
 
-def test_what_is_transparent_is_white_and_16_bits_become_8() -> None:
+def test_what_is_transparent_is_white_and_16_bits_become_8():
     clear = np.dstack(
         [np.full((2, 3), 40, np.uint8)] * 3 + [np.array([[0, 255, 0], [255, 0, 255]], np.uint8)]
     )
@@ -55,7 +53,7 @@ def test_what_is_transparent_is_white_and_16_bits_become_8() -> None:
         assert np.array_equal(found, GREY)
 
 
-def test_a_transparent_colour_of_a_palette_is_white() -> None:
+def test_a_transparent_colour_of_a_palette_is_white():
     """Black lines on a transparent ground were black on black."""
 
     def chunk(kind: bytes, data: bytes) -> bytes:
@@ -69,7 +67,7 @@ def test_a_transparent_colour_of_a_palette_is_white() -> None:
     assert in_colour(plan_pixels(plan_file(png).png))[0, :, 0].tolist() == [255, 0, 255]
 
 
-def test_a_long_plan_is_refused_before_it_is_decoded(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_plan_is_refused_before_it_is_decoded(monkeypatch):
     long = bytearray(cv2.imencode(".png", GREY)[1].tobytes())
     long[16:24] = (20_001).to_bytes(4, "big") + (2_000).to_bytes(4, "big")
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
@@ -77,7 +75,7 @@ def test_a_long_plan_is_refused_before_it_is_decoded(monkeypatch: pytest.MonkeyP
         plan_file(bytes(long))
 
 
-def test_a_large_transparent_plan_takes_no_more_memory_than_its_pixels() -> None:
+def test_a_large_transparent_plan_takes_no_more_memory_than_its_pixels():
     """A PNG of 50 kB with 50 million pixels took 1.8 GB: all of it as numbers of four bytes, twice."""
     rows = 4096
     image = np.zeros((rows, 1000, 4), np.uint8)
@@ -92,7 +90,7 @@ def test_a_large_transparent_plan_takes_no_more_memory_than_its_pixels() -> None
     assert peak < 1.5 * white.nbytes
 
 
-def test_no_image_and_too_large_ones_are_refused(tmp_path: Path) -> None:
+def test_no_image_and_too_large_ones_are_refused(tmp_path):
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + bytes(40))
     (tmp_path / "b.png").write_text("a page")
     huge = bytearray(cv2.imencode(".png", GREY)[1].tobytes())
@@ -116,7 +114,7 @@ def test_no_image_and_too_large_ones_are_refused(tmp_path: Path) -> None:
 MAP = "image: plan.pgm\nresolution: 0.05\norigin: [-10.0, -5.5, 0.25]\n"
 
 
-def test_a_map_of_nav2_is_read(tmp_path: Path) -> None:
+def test_a_map_of_nav2_is_read(tmp_path):
     path = tmp_path / "map.yaml"
     path.write_text(
         f"# made by map_saver\n{MAP}negate: 1\noccupied_thresh: 0.65\nfree_thresh: 0.196\nmode: trinary\n"
@@ -153,7 +151,7 @@ def test_a_map_of_nav2_is_read(tmp_path: Path) -> None:
         ("a" * 10_000, "10000 bytes"),
     ],
 )
-def test_what_is_no_map_yaml_is_refused_in_one_line(tmp_path: Path, text: str, words: str) -> None:
+def test_what_is_no_map_yaml_is_refused_in_one_line(tmp_path, text: str, words: str):
     path = tmp_path / "map.yaml"
     path.write_text(text)
     with pytest.raises(InvalidFile, match=words) as refused:
@@ -164,7 +162,7 @@ def test_what_is_no_map_yaml_is_refused_in_one_line(tmp_path: Path, text: str, w
 
 
 @pytest.mark.parametrize("field", ["origin", "resolution", "negate", "free_thresh"])
-def test_aliases_of_aliases_fill_no_memory(tmp_path: Path, field: str) -> None:
+def test_aliases_of_aliases_fill_no_memory(tmp_path, field: str):
     """600 bytes of lists of lists, of which the text would take terabytes."""
     names = ["x", *(f"*a{k}" for k in range(13))]
     levels = [f"a{k}: &a{k} [{', '.join(9 * [name])}]\n" for k, name in enumerate(names)]

@@ -1,7 +1,5 @@
 """Whether waiting may help, of real servers that are down, starting, frozen, or that refuse."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 from collections.abc import Iterator
@@ -35,7 +33,7 @@ def away(address: str) -> bool:
     return waiting_may_help(read)
 
 
-def test_a_server_that_is_down_may_come(server: PostgresServer) -> None:
+def test_a_server_that_is_down_may_come(server: PostgresServer):
     server.stop()
     try:
         assert away(server.address())
@@ -44,11 +42,11 @@ def test_a_server_that_is_down_may_come(server: PostgresServer) -> None:
         server.start()
 
 
-def test_a_host_whose_name_is_not_known_yet_may_come() -> None:
+def test_a_host_whose_name_is_not_known_yet_may_come():
     assert away("postgresql://anna@none.invalid/maps")
 
 
-def test_a_frozen_server_may_go_on(server: PostgresServer) -> None:
+def test_a_frozen_server_may_go_on(server: PostgresServer):
     server.freeze()
     try:
         assert away(server.address())
@@ -56,9 +54,7 @@ def test_a_frozen_server_may_go_on(server: PostgresServer) -> None:
         server.thaw()
 
 
-def test_a_server_that_recovers_takes_sessions_later(
-    server: PostgresServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_that_recovers_takes_sessions_later(server: PostgresServer, monkeypatch):
     """It refuses all sessions while it replays its log, as a standby does that may not be read."""
     server.stop()
     (server.data / "standby.signal").touch()
@@ -88,7 +84,7 @@ def refused(address: str) -> str:
     return ""
 
 
-def test_no_database_user_or_password_comes_by_waiting(server: PostgresServer) -> None:
+def test_no_database_user_or_password_comes_by_waiting(server: PostgresServer):
     assert not away(server.address("none"))
     assert not away(server.address().replace("mapweave@", "stranger@"))
     # A machine that is down beside it changes nothing.
@@ -106,7 +102,7 @@ def test_no_database_user_or_password_comes_by_waiting(server: PostgresServer) -
         eventually(lambda: not refused(server.address()))
 
 
-def test_a_server_with_too_many_sessions_takes_another_one_later() -> None:
+def test_a_server_with_too_many_sessions_takes_another_one_later():
     servers = started("-c", "max_connections=8", "-c", "superuser_reserved_connections=3")
     server = next(servers)
     address = server.address().replace("mapweave@", "anna@")
@@ -130,7 +126,7 @@ def test_a_server_with_too_many_sessions_takes_another_one_later() -> None:
         servers.close()
 
 
-def test_one_of_several_standbys_may_become_the_primary() -> None:
+def test_one_of_several_standbys_may_become_the_primary():
     servers = started("-c", "default_transaction_read_only=on")
     try:
         assert away(next(servers).address())
@@ -140,7 +136,7 @@ def test_one_of_several_standbys_may_become_the_primary() -> None:
 
 @pytest.mark.slow
 @pytest.mark.waits
-def test_a_pooler_whose_server_is_down_is_waited_for(own_postgres: PostgresServer) -> None:
+def test_a_pooler_whose_server_is_down_is_waited_for(own_postgres: PostgresServer):
     with pooled(own_postgres, "session") as pooler:
         address = pooler.through(own_postgres.address())
         own_postgres.stop()
@@ -153,7 +149,7 @@ def test_a_pooler_whose_server_is_down_is_waited_for(own_postgres: PostgresServe
         assert away(address)
 
 
-def test_what_is_wrong_with_a_session_that_was_made_is_no_reason_to_wait(postgres: PostgresServer) -> None:
+def test_what_is_wrong_with_a_session_that_was_made_is_no_reason_to_wait(postgres: PostgresServer):
     session = PostgresSession(PostgresAddress.read(postgres.database()), "test")
     with pytest.raises(InvalidFile) as wrong, session.guard():
         session.connection.execute("SELECT * FROM none")

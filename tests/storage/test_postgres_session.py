@@ -1,12 +1,9 @@
 """What a session with PostgreSQL says when there is none: one line, and nothing of libraries."""
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Iterator
 from contextlib import closing, suppress
-from pathlib import Path
 
 import psycopg
 import pytest
@@ -25,9 +22,7 @@ def server() -> Iterator[PostgresServer]:
 
 
 @pytest.mark.parametrize("what", ["dup", "prepare"])
-def test_a_session_that_could_not_be_made_ready_is_not_used(
-    server: PostgresServer, what: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_session_that_could_not_be_made_ready_is_not_used(server: PostgresServer, what: str, monkeypatch):
     """No file may be opened any more, and later again: a session without its settings would lose what it
     commits, and one without its mark would fail for ever.
     """
@@ -79,11 +74,11 @@ def test_a_session_that_could_not_be_made_ready_is_not_used(
         ("postgresql:///maps?host=/run/postgresql&port=5433", "postgresql:///run/postgresql:5433/maps"),
     ],
 )
-def test_an_address_names_its_ports(address: str, words: str) -> None:
+def test_an_address_names_its_ports(address: str, words: str):
     assert PostgresAddress.read(address).words == words
 
 
-def test_each_of_several_machines_is_named_once_with_its_reason() -> None:
+def test_each_of_several_machines_is_named_once_with_its_reason():
     first, second = free_port(), free_port()
     address = PostgresAddress.read(f"postgresql://anna@127.0.0.1:{first},127.0.0.1:{second}/maps")
     with pytest.raises(InvalidFile) as away:
@@ -94,7 +89,7 @@ def test_each_of_several_machines_is_named_once_with_its_reason() -> None:
     )
 
 
-def test_a_standby_is_named_as_one_that_only_reads(tmp_path: Path) -> None:
+def test_a_standby_is_named_as_one_that_only_reads(tmp_path):
     servers = started("-c", "default_transaction_read_only=on")
     server = next(servers)
     try:
@@ -109,7 +104,7 @@ def test_a_standby_is_named_as_one_that_only_reads(tmp_path: Path) -> None:
         servers.close()
 
 
-def test_a_password_that_is_missing_is_looked_for_in_its_file(own_postgres: PostgresServer) -> None:
+def test_a_password_that_is_missing_is_looked_for_in_its_file(own_postgres: PostgresServer):
     (own_postgres.data / "pg_hba.conf").write_text("local all all scram-sha-256\n")
     with psycopg.connect(own_postgres.address(), autocommit=True) as connection:
         connection.execute("SELECT pg_reload_conf()")
@@ -125,7 +120,7 @@ def test_a_password_that_is_missing_is_looked_for_in_its_file(own_postgres: Post
     eventually(lambda: "no password supplied: ~/.pgpass (PGPASSFILE) has none" in refused())
 
 
-def test_a_lock_that_another_session_holds_is_explained(postgres: PostgresServer) -> None:
+def test_a_lock_that_another_session_holds_is_explained(postgres: PostgresServer):
     address = PostgresAddress.read(postgres.database())
     session = PostgresSession(address, "test", {"lock_timeout": "10ms"})
     with psycopg.connect(
@@ -140,7 +135,7 @@ def test_a_lock_that_another_session_holds_is_explained(postgres: PostgresServer
     session.close()
 
 
-def test_a_session_that_a_pooler_gave_to_another_is_not_used(postgres: PostgresServer) -> None:
+def test_a_session_that_a_pooler_gave_to_another_is_not_used(postgres: PostgresServer):
     session = PostgresSession(PostgresAddress.read(postgres.database()), "test")
     with session.guard(), session.transaction() as connection:
         connection.execute("CREATE TABLE public.kept (number INT)")
@@ -153,8 +148,8 @@ def test_a_session_that_a_pooler_gave_to_another_is_not_used(postgres: PostgresS
 
 
 def test_a_connection_that_is_lost_in_a_pipeline_says_no_more_than_its_error(
-    postgres: PostgresServer, caplog: pytest.LogCaptureFixture
-) -> None:
+    postgres: PostgresServer, caplog
+):
     session = PostgresSession(PostgresAddress.read(postgres.database()), "test")
     with pytest.raises(InvalidFile), session.guard(), session.connection.pipeline():
         with psycopg.connect(postgres.address(), autocommit=True) as other:
@@ -164,7 +159,7 @@ def test_a_connection_that_is_lost_in_a_pipeline_says_no_more_than_its_error(
     assert not caplog.records
 
 
-def test_a_server_that_was_killed_is_named_without_guesses(own_postgres: PostgresServer) -> None:
+def test_a_server_that_was_killed_is_named_without_guesses(own_postgres: PostgresServer):
     with closing(PostgresSession(PostgresAddress.read(own_postgres.address()), "test")) as session:
         connection = session.connection
         own_postgres.kill()

@@ -1,7 +1,5 @@
 """A PostgreSQL that stands still is given up; one where a commit has to wait is not."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Iterator
@@ -30,7 +28,7 @@ def ask(session: PostgresSession, query: str = "SELECT 1") -> object:
         return session.connection.execute(query).fetchone()
 
 
-def test_sessions_with_a_postgresql_that_stands_still_are_given_up(server: PostgresServer) -> None:
+def test_sessions_with_a_postgresql_that_stands_still_are_given_up(server: PostgresServer):
     used, idle = (PostgresSession(PostgresAddress.read(server.address()), name) for name in ("used", "idle"))
     watchdog = PostgresWatchdog(used, idle)
     assert ask(used) == ask(idle) == (1,)
@@ -58,7 +56,7 @@ def test_sessions_with_a_postgresql_that_stands_still_are_given_up(server: Postg
     watchdog.close()
 
 
-def test_a_session_that_waits_for_a_postgresql_that_runs_goes_on_waiting(server: PostgresServer) -> None:
+def test_a_session_that_waits_for_a_postgresql_that_runs_goes_on_waiting(server: PostgresServer):
     session = PostgresSession(PostgresAddress.read(server.address()), "waits")
     watchdog = PostgresWatchdog(session)
     began = time.monotonic()

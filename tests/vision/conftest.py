@@ -1,7 +1,5 @@
 """Images whose motion is known."""
 
-from __future__ import annotations
-
 import pytest
 
 from tests.vision.photographs import Pictures

@@ -1,7 +1,5 @@
 """Photographs, and how their points move when they are warped."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import skimage.data

@@ -1,7 +1,5 @@
 """Fisheye lenses against OpenCV's, finite differences, and themselves back and forth."""
 
-from __future__ import annotations
-
 import math
 
 import cv2
@@ -38,7 +36,7 @@ def tangents(angles: list[tuple[float, float]]) -> np.ndarray:
 
 
 @given(coefficients, angles)
-def test_points_are_where_opencv_sees_them(k, angles) -> None:
+def test_points_are_where_opencv_sees_them(k, angles):
     lens, rays = fisheye(k), tangents(angles)
     matrix = np.array([[REAL.fx, 0, REAL.cx], [0, REAL.fy, REAL.cy], [0, 0, 1]])
     points = np.column_stack([rays, np.ones(len(rays))])[:, None]
@@ -47,14 +45,14 @@ def test_points_are_where_opencv_sees_them(k, angles) -> None:
 
 
 @given(coefficients, angles)
-def test_rays_come_back(k, angles) -> None:
+def test_rays_come_back(k, angles):
     lens, rays = fisheye(k), tangents([(min(a, WIDEST), b) for a, b in angles])
     back = lens.rays(lens.project(rays))
     assert np.allclose(back, rays, atol=1e-7)
 
 
 @given(coefficients)
-def test_angles_beyond_a_fold_have_no_ray(k) -> None:
+def test_angles_beyond_a_fold_have_no_ray(k):
     lens = fisheye(k)
     rays = lens.rays(np.column_stack([np.linspace(-400.0, 700.0, 200), np.full(200, REAL.cy)]))
     known = rays[np.isfinite(rays[:, 0]), 0]
@@ -62,7 +60,7 @@ def test_angles_beyond_a_fold_have_no_ray(k) -> None:
     assert np.abs(known).max() <= math.tan(math.radians(80)) + 1e-6
 
 
-def test_lenses_that_fold_are_refused() -> None:
+def test_lenses_that_fold_are_refused():
     with pytest.raises(InvalidValue, match=r"folds its image over 4[0-9] degrees"):
         Equidistant(REAL.fx, REAL.fy, REAL.cx, REAL.cy, (-0.5, 0.0, 0.0, 0.0))
     with pytest.raises(InvalidValue, match="4 coefficients, not 5"):
@@ -71,7 +69,7 @@ def test_lenses_that_fold_are_refused() -> None:
         lens_of(REAL, LensModel.RADIAL_TANGENTIAL, K)
 
 
-def test_the_ideal_camera_sees_the_middle_of_the_field() -> None:
+def test_the_ideal_camera_sees_the_middle_of_the_field():
     ideal, lens = lens_of(REAL, LensModel.EQUIDISTANT, K)
     assert (ideal.width, ideal.height) == (REAL.width, REAL.height)
     assert (ideal.mount_height, ideal.mount_forward) == (0.3, 0.1)
@@ -86,7 +84,7 @@ def test_the_ideal_camera_sees_the_middle_of_the_field() -> None:
     assert (shown > -1).all() and (shown < [320, 240]).all()
 
 
-def test_a_rectified_image_is_a_pinholes() -> None:
+def test_a_rectified_image_is_a_pinholes():
     """A wall of texture straight ahead is a homography of the rectified image, as of any pinhole's."""
     ideal, lens = lens_of(REAL, LensModel.EQUIDISTANT, K)
     assert isinstance(lens, Equidistant)

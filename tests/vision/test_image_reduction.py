@@ -1,7 +1,5 @@
 """Large images: a place of the scene is seen where the reduced camera says, to a fraction of a pixel."""
 
-from __future__ import annotations
-
 import math
 
 import cv2
@@ -53,7 +51,7 @@ def centre(image: np.ndarray, near: Array, radius: float) -> Array:
 
 
 @pytest.mark.parametrize("size", SIZES)
-def test_every_shape_is_reduced_to_the_same_area(size: tuple[int, int]) -> None:
+def test_every_shape_is_reduced_to_the_same_area(size: tuple[int, int]):
     """By width alone, an upright image of 760x1350 was not reduced, and 801x601 became 400x300."""
     small = reduced_size(*size)
     assert 0.97 * MOST_PIXELS <= small.width * small.height <= MOST_PIXELS
@@ -61,7 +59,7 @@ def test_every_shape_is_reduced_to_the_same_area(size: tuple[int, int]) -> None:
 
 
 @pytest.mark.parametrize("size", [(800, 600), (640, 480), (621, 188), (512, 384), (600, 800), (16, 16)])
-def test_small_images_stay_as_they_are(size: tuple[int, int]) -> None:
+def test_small_images_stay_as_they_are(size: tuple[int, int]):
     assert reduced_size(*size) == size
     image = np.zeros((size[1], size[0]), np.uint8)
     assert reduced_image(image, reduced_size(*size)) is image
@@ -73,7 +71,7 @@ def test_small_images_stay_as_they_are(size: tuple[int, int]) -> None:
 @pytest.mark.parametrize(
     "size", first_quick([((801, 601),), ((760, 1350),), ((1280, 720),), ((2592, 1944),)], 3)
 )
-def test_a_point_is_seen_where_the_reduced_camera_says(size: tuple[int, int], kind: str) -> None:
+def test_a_point_is_seen_where_the_reduced_camera_says(size: tuple[int, int], kind: str):
     camera, lens = optics_of(*size, kind)
     small_size = reduced_size(*size)
     small, small_lens = reduced_optics(camera, lens, small_size)
@@ -86,13 +84,13 @@ def test_a_point_is_seen_where_the_reduced_camera_says(size: tuple[int, int], ki
         assert centre(image, pixel, 8.0) == pytest.approx(pixel, abs=0.05)
 
 
-def test_the_reduced_image_of_a_flat_grey_is_that_grey() -> None:
+def test_the_reduced_image_of_a_flat_grey_is_that_grey():
     image = np.full((1350, 760), 113, np.uint8)
     small = reduced_image(image, reduced_size(760, 1350))
     assert small.dtype == np.uint8 and (small == 113).all()
 
 
-def test_a_fine_pattern_does_not_alias() -> None:
+def test_a_fine_pattern_does_not_alias():
     """Stripes of a pixel, which a point sample would turn into wide ones, become grey."""
     image = np.zeros((1944, 2592), np.uint8)
     image[:, ::2] = 200
@@ -101,7 +99,7 @@ def test_a_fine_pattern_does_not_alias() -> None:
     assert np.abs(wide[20:-20, 20:-20].astype(float) - 100.0).max() < 8.0
 
 
-def test_a_reduced_fisheye_shows_the_field_that_its_image_has_when_it_is_calibrated_so() -> None:
+def test_a_reduced_fisheye_shows_the_field_that_its_image_has_when_it_is_calibrated_so():
     """A robot records reduced images with their lens: a replay finds the ideal camera that the robot had."""
     camera, lens = optics_of(1600, 1200, "fisheye")
     small, small_lens = reduced_optics(camera, lens, ImageSize(800, 600))

@@ -1,7 +1,5 @@
 """The lens against the formula of its model, and against itself back and forth."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st

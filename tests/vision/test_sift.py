@@ -1,7 +1,5 @@
 """Features are spread, can be tracked, and are free of the lens."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest

@@ -1,7 +1,5 @@
 """Values of the map as they may come: hypothesis strategies and a plain sample of everything."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from contextlib import closing

@@ -1,7 +1,5 @@
 """Buses that can talk to each other, in memory and over Zenoh, for what every bus must do."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 from mapweave.wire.bus import Bus, Reply, Sample

@@ -3,8 +3,6 @@
 Written from that page. It imports nothing of Mapweave, so that what the page leaves out shows.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import re

@@ -1,7 +1,5 @@
 """What a watcher knows of others is bounded, and what it reports is what holds."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 
@@ -47,7 +45,7 @@ def watching() -> Iterator[Watching]:
     watching.dispatcher.close()
 
 
-def test_a_token_that_comes_and_goes_without_end_is_one_task(watching: Watching) -> None:
+def test_a_token_that_comes_and_goes_without_end_is_one_task(watching: Watching):
     watching.hold()
     for _ in range(1000):
         watching.note("r3/alive/1", True)
@@ -59,7 +57,7 @@ def test_a_token_that_comes_and_goes_without_end_is_one_task(watching: Watching)
     assert ("r3/alive/1", True) not in watching.news
 
 
-def test_one_that_was_away_meanwhile_is_reported_as_that(watching: Watching) -> None:
+def test_one_that_was_away_meanwhile_is_reported_as_that(watching: Watching):
     """A server that was started again, say: it has forgotten what it was asked."""
     watching.note("r0/alive/1", True)
     eventually(lambda: watching.news == [("r0/alive/1", True)])
@@ -70,7 +68,7 @@ def test_one_that_was_away_meanwhile_is_reported_as_that(watching: Watching) -> 
     eventually(lambda: watching.news[-2:] == [("r0/alive/1", False), ("r0/alive/1", True)])
 
 
-def test_a_robot_that_goes_on_with_its_next_map_is_never_away(watching: Watching) -> None:
+def test_a_robot_that_goes_on_with_its_next_map_is_never_away(watching: Watching):
     watching.note("r0/alive/1", True)
     eventually(lambda: len(watching.news) == 1)
     watching.hold()
@@ -80,7 +78,7 @@ def test_a_robot_that_goes_on_with_its_next_map_is_never_away(watching: Watching
     eventually(lambda: watching.news[-2:] == [("r0/alive/2", True), ("r0/alive/1", False)])
 
 
-def test_names_and_keys_fill_no_memory(watching: Watching, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_and_keys_fill_no_memory(watching: Watching, monkeypatch):
     monkeypatch.setattr(alive_keys, "MOST", 100)
     for number in range(500):
         watching.note(f"x{number}/alive/1", True)
@@ -94,9 +92,7 @@ def test_names_and_keys_fill_no_memory(watching: Watching, monkeypatch: pytest.M
     eventually(lambda: watching.news[-1:] and watching.news[-1] == ("long/alive/1", True))
 
 
-def test_tokens_of_one_robot_leave_room_for_others(
-    watching: Watching, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_tokens_of_one_robot_leave_room_for_others(watching: Watching, monkeypatch, caplog):
     monkeypatch.setattr(alive_keys, "MOST", 2 * alive_keys.MOST_OF_ONE)
     for number in range(1000):
         watching.note(f"r3/alive/{number}", True)
@@ -108,7 +104,7 @@ def test_tokens_of_one_robot_leave_room_for_others(
     assert len(caplog.records) == 10, "a line at each power of two"
 
 
-def test_tokens_of_ros_2_are_no_robots(watching: Watching) -> None:
+def test_tokens_of_ros_2_are_no_robots(watching: Watching):
     for number in range(2 * alive_keys.MOST_OF_ONE):
         watching.keys.note(f"@ros2_lv/0/session/0/{number}/MP/%/%/node/%chatter", True)
     eventually(lambda: len(watching.news) == 2 * alive_keys.MOST_OF_ONE)

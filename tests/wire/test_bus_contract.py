@@ -1,7 +1,5 @@
 """What every bus must do, run on the in-memory and on the Zenoh implementation."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time
@@ -15,7 +13,7 @@ from tests.waiting import eventually
 from tests.wire.fleets import Fleet, settle, subscribe
 
 
-def test_a_message_comes_with_key_payload_and_attachment(fleet: Fleet) -> None:
+def test_a_message_comes_with_key_payload_and_attachment(fleet: Fleet):
     sender, receiver = fleet.join(), fleet.join()
     got = subscribe(receiver, sender, "a/b")
     sender.publish("a/b", b"\x00payload", b"\xffattachment")
@@ -33,7 +31,7 @@ def test_a_message_comes_with_key_payload_and_attachment(fleet: Fleet) -> None:
         ("a/b", {"a/b"}),
     ],
 )
-def test_patterns(fleet: Fleet, pattern: str, keys: set[str]) -> None:
+def test_patterns(fleet: Fleet, pattern: str, keys: set[str]):
     sender, receiver = fleet.join(), fleet.join()
     got = subscribe(receiver, sender, pattern)
     for key in ("a/b/c", "a/x/c", "a/b", "a", "z/c"):
@@ -46,7 +44,7 @@ def test_patterns(fleet: Fleet, pattern: str, keys: set[str]) -> None:
     assert len(got) == len(keys)
 
 
-def test_a_publisher_receives_its_own_messages(fleet: Fleet) -> None:
+def test_a_publisher_receives_its_own_messages(fleet: Fleet):
     bus = fleet.join()
     got = subscribe(bus, bus, "a")
     bus.publish("a", b"1")
@@ -54,7 +52,7 @@ def test_a_publisher_receives_its_own_messages(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("key", ["a/*", "**", "", "a//b", "/a", "a/", "a/@b", "a b", "a/b?c", "ä"])
-def test_invalid_keys_are_refused(fleet: Fleet, key: str) -> None:
+def test_invalid_keys_are_refused(fleet: Fleet, key: str):
     bus = fleet.join()
     with pytest.raises(InvalidValue):
         bus.publish(key, b"")
@@ -65,7 +63,7 @@ def test_invalid_keys_are_refused(fleet: Fleet, key: str) -> None:
             bus.subscribe(key, lambda _: None)
 
 
-def test_messages_of_one_sender_keep_their_order(fleet: Fleet) -> None:
+def test_messages_of_one_sender_keep_their_order(fleet: Fleet):
     sender, receiver = fleet.join(), fleet.join()
     got = subscribe(receiver, sender, "n")
     for n in range(200):
@@ -74,7 +72,7 @@ def test_messages_of_one_sender_keep_their_order(fleet: Fleet) -> None:
     assert [int.from_bytes(s.payload, "big") for s in got] == list(range(200))
 
 
-def test_a_reply_may_be_enough(fleet: Fleet) -> None:
+def test_a_reply_may_be_enough(fleet: Fleet):
     asker, frozen, quick = fleet.join(), fleet.join(), fleet.join()
     release = threading.Event()
     frozen.serve("who/frozen", lambda request: release.wait(60))
@@ -90,14 +88,14 @@ def test_a_reply_may_be_enough(fleet: Fleet) -> None:
     release.set()
 
 
-def test_no_server_to_ask(fleet: Fleet) -> None:
+def test_no_server_to_ask(fleet: Fleet):
     bus = fleet.join()
     begin = time.monotonic()
     assert bus.ask("no/server", b"?", 60.0) == []
     assert time.monotonic() - begin < 20, "an empty answer must not cost the time-out"
 
 
-def test_one_server_answers(fleet: Fleet) -> None:
+def test_one_server_answers(fleet: Fleet):
     asker, server = fleet.join(), fleet.join()
     server.serve("echo", lambda request: request.reply(request.key.encode() + b" " + request.payload))
     settle(asker, "echo")
@@ -105,7 +103,7 @@ def test_one_server_answers(fleet: Fleet) -> None:
     assert asker.ask("echo", b"", 3.0) == [Reply(payload=b"echo ")]
 
 
-def test_two_servers_answer_and_the_slow_one_does_not_hide_the_quick(fleet: Fleet) -> None:
+def test_two_servers_answer_and_the_slow_one_does_not_hide_the_quick(fleet: Fleet):
     asker, first, second = fleet.join(), fleet.join(), fleet.join()
     first.serve("server/one/ask", lambda request: request.reply(b"one"))
     second.serve("server/two/ask", lambda request: request.refuse("not today"))
@@ -114,7 +112,7 @@ def test_two_servers_answer_and_the_slow_one_does_not_hide_the_quick(fleet: Flee
     assert sorted(replies, key=lambda r: r.error) == [Reply(payload=b"one"), Reply(error="not today")]
 
 
-def test_two_servers_under_the_same_key_both_answer(fleet: Fleet) -> None:
+def test_two_servers_under_the_same_key_both_answer(fleet: Fleet):
     asker, first, second = fleet.join(), fleet.join(), fleet.join()
     first.serve("ask", lambda request: request.reply(b"one"))
     second.serve("ask", lambda request: request.reply(b"two"))
@@ -122,7 +120,7 @@ def test_two_servers_under_the_same_key_both_answer(fleet: Fleet) -> None:
     assert sorted(reply.payload for reply in asker.ask("ask", b"", 3.0)) == [b"one", b"two"]
 
 
-def test_a_service_for_a_pattern_gets_the_key(fleet: Fleet) -> None:
+def test_a_service_for_a_pattern_gets_the_key(fleet: Fleet):
     asker, server = fleet.join(), fleet.join()
     server.serve("agent/r0/log/*", lambda request: request.reply(request.key.encode()))
     settle(asker, "agent/r0/log/1")
@@ -130,7 +128,7 @@ def test_a_service_for_a_pattern_gets_the_key(fleet: Fleet) -> None:
     assert asker.ask("agent/r1/log/7", b"", 3.0) == []
 
 
-def test_a_server_that_never_answers_does_not_hide_the_other(fleet: Fleet) -> None:
+def test_a_server_that_never_answers_does_not_hide_the_other(fleet: Fleet):
     asker, first, second = fleet.join(), fleet.join(), fleet.join()
     kept: list[Request] = []
     first.serve("server/one/ask", lambda request: request.reply(b"one"))
@@ -139,7 +137,7 @@ def test_a_server_that_never_answers_does_not_hide_the_other(fleet: Fleet) -> No
     eventually(lambda: asker.ask("server/*/ask", b"", 0.3) == [Reply(payload=b"one")] and kept)
 
 
-def test_handlers_that_raise(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+def test_handlers_that_raise(fleet: Fleet, caplog):
     asker, server = fleet.join(), fleet.join()
 
     def expected(request: Request) -> None:
@@ -157,7 +155,7 @@ def test_handlers_that_raise(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> 
         assert asker.ask("unexpected", b"", 3.0) == [Reply(error="internal error: ZeroDivisionError")]
 
 
-def test_a_busy_server_gives_a_retry_time(fleet: Fleet) -> None:
+def test_a_busy_server_gives_a_retry_time(fleet: Fleet):
     asker, server = fleet.join(), fleet.join()
 
     def raises(request: Request) -> None:
@@ -174,9 +172,7 @@ def test_a_busy_server_gives_a_retry_time(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("direct", [False, True])
-def test_a_subscriber_that_raises_is_logged_and_goes_on(
-    fleet: Fleet, direct: bool, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_subscriber_that_raises_is_logged_and_goes_on(fleet: Fleet, direct: bool, caplog):
     bus = fleet.join()
     seen: list[bytes] = []
 
@@ -194,7 +190,7 @@ def test_a_subscriber_that_raises_is_logged_and_goes_on(
     assert "broken handler" in caplog.text
 
 
-def test_a_direct_subscriber_gets_all_in_order_until_it_is_closed(fleet: Fleet) -> None:
+def test_a_direct_subscriber_gets_all_in_order_until_it_is_closed(fleet: Fleet):
     bus = fleet.join()
     seen: list[bytes] = []
     subscribed = bus.subscribe("a", lambda sample: seen.append(sample.payload), direct=True)
@@ -212,7 +208,7 @@ def test_a_direct_subscriber_gets_all_in_order_until_it_is_closed(fleet: Fleet) 
     assert len(seen) == settled
 
 
-def test_an_answer_may_come_later_from_another_thread_and_counts_once(fleet: Fleet) -> None:
+def test_an_answer_may_come_later_from_another_thread_and_counts_once(fleet: Fleet):
     asker, server = fleet.join(), fleet.join()
 
     def later(request: Request) -> None:
@@ -229,7 +225,7 @@ def test_an_answer_may_come_later_from_another_thread_and_counts_once(fleet: Fle
     assert asker.ask("slow", b"", 3.0) == [Reply(payload=b"later")]
 
 
-def test_handlers_run_one_at_a_time_and_may_use_the_bus(fleet: Fleet) -> None:
+def test_handlers_run_one_at_a_time_and_may_use_the_bus(fleet: Fleet):
     bus = fleet.join()
     running: list[str] = []
     overlaps: list[str] = []
@@ -251,7 +247,7 @@ def test_handlers_run_one_at_a_time_and_may_use_the_bus(fleet: Fleet) -> None:
     assert not overlaps
 
 
-def test_tokens_of_one_robot_are_bounded(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+def test_tokens_of_one_robot_are_bounded(fleet: Fleet, caplog):
     """Whatever one session declares, others are seen, and so is that a known key of it ends."""
     flooding, honest, watcher = fleet.join(), fleet.join(), fleet.join()
     news: list[tuple[str, bool]] = []
@@ -271,7 +267,7 @@ def test_tokens_of_one_robot_are_bounded(fleet: Fleet, caplog: pytest.LogCapture
     again.close()
 
 
-def test_services_at_one_robot_answer_each_for_itself(fleet: Fleet) -> None:
+def test_services_at_one_robot_answer_each_for_itself(fleet: Fleet):
     robot, asker = fleet.join(), fleet.join()
     root = "mapweave/1/fleet/agent/r1"
 
@@ -301,7 +297,7 @@ def test_services_at_one_robot_answer_each_for_itself(fleet: Fleet) -> None:
     eventually(lambda: asked("**") == {"mission: mission"})
 
 
-def test_a_robot_that_serves_nothing_for_a_while_serves_again(fleet: Fleet) -> None:
+def test_a_robot_that_serves_nothing_for_a_while_serves_again(fleet: Fleet):
     robot, asker = fleet.join(), fleet.join()
     key = "mapweave/1/fleet/agent/r1/mission"
     for answer in (b"first", b"second"):

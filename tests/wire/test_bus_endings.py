@@ -1,7 +1,5 @@
 """What every bus must do when a peer closes, dies or is cut off, on both implementations."""
 
-from __future__ import annotations
-
 import threading
 import time
 
@@ -13,7 +11,7 @@ from tests.waiting import eventually
 from tests.wire.fleets import Fleet, settle, subscribe
 
 
-def test_liveliness_before_and_after(fleet: Fleet) -> None:
+def test_liveliness_before_and_after(fleet: Fleet):
     watcher, others = fleet.join(), fleet.join()
     others.announce("agent/r0/alive")
     news: list[tuple[str, bool]] = []
@@ -31,7 +29,7 @@ def test_liveliness_before_and_after(fleet: Fleet) -> None:
     watching.close()
 
 
-def test_closed_handlers_are_not_called(fleet: Fleet) -> None:
+def test_closed_handlers_are_not_called(fleet: Fleet):
     asker, server = fleet.join(), fleet.join()
     got: list[Sample] = []
     subscription = server.subscribe("a", got.append)
@@ -48,7 +46,7 @@ def test_closed_handlers_are_not_called(fleet: Fleet) -> None:
     assert not got
 
 
-def test_closing_twice_and_use_after_close(fleet: Fleet) -> None:
+def test_closing_twice_and_use_after_close(fleet: Fleet):
     bus = fleet.join()
     closing = bus.subscribe("a", lambda _: None)
     bus.close()
@@ -62,7 +60,7 @@ def test_closing_twice_and_use_after_close(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("who", ["the asker", "the server"])
-def test_a_question_during_closing_does_not_wait_for_the_timeout(fleet: Fleet, who: str) -> None:
+def test_a_question_during_closing_does_not_wait_for_the_timeout(fleet: Fleet, who: str):
     asker, server = fleet.join(), fleet.join()
     kept: list[Request] = []
     answer: list[list[Reply]] = []
@@ -77,7 +75,7 @@ def test_a_question_during_closing_does_not_wait_for_the_timeout(fleet: Fleet, w
     assert answer == [[]]
 
 
-def test_without_a_connection_nothing_blocks_and_all_comes_back(fleet: Fleet) -> None:
+def test_without_a_connection_nothing_blocks_and_all_comes_back(fleet: Fleet):
     first, second = fleet.join(), fleet.join()
     got = subscribe(second, first, "a")
     second.serve("q", lambda request: request.reply(b"yes"))

@@ -1,7 +1,5 @@
 """The codec: sizes, rounding and borders. Each layout is read by hand in test_vectors.py."""
 
-from __future__ import annotations
-
 import math
 import struct
 from dataclasses import replace
@@ -25,18 +23,18 @@ from mapweave.wire.codec import decode_body, decode_change, element_of, encode_b
 data = st.data()
 
 
-def test_an_edge_of_60_shared_landmarks_is_small(some: SimpleNamespace) -> None:
+def test_an_edge_of_60_shared_landmarks_is_small(some: SimpleNamespace):
     assert len(encode_change(Change(some.map, 1000, 2**62, EdgePut(some.edge())))) < 250
 
 
 @given(data)
-def test_encoding_a_decoded_value_gives_the_same_bytes(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_encoding_a_decoded_value_gives_the_same_bytes(some: SimpleNamespace, data: st.DataObject):
     encoded = encode_body(data.draw(some.bodies))
     assert encode_body(decode_body(encoded)) == encoded
 
 
 @given(data)
-def test_a_node_keeps_its_content(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_a_node_keeps_its_content(some: SimpleNamespace, data: st.DataObject):
     node: Node = data.draw(some.nodes)
     body = decode_body(encode_body(NodePut(node)))
     assert isinstance(body, NodePut)
@@ -74,7 +72,7 @@ NUMBERS = st.one_of(
 
 
 @given(data)
-def test_whatever_landmarks_are_encoded_can_be_decoded(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_whatever_landmarks_are_encoded_can_be_decoded(some: SimpleNamespace, data: st.DataObject):
     """Encoding does not unpack them again to find that out."""
     count = data.draw(st.integers(0, 4))
     rows = st.lists(NUMBERS, min_size=count, max_size=count)
@@ -93,7 +91,7 @@ def test_whatever_landmarks_are_encoded_can_be_decoded(some: SimpleNamespace, da
 
 
 @given(data)
-def test_an_edge_keeps_its_content(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_an_edge_keeps_its_content(some: SimpleNamespace, data: st.DataObject):
     edge: Edge = data.draw(some.edges)
     body = decode_body(encode_body(EdgePut(edge)))
     assert isinstance(body, EdgePut)
@@ -108,7 +106,7 @@ def test_an_edge_keeps_its_content(some: SimpleNamespace, data: st.DataObject) -
 
 
 @given(data)
-def test_a_change_keeps_its_content(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_a_change_keeps_its_content(some: SimpleNamespace, data: st.DataObject):
     body = data.draw(some.bodies)
     map_id = element_of(body).map
     change = Change(map_id, data.draw(st.integers(1, 2**53)), data.draw(st.integers(0, 2**63 - 1)), body)
@@ -123,7 +121,7 @@ def assert_close(new: PoseGaussian, old: PoseGaussian) -> None:
     np.testing.assert_allclose(new.covariance, old.covariance, rtol=1e-6, atol=1e-30)
 
 
-def test_empty_values_cost_nothing_and_come_back_empty(some: SimpleNamespace) -> None:
+def test_empty_values_cost_nothing_and_come_back_empty(some: SimpleNamespace):
     edge: Edge = some.edge(0)
     bare = Edge(edge.id, edge.a, edge.b, edge.a_from_b, edge.kind)
     encoded = encode_body(EdgePut(bare))
@@ -135,14 +133,14 @@ def test_empty_values_cost_nothing_and_come_back_empty(some: SimpleNamespace) ->
 
 
 @pytest.mark.parametrize("far", [0.009, 1.3e4, math.inf])
-def test_depths_beyond_use_become_unknown(some: SimpleNamespace, far: float) -> None:
+def test_depths_beyond_use_become_unknown(some: SimpleNamespace, far: float):
     back = through(some, depth=far, sigma=1.0)
     assert np.isnan(back.depths).all()
     assert np.isnan(back.depth_sigmas).all()
 
 
 @pytest.mark.parametrize(("sigma", "share"), [(0.0, 0.002), (1e-9, 0.002), (1e4, 0.002 * math.exp(62 / 8))])
-def test_sigmas_are_clipped(some: SimpleNamespace, sigma: float, share: float) -> None:
+def test_sigmas_are_clipped(some: SimpleNamespace, sigma: float, share: float):
     back = through(some, depth=2.0, sigma=sigma)
     assert back.depth_sigmas[0] / back.depths[0] == pytest.approx(share, rel=1e-6)
 
@@ -192,12 +190,12 @@ def bad_landmarks(count: int = 1, pixel: float = 10.0, depth: float = 1.0, sigma
         {"camera": Camera(320, 240, 1e300, 277, 160, 120, 0.2)},
     ],
 )
-def test_values_out_of_range_are_refused_before_sending(some: SimpleNamespace, new: dict[str, Any]) -> None:
+def test_values_out_of_range_are_refused_before_sending(some: SimpleNamespace, new: dict[str, Any]):
     with pytest.raises(InvalidValue):
         encode_body(NodePut(replaced(some.node(), **new)))
 
 
-def test_an_edge_that_cannot_be_sent_is_refused_before(some: SimpleNamespace) -> None:
+def test_an_edge_that_cannot_be_sent_is_refused_before(some: SimpleNamespace):
     good: Edge = some.edge()
 
     def edge(**new: Any) -> EdgePut:
@@ -221,7 +219,7 @@ def test_an_edge_that_cannot_be_sent_is_refused_before(some: SimpleNamespace) ->
 
 
 @given(seed=st.integers(0, 2**32 - 1), largest=st.floats(4.01, 10.0))
-def test_greater_variances_become_the_greatest(some: SimpleNamespace, seed: int, largest: float) -> None:
+def test_greater_variances_become_the_greatest(some: SimpleNamespace, seed: int, largest: float):
     """Directions stay, and what is known well stays so: NumPy's eigenvectors of what comes out."""
     axes = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
     covariance = axes * [10.0**largest, 1e3, 1e4] @ axes.T
@@ -235,20 +233,20 @@ def test_greater_variances_become_the_greatest(some: SimpleNamespace, seed: int,
     encode_body(NodePut(nothing_known))
 
 
-def test_evidence_is_brought_within_its_bounds(some: SimpleNamespace) -> None:
+def test_evidence_is_brought_within_its_bounds(some: SimpleNamespace):
     edge = replace(some.edge(), evidence={"inliers": 9e29, "there": -1.0, "rms_px": 0.5})
     back = decode_body(encode_body(EdgePut(edge)))
     assert isinstance(back, EdgePut)
     assert back.edge.evidence == {"inliers": 2000.0, "there": 0.0, "rms_px": 0.5}
 
 
-def test_a_change_must_be_about_its_own_map(some: SimpleNamespace) -> None:
+def test_a_change_must_be_about_its_own_map(some: SimpleNamespace):
     with pytest.raises(InvalidValue, match="cannot be about"):
         encode_change(Change(MapId("other", 1), 1, 1, NodePut(some.node())))
 
 
 @pytest.mark.parametrize(("sequence", "stamp_ns"), [(0, 0), (-1, 0), (2**54, 0), (1, -1), (1, 2**63)])
-def test_numbers_of_a_change_are_bounded(sequence: int, stamp_ns: int) -> None:
+def test_numbers_of_a_change_are_bounded(sequence: int, stamp_ns: int):
     with pytest.raises(InvalidValue):
         encode_change(Change(MapId("r0", 1), sequence, stamp_ns, NodeRetired(NodeId("r0", 1, 1))))
 
@@ -300,7 +298,7 @@ FORGERIES: list[tuple[str, dict[str, Any], str]] = [
 @pytest.mark.parametrize(("kind", "forgery", "reason"), FORGERIES)
 def test_forgeries_are_refused_with_a_reason(
     some: SimpleNamespace, kind: str, forgery: dict[str, Any], reason: str
-) -> None:
+):
     encoded = encode_body(NodePut(some.node(3)) if kind == "node" else EdgePut(some.edge(3)))
     fields = msgpack.unpackb(encoded)
     assert decode_body(msgpack.packb(fields))
@@ -310,14 +308,14 @@ def test_forgeries_are_refused_with_a_reason(
 
 
 @pytest.mark.parametrize("name", ["v", "k", "i", "t", "p", "c", "m"])
-def test_missing_parts_are_named(some: SimpleNamespace, name: str) -> None:
+def test_missing_parts_are_named(some: SimpleNamespace, name: str):
     fields = msgpack.unpackb(encode_body(NodePut(some.node(3))))
     del fields[name]
     with pytest.raises(InvalidMessage, match=f"required field `{name}`"):
         decode_body(msgpack.packb(fields))
 
 
-def test_unknown_fields_are_ignored(some: SimpleNamespace) -> None:
+def test_unknown_fields_are_ignored(some: SimpleNamespace):
     encoded = encode_body(NodePut(some.node(3)))
     newer = {"new": [1, {"deep": b"x"}], **msgpack.unpackb(encoded), "newer": None}
     assert encode_body(decode_body(msgpack.packb(newer))) == encoded
@@ -325,7 +323,7 @@ def test_unknown_fields_are_ignored(some: SimpleNamespace) -> None:
 
 @settings(max_examples=30)
 @given(data)
-def test_any_view_of_a_camera_fits(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_any_view_of_a_camera_fits(some: SimpleNamespace, data: st.DataObject):
     """Every pixel from half an image outside on one side to half an image outside on the other."""
     camera: Camera = data.draw(some.cameras)
     far = np.array([[-0.5, -0.5], [1.5, 1.5], [1.5, -0.5]]) * [camera.width, camera.height]

@@ -41,13 +41,13 @@ print("done")
 """Structs in structs, each round new ones, which eight threads use for the first time at once."""
 
 
-def test_threads_that_use_a_type_for_the_first_time_do_not_crash() -> None:
+def test_threads_that_use_a_type_for_the_first_time_do_not_crash():
     # In a process of its own, since it ended with a segmentation fault.
     run = subprocess.run([sys.executable, "-c", THREADS], capture_output=True, text=True, timeout=100)
     assert (run.returncode, run.stdout.strip()) == (0, "done"), run.stderr
 
 
-def test_what_does_not_fit_is_refused_each_time() -> None:
+def test_what_does_not_fit_is_refused_each_time():
     for _ in range(2):
         with pytest.raises(msgspec.ValidationError):
             convert("one", int)
@@ -55,5 +55,5 @@ def test_what_does_not_fit_is_refused_each_time() -> None:
             json_value(b'"one"', int)
 
 
-def test_other_types_are_read_by_the_given_function() -> None:
+def test_other_types_are_read_by_the_given_function():
     assert convert(["1", b"2"], tuple[complex, bytes], lambda kind, plain: kind(plain)) == (1 + 0j, b"2")

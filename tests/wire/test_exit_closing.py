@@ -19,7 +19,7 @@ opened[1].close()
 """
 
 
-def test_the_newest_is_closed_first() -> None:
+def test_the_newest_is_closed_first():
     """A router closed before clients of its process panicked, in 7 of 600 processes."""
     done = subprocess.run([sys.executable, "-c", PROGRAM], capture_output=True, text=True, check=True)
     assert done.stdout.split("\n") == ["closed before", "second client", "client", "router", ""]

@@ -1,7 +1,5 @@
 """Explanations and manual constraints round-trip, and invalid ones are refused."""
 
-from __future__ import annotations
-
 import math
 import struct
 from typing import Any
@@ -71,7 +69,7 @@ def explanation() -> PairExplanation:
     )  # fmt: skip
 
 
-def test_two_nodes_come_back() -> None:
+def test_two_nodes_come_back():
     result, back = explanation(), decode(encode(explanation()), PairExplanation)
     assert (back.a.id, back.b.id) == (result.a.id, result.b.id)
     assert (back.standing, back.reason) == (result.standing, result.reason)
@@ -85,7 +83,7 @@ def test_two_nodes_come_back() -> None:
     assert np.array_equal(back.a.landmarks.pixels, decode(encode(back), PairExplanation).a.landmarks.pixels)
 
 
-def test_nothing_but_words_comes_back_too() -> None:
+def test_nothing_but_words_comes_back_too():
     a, b = nodes()
     nothing = np.zeros((0, 2), np.int64)
     back = decode(
@@ -157,23 +155,23 @@ routes = st.builds(
 
 
 @given(routes)
-def test_routes_come_back(explanation: RouteExplanation) -> None:
+def test_routes_come_back(explanation: RouteExplanation):
     assert decode(encode(explanation), RouteExplanation) == explanation
 
 
 @given(st.lists(maps, max_size=4).map(lambda some: FleetExplanation(tuple(some))))
-def test_maps_come_back(explanation: FleetExplanation) -> None:
+def test_maps_come_back(explanation: FleetExplanation):
     assert decode(encode(explanation), FleetExplanation) == explanation
 
 
 @given(constraints)
-def test_constraints_round_trip(constraint: ManualConstraint) -> None:
+def test_constraints_round_trip(constraint: ManualConstraint):
     assert decode(encode(constraint), ManualConstraint) == constraint
     assert decode(encode(ConstraintList((constraint,))), ConstraintList).made == (constraint,)
 
 
 @given(constraints_on(other_subjects | simple_areas.map(RetiredArea)))
-def test_constraints_and_questions_round_trip(constraint: ManualConstraint) -> None:
+def test_constraints_and_questions_round_trip(constraint: ManualConstraint):
     assert decode(encode(constraint), ManualConstraint) == constraint
     asked = ConstraintRequest(constraint, True)
     assert decode(encode(asked), ConstraintRequest) == asked
@@ -201,7 +199,7 @@ def test_constraints_and_questions_round_trip(constraint: ManualConstraint) -> N
         ("a", b"no node"), ("a", encode_body(NodeRetired(NODE_A))), ("claims", [7]),
     ],
 )  # fmt: skip
-def test_a_damaged_explanation_is_refused_in_one_line(field: str, value: Any) -> None:
+def test_a_damaged_explanation_is_refused_in_one_line(field: str, value: Any):
     fields = msgpack.unpackb(encode(explanation()))
     with pytest.raises(InvalidMessage) as refused:
         decode(msgpack.packb({**fields, field: value}), PairExplanation)
@@ -231,12 +229,12 @@ def constrained(kind: str, **about: Any) -> bytes:
         ("burnt", {"map": ["a", 1]}, "`kind` must be one of apart, link, map, nodes, area, window"),
     ],
 )
-def test_invalid_constraints_are_refused_in_one_line(kind: str, about: dict[str, Any], words: str) -> None:
+def test_invalid_constraints_are_refused_in_one_line(kind: str, about: dict[str, Any], words: str):
     with pytest.raises(InvalidMessage, match=words):
         decode(constrained(kind, **about), ManualConstraint)
 
 
-def test_undecodable_values_are_not_encoded() -> None:
+def test_undecodable_values_are_not_encoded():
     with pytest.raises(InvalidValue):
         encode(
             PairExplanation(*nodes(), Standing.LINKED, "x" * 5000, *[np.zeros((0, 2), int)] * 2, np.zeros(0))

@@ -1,7 +1,5 @@
 """The fair queue against a model: a sender's things in order, senders in turn, room for who has little."""
 
-from __future__ import annotations
-
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,7 +11,7 @@ steps = st.lists(st.one_of(st.none(), st.tuples(st.sampled_from("abcd"), st.inte
 @given(steps, st.integers(1, 12), st.integers(1, 100))
 def test_senders_take_turns_and_none_loses_its_share(
     steps: list[tuple[str, int] | None], most: int, most_bytes: int
-) -> None:
+):
     queue: FairQueue[int] = FairQueue(most, most_bytes)
     lanes: dict[str, list[tuple[int, int]]] = {}
     passed_over: dict[str, int] = {}
@@ -47,14 +45,14 @@ def test_senders_take_turns_and_none_loses_its_share(
         assert all(queue.waiting(sender) == len(lanes.get(sender, [])) for sender in "abcd")
 
 
-def test_one_that_floods_takes_no_more_than_the_queue() -> None:
+def test_one_that_floods_takes_no_more_than_the_queue():
     queue: FairQueue[int] = FairQueue(100, 10_000)
     assert sum(queue.put("flood", k, 1) for k in range(1000)) == 100
     assert sum(queue.put("r0", k, 1) for k in range(1000)) == 50
     assert [queue.pop()[0] for _ in range(6)] == ["flood", "r0"] * 3
 
 
-def test_a_thing_may_take_the_place_of_its_senders_last() -> None:
+def test_a_thing_may_take_the_place_of_its_senders_last():
     queue: FairQueue[str] = FairQueue(3, 100)
     for sender, item in (("a", "beacon 1"), ("b", "beacon 1"), ("a", "change")):
         assert queue.put(sender, item, 10)

@@ -82,9 +82,7 @@ def client_and_router(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[ZenohBu
 
 
 @pytest.mark.slow
-def test_a_client_that_was_forgotten_connects_again(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_client_that_was_forgotten_connects_again(monkeypatch, caplog):
     """And everything that it has declared is there again; its user sees the server go and come."""
     with client_and_router(monkeypatch) as (client, router, link):
         heard: list[bytes] = []
@@ -114,7 +112,7 @@ def test_a_client_that_was_forgotten_connects_again(
 
 
 @pytest.mark.parametrize("server", [True, False])
-def test_silence_alone_ends_no_connection(monkeypatch: pytest.MonkeyPatch, server: bool) -> None:
+def test_silence_alone_ends_no_connection(monkeypatch, server: bool):
     """The router says who is alive, or that no one is."""
     with client_and_router(monkeypatch) as (client, router, link):
         if server:
@@ -133,7 +131,7 @@ def test_silence_alone_ends_no_connection(monkeypatch: pytest.MonkeyPatch, serve
         assert set(asked) == {"answered"} and link.accepted == 1
 
 
-def test_a_bus_is_closed_at_once_while_it_waits_for_a_sign_of_life(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bus_is_closed_at_once_while_it_waits_for_a_sign_of_life(monkeypatch):
     with client_and_router(monkeypatch) as (client, _, link):
         monkeypatch.setattr(zenoh_bus, "UNANSWERED", 600.0)
         client.watch("m/alive/*", lambda key, there: None)
@@ -154,9 +152,7 @@ def test_a_bus_is_closed_at_once_while_it_waits_for_a_sign_of_life(monkeypatch: 
 
 
 @pytest.mark.parametrize("keys", [20, 300])
-def test_the_sign_of_life_takes_no_longer_with_many_who_are_alive(
-    monkeypatch: pytest.MonkeyPatch, keys: int
-) -> None:
+def test_the_sign_of_life_takes_no_longer_with_many_who_are_alive(monkeypatch, keys: int):
     """One answer was taken at each look: 18 s for twenty of them. And 300 were more than the channel held, so
     that the client waited for ever.
     """
@@ -199,7 +195,7 @@ class Silent:
             raise zenoh.ZError("channel is empty and closed")
 
 
-def test_clients_that_wait_for_a_busy_router_do_not_keep_it_busy(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_clients_that_wait_for_a_busy_router_do_not_keep_it_busy(monkeypatch):
     """With a look every 50 ms a thousand of them took a core and a half, and starved the server itself."""
     with client_and_router(monkeypatch) as (client, _, _):
         client.watch("m/alive/*", lambda key, there: None)
@@ -208,9 +204,7 @@ def test_clients_that_wait_for_a_busy_router_do_not_keep_it_busy(monkeypatch: py
         assert silent.looks <= 10
 
 
-def test_a_client_that_hears_messages_looks_for_silence_once_it_may_be_there(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_client_that_hears_messages_looks_for_silence_once_it_may_be_there(monkeypatch):
     """It looked ten times as often: a thousand robots, five hundred times a second."""
     with client_and_router(monkeypatch) as (client, _, _):
         looks: list[float] = []

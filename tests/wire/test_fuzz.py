@@ -1,7 +1,5 @@
 """Any bytes from outside: only InvalidMessage is raised, and nothing huge is allocated."""
 
-from __future__ import annotations
-
 import json
 import tracemalloc
 from collections.abc import Callable, Iterator
@@ -75,14 +73,14 @@ def refused_or_read(decode: Decoder, data: bytes) -> object | None:
 @example(garbage=b"\x81\xa1v\xd7\xff" + b"\xff" * 8)
 @example(garbage=msgpack.packb({1: 1}))
 @example(garbage=b"\x82\xa1v\x01\xa1k\xa2\xff\xff")
-def test_garbage(garbage: bytes) -> None:
+def test_garbage(garbage: bytes):
     for decode in EVERY:
         refused_or_read(decode, garbage)
 
 
 @settings(max_examples=100)
 @given(st.data())
-def test_good_messages_gone_bad(data: st.DataObject) -> None:
+def test_good_messages_gone_bad(data: st.DataObject):
     decode, good = data.draw(st.sampled_from(GOOD))
     decode(good)
     bad = bytearray(good)
@@ -93,7 +91,7 @@ def test_good_messages_gone_bad(data: st.DataObject) -> None:
     refused_or_read(decode, bytes(bad))
 
 
-def test_every_truncation_is_refused() -> None:
+def test_every_truncation_is_refused():
     for decode, good in GOOD:
         lengths = range(len(good)) if len(good) < 800 else np.linspace(0, len(good) - 1, 300).astype(int)
         for length in lengths:
@@ -115,7 +113,7 @@ def altered(fields: dict[str, Any]) -> Iterator[dict[str, Any]]:
             yield from ({**fields, name: inner} for inner in altered(value))
 
 
-def test_every_single_field_may_be_anything() -> None:
+def test_every_single_field_may_be_anything():
     """What is read all the same can be sent on."""
     for decode, good in GOOD:
         if decode in (Mark.decode, unpack_map_file):
@@ -141,7 +139,7 @@ def test_every_single_field_may_be_anything() -> None:
         b"MAPWEAVE\x01\x00\x00\x00" + b"\xff" * 8,
     ],
 )
-def test_a_claim_of_gigabytes_allocates_nothing(bomb: bytes) -> None:
+def test_a_claim_of_gigabytes_allocates_nothing(bomb: bytes):
     tracemalloc.start()
     for decode in EVERY:
         with pytest.raises(InvalidMessage):
@@ -156,7 +154,7 @@ SMALL = (b"\x90", b"\x80", b"\x91\x90", b"\xa0", b"\x01", b"\xc4\x00", b"\x81\xa
 
 @pytest.mark.parametrize("small", SMALL, ids=bytes.hex)
 @pytest.mark.parametrize("outer", ["field", "unknown", "nested"])
-def test_small_values_in_a_large_message_cost_no_memory(small: bytes, outer: str) -> None:
+def test_small_values_in_a_large_message_cost_no_memory(small: bytes, outer: str):
     """A message as long as its kind allows, full of the smallest values, is refused before they are made."""
     # The shortest first: what makes the values of the longest takes minutes.
     for decode, length in (
@@ -183,7 +181,7 @@ def test_small_values_in_a_large_message_cost_no_memory(small: bytes, outer: str
     lambda inner: st.lists(inner, max_size=20) | st.dictionaries(st.text(max_size=40), inner, max_size=20),
     max_leaves=60,
 ))  # fmt: skip
-def test_values_are_counted_as_they_are(value: object) -> None:
+def test_values_are_counted_as_they_are(value: object):
     def count(one: object) -> int:
         if isinstance(one, dict):
             return 1 + sum(1 + count(inner) for inner in one.values())
@@ -194,13 +192,13 @@ def test_values_are_counted_as_they_are(value: object) -> None:
     assert _exceeds(data, values - 1) or values == 1
 
 
-def test_too_long_input_is_refused_before_decoding() -> None:
+def test_too_long_input_is_refused_before_decoding():
     for decode in (decode_change, decode_body, decode_view, Head.decode, Ack.decode, decode_record):
         with pytest.raises(InvalidMessage, match="at most"):
             decode(b"\x80" + b"\0" * 200_000)
 
 
-def test_poses_of_another_robot_are_refused() -> None:
+def test_poses_of_another_robot_are_refused():
     data = dict(NAMED)["merged poses"]
     assert PoseNews.decode(data, "r0").encode("r0") == data
     with pytest.raises(InvalidMessage, match="r0's nodes, not of r1's"):

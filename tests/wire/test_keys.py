@@ -1,7 +1,5 @@
 """Patterns match what they should, and what comes from outside is checked; each key is in test_vectors.py."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 
@@ -20,7 +18,7 @@ maps = st.builds(MapId, names, st.integers(0, 2**53))
 
 
 @given(maps, names)
-def test_patterns_match_their_keys_and_no_others(one: MapId, server: str) -> None:
+def test_patterns_match_their_keys_and_no_others(one: MapId, server: str):
     keys = {
         KEYS.changes(): KEYS.change(one),
         KEYS.heads(): KEYS.head(one),
@@ -45,7 +43,7 @@ def test_patterns_match_their_keys_and_no_others(one: MapId, server: str) -> Non
 
 
 @given(maps, names)
-def test_a_key_is_parsed(one: MapId, server: str) -> None:
+def test_a_key_is_parsed(one: MapId, server: str):
     assert KEYS.parse_change(KEYS.change(one)) == one
     assert KEYS.parse_head(KEYS.head(one)) == one
     assert KEYS.parse_log(KEYS.log(one)) == one
@@ -77,13 +75,13 @@ def test_a_key_is_parsed(one: MapId, server: str) -> None:
         "/" * 1000,
     ],
 )
-def test_foreign_keys_are_refused(key: str) -> None:
+def test_foreign_keys_are_refused(key: str):
     with pytest.raises(InvalidMessage):
         KEYS.parse_change(key)
 
 
 @given(st.text(max_size=60))
-def test_any_text_is_parsed_or_refused(text: str) -> None:
+def test_any_text_is_parsed_or_refused(text: str):
     for key in (text, f"{KEYS.root}/agent/{text}/change/3", f"{KEYS.root}/agent/r0/change/{text}"):
         try:
             assert KEYS.change(KEYS.parse_change(key)) == key
@@ -104,7 +102,7 @@ def test_any_text_is_parsed_or_refused(text: str) -> None:
         lambda: KEYS.relocalize("x" * 33),
     ],
 )
-def test_names_that_cannot_be_in_a_key_are_refused(make: Callable[[], object]) -> None:
+def test_names_that_cannot_be_in_a_key_are_refused(make: Callable[[], object]):
     with pytest.raises(InvalidValue):
         make()
 
@@ -120,14 +118,14 @@ def as_regex(pattern: list[str]) -> re.Pattern[str]:
 
 
 @given(chunks, pattern_chunks)
-def test_matching_agrees_with_regular_expressions(key: list[str], pattern: list[str]) -> None:
+def test_matching_agrees_with_regular_expressions(key: list[str], pattern: list[str]):
     expected = as_regex(pattern).fullmatch("".join(f"{chunk}/" for chunk in key)) is not None
     assert intersects("/".join(pattern), "/".join(key)) == expected
     assert intersects("/".join(key), "/".join(pattern)) == expected
 
 
 @given(pattern_chunks, pattern_chunks)
-def test_two_patterns_meet_where_some_key_matches_both(one: list[str], other: list[str]) -> None:
+def test_two_patterns_meet_where_some_key_matches_both(one: list[str], other: list[str]):
     keys = [""]
     count = False
     for _ in range(7):

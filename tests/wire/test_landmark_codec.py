@@ -1,7 +1,5 @@
 """Landmarks on the wire: a second decoder written from docs/wire.md, sizes and damage."""
 
-from __future__ import annotations
-
 import math
 import zlib
 from contextlib import nullcontext
@@ -44,7 +42,7 @@ CAMERA = Camera(320, 240, 277.0, 277.0, 159.5, 119.5, 0.25, 0.05)
 
 @pytest.mark.parametrize("count", [1, 2, 40, 150])
 @pytest.mark.parametrize("by_rows", [True, False])
-def test_a_second_decoder_reads_landmarks(some: SimpleNamespace, count: int, by_rows: bool) -> None:
+def test_a_second_decoder_reads_landmarks(some: SimpleNamespace, count: int, by_rows: bool):
     one: Landmarks = some.node(count).landmarks
     if by_rows:
         one, _ = settle(one, CAMERA)
@@ -61,7 +59,7 @@ def test_a_second_decoder_reads_landmarks(some: SimpleNamespace, count: int, by_
 
 
 @given(data)
-def test_landmarks_come_back_in_their_order(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_landmarks_come_back_in_their_order(some: SimpleNamespace, data: st.DataObject):
     camera = data.draw(some.cameras)
     one: Landmarks = data.draw(some.landmarks(camera))
     if data.draw(st.booleans()):
@@ -78,7 +76,7 @@ def test_landmarks_come_back_in_their_order(some: SimpleNamespace, data: st.Data
 
 
 @given(data)
-def test_settled_landmarks_come_back_to_the_last_bit(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_settled_landmarks_come_back_to_the_last_bit(some: SimpleNamespace, data: st.DataObject):
     """The robot that made a node works with the same numbers as all receivers."""
     camera = data.draw(some.cameras)
     one, _ = settle(data.draw(some.landmarks(camera)), camera)
@@ -93,7 +91,7 @@ FRAMING = 80
 
 @pytest.mark.parametrize("photograph", ["coins", "page", "retina", "stereo_motorcycle"])
 @pytest.mark.parametrize("most", first_quick([800, 3000, 1500, 4500], 2))
-def test_a_node_of_a_photograph_keeps_its_byte_budget(photograph: str, most: int) -> None:
+def test_a_node_of_a_photograph_keeps_its_byte_budget(photograph: str, most: int):
     """Real descriptors of images that no table was trained on; what is chosen fits, and little is wasted."""
     image = getattr(skimage.data, photograph)()
     image = image[0] if isinstance(image, tuple) else image
@@ -120,7 +118,7 @@ def test_a_node_of_a_photograph_keeps_its_byte_budget(photograph: str, most: int
         assert len(kept) >= 145
 
 
-def test_order_by_rows_saves_its_rank(some: SimpleNamespace) -> None:
+def test_order_by_rows_saves_its_rank(some: SimpleNamespace):
     """log2(150!) is 873 bits; the row of ones and zeros costs a little of that."""
     one: Landmarks = some.node(150).landmarks
     settled, _ = settle(one, CAMERA)
@@ -128,7 +126,7 @@ def test_order_by_rows_saves_its_rank(some: SimpleNamespace) -> None:
     assert 80 < saved < 110
 
 
-def test_the_least_likely_is_not_longer_than_is_allowed() -> None:
+def test_the_least_likely_is_not_longer_than_is_allowed():
     """Every symbol the rarest of its column, pixels as far apart as they can be."""
     tables, random = landmark_tables(), np.random.default_rng(0)
     large = Camera(16384, 16384, 1e4, 1e4, 8e3, 8e3, 0.3)
@@ -143,7 +141,7 @@ def test_the_least_likely_is_not_longer_than_is_allowed() -> None:
 
 @settings(max_examples=100)
 @given(data)
-def test_damage_is_noticed(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_damage_is_noticed(some: SimpleNamespace, data: st.DataObject):
     good = pack_landmarks(some.node(20).landmarks, CAMERA)
     bad = bytearray(good)
     bad[data.draw(st.integers(0, len(good) - 1))] ^= data.draw(st.integers(1, 255))
@@ -166,7 +164,7 @@ def both_forms(packed: bytes) -> list[Landmarks | str]:
 
 @settings(max_examples=100)
 @given(data)
-def test_forgeries_with_a_right_checksum_do_no_harm(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_forgeries_with_a_right_checksum_do_no_harm(some: SimpleNamespace, data: st.DataObject):
     """Every decoded value is finite, within the image's surroundings, and round-trips."""
     bad = bytearray(pack_landmarks(some.node(20).landmarks, CAMERA)[:-4])
     for _ in range(data.draw(st.integers(1, 3))):
@@ -190,7 +188,7 @@ def test_forgeries_with_a_right_checksum_do_no_harm(some: SimpleNamespace, data:
     assert pack_landmarks(again, CAMERA) == packed
 
 
-def test_landmarks_are_no_features_and_features_no_landmarks(some: SimpleNamespace) -> None:
+def test_landmarks_are_no_features_and_features_no_landmarks(some: SimpleNamespace):
     one: Landmarks = some.node(5).landmarks
     with pytest.raises(InvalidMessage, match="flags"):
         unpack_features(pack_landmarks(one, CAMERA), CAMERA)
@@ -198,7 +196,7 @@ def test_landmarks_are_no_features_and_features_no_landmarks(some: SimpleNamespa
         unpack_landmarks(pack_features(one.pixels, one.codes, CAMERA), CAMERA)
 
 
-def test_codes_that_are_none_are_refused(some: SimpleNamespace) -> None:
+def test_codes_that_are_none_are_refused(some: SimpleNamespace):
     one: Landmarks = some.node(5).landmarks
     wrong = one.codes.copy()
     wrong[2, 3] = 64

@@ -1,7 +1,5 @@
 """The compiled reader of landmarks against the one in NumPy and against plain Python: numbers and reasons."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable
 from types import SimpleNamespace
@@ -72,7 +70,7 @@ def packed_landmarks(draw: st.DrawFn, some: SimpleNamespace) -> tuple[bytes, Cam
 
 
 @given(st.data())
-def test_good_bytes_are_read_alike(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_good_bytes_are_read_alike(some: SimpleNamespace, data: st.DataObject):
     packed, camera = data.draw(packed_landmarks(some))
     assert not isinstance(same_outcome(packed, camera), str)
     plain = PlainLandmarks(packed).read(camera.width, camera.height)
@@ -83,7 +81,7 @@ def test_good_bytes_are_read_alike(some: SimpleNamespace, data: st.DataObject) -
 @pytest.mark.slow
 @settings(max_examples=400)
 @given(st.data())
-def test_bad_bytes_are_refused_alike(some: SimpleNamespace, data: st.DataObject) -> None:
+def test_bad_bytes_are_refused_alike(some: SimpleNamespace, data: st.DataObject):
     """Changed, cut off or too long, with a right checksum; what is read all the same is read alike."""
     packed, camera = data.draw(packed_landmarks(some))
     bad = bytearray(packed[:-4])
@@ -99,7 +97,7 @@ def test_bad_bytes_are_refused_alike(some: SimpleNamespace, data: st.DataObject)
 
 @pytest.mark.parametrize("count", [0, 1, 40])
 @pytest.mark.parametrize("by_rows", [True, False])
-def test_every_cut_is_refused_alike(some: SimpleNamespace, count: int, by_rows: bool) -> None:
+def test_every_cut_is_refused_alike(some: SimpleNamespace, count: int, by_rows: bool):
     one: Landmarks = some.node(count).landmarks
     packed = pack_landmarks(settle(one, CAMERA)[0] if by_rows else one, CAMERA)[:-4]
     for length in range(HEAD.size, len(packed)):
@@ -109,7 +107,7 @@ def test_every_cut_is_refused_alike(some: SimpleNamespace, count: int, by_rows: 
     assert same_outcome(with_checksum(packed + b"\0"), CAMERA) == "landmarks: more than there should be"
 
 
-def test_each_reason_is_given_by_both(some: SimpleNamespace) -> None:
+def test_each_reason_is_given_by_both(some: SimpleNamespace):
     one, _ = settle(some.node(40).landmarks, CAMERA)
     packed = pack_landmarks(one, CAMERA)[:-4]
     head = HEAD.unpack_from(packed)
@@ -127,7 +125,7 @@ def test_each_reason_is_given_by_both(some: SimpleNamespace) -> None:
         assert same_outcome(with_checksum(off), CAMERA) == "landmarks: a pixel is out of range"
 
 
-def test_nothing_is_compiled_for_a_message(some: SimpleNamespace) -> None:
+def test_nothing_is_compiled_for_a_message(some: SimpleNamespace):
     """Whatever comes has the types that the reader is compiled for beforehand."""
     for count in (0, 1, 150):
         one: Landmarks = some.node(count).landmarks

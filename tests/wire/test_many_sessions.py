@@ -1,7 +1,5 @@
 """A router takes more sessions than Zenoh's own thousand, and than a process has files at first."""
 
-from __future__ import annotations
-
 import json
 import resource
 import subprocess
@@ -40,7 +38,7 @@ os._exit(0)
 
 
 @pytest.mark.slow
-def test_a_router_takes_more_than_a_thousand_sessions() -> None:
+def test_a_router_takes_more_than_a_thousand_sessions():
     if resource.getrlimit(resource.RLIMIT_NOFILE)[1] < 2 * SESSIONS:
         pytest.skip("this machine allows too few open files")
     endpoint = f"tcp/127.0.0.1:{free_port()}"
@@ -58,7 +56,7 @@ def test_a_router_takes_more_than_a_thousand_sessions() -> None:
         router.communicate("\n", timeout=60)
 
 
-def test_the_limit_of_open_files_rises_and_never_falls() -> None:
+def test_the_limit_of_open_files_rises_and_never_falls():
     hard = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
     script = (
         "import resource; from mapweave.wire.open_files import allow_many_files; "
@@ -73,9 +71,7 @@ def test_the_limit_of_open_files_rises_and_never_falls() -> None:
         assert int(done.stdout) == max(min(open_files.WANTED, hard), soft), done.stderr
 
 
-def test_a_system_that_refuses_is_reported(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_system_that_refuses_is_reported(monkeypatch, caplog):
     def refuses(what: int, limits: tuple[int, int]) -> None:
         del what, limits
         raise ValueError("not allowed to raise maximum limit")

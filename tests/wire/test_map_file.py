@@ -1,9 +1,6 @@
 """Map files: what is written is read, and nothing else is."""
 
-from __future__ import annotations
-
 import struct
-from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -25,7 +22,7 @@ def content(some: SimpleNamespace) -> MapFile:
     return MapFile("merged", "three rooms", changes, {node.id: (4, here)})
 
 
-def test_written_values_are_read(tmp_path: Path, content: MapFile) -> None:
+def test_written_values_are_read(tmp_path, content: MapFile):
     path = tmp_path / "a.mapweave"
     write_map_file(path, content)
     back = read_map_file(path)
@@ -44,9 +41,7 @@ def test_written_values_are_read(tmp_path: Path, content: MapFile) -> None:
 
 @settings(max_examples=100)
 @given(where=st.floats(0, 1, exclude_max=True), change=st.integers(1, 255))
-def test_any_changed_byte_is_noticed(
-    tmp_path_factory: pytest.TempPathFactory, some: SimpleNamespace, where: float, change: int
-) -> None:
+def test_any_changed_byte_is_noticed(tmp_path_factory, some: SimpleNamespace, where: float, change: int):
     data = bytearray(pack_map_file(MapFile("agent", "t", (NodePut(some.node(5)),))))
     data[int(where * len(data))] ^= change
     path = tmp_path_factory.getbasetemp() / "changed.mapweave"
@@ -56,7 +51,7 @@ def test_any_changed_byte_is_noticed(
     assert "\n" not in str(error.value)
 
 
-def test_any_truncation_is_noticed(tmp_path: Path, some: SimpleNamespace) -> None:
+def test_any_truncation_is_noticed(tmp_path, some: SimpleNamespace):
     data = pack_map_file(MapFile("agent", "t", (NodePut(some.node(5)),)))
     path = tmp_path / "short.mapweave"
     for length in range(len(data)):
@@ -77,14 +72,14 @@ def test_any_truncation_is_noticed(tmp_path: Path, some: SimpleNamespace) -> Non
         (struct.pack("<8sIQ", b"MAPWEAVE", 9, 0) + b"\0" * 32, "has format version 9, this program reads 1"),
     ],
 )
-def test_other_files_are_named(tmp_path: Path, data: bytes, reason: str) -> None:
+def test_other_files_are_named(tmp_path, data: bytes, reason: str):
     path = tmp_path / "other"
     path.write_bytes(data)
     with pytest.raises(InvalidFile, match=f"other: {reason}"):
         read_map_file(path)
 
 
-def test_files_that_cannot_be_opened_are_named(tmp_path: Path, content: MapFile) -> None:
+def test_files_that_cannot_be_opened_are_named(tmp_path, content: MapFile):
     with pytest.raises(InvalidFile, match="nowhere: cannot be read"):
         read_map_file(tmp_path / "nowhere")
     with pytest.raises(InvalidFile, match="cannot be read"):
@@ -93,7 +88,7 @@ def test_files_that_cannot_be_opened_are_named(tmp_path: Path, content: MapFile)
         write_map_file(tmp_path / "no folder" / "map", content)
 
 
-def test_a_file_of_the_other_kind_can_be_refused(tmp_path: Path, content: MapFile) -> None:
+def test_a_file_of_the_other_kind_can_be_refused(tmp_path, content: MapFile):
     path = tmp_path / "merged"
     write_map_file(path, content)
     assert read_map_file(path, "merged").kind == "merged"
@@ -101,12 +96,12 @@ def test_a_file_of_the_other_kind_can_be_refused(tmp_path: Path, content: MapFil
         read_map_file(path, "agent")
 
 
-def test_an_unknown_kind(content: MapFile) -> None:
+def test_an_unknown_kind(content: MapFile):
     with pytest.raises(InvalidValue, match="Invalid enum value 'odd'"):
         pack_map_file(MapFile("odd", "", ()))  # type: ignore[arg-type]
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path: Path, content: MapFile, some: SimpleNamespace) -> None:
+def test_a_failed_write_leaves_the_old_file(tmp_path, content: MapFile, some: SimpleNamespace):
     path = tmp_path / "map"
     write_map_file(path, content)
     before = path.read_bytes()

@@ -1,7 +1,5 @@
 """The in-memory hub's faults, and the dispatcher's bounded queue."""
 
-from __future__ import annotations
-
 import logging
 import threading
 
@@ -36,11 +34,11 @@ def run(faults: MessageFaults, count: int = 300, seed: int = 1) -> list[int]:
     return got[:-1]
 
 
-def test_without_faults_all_arrives_in_order() -> None:
+def test_without_faults_all_arrives_in_order():
     assert run(MessageFaults()) == list(range(300))
 
 
-def test_one_bus_can_be_disturbed_alone(hub: MemoryHub) -> None:
+def test_one_bus_can_be_disturbed_alone(hub: MemoryHub):
     bad, good, receiver = MemoryBus(hub), MemoryBus(hub), MemoryBus(hub)
     got: list[bytes] = []
     receiver.subscribe("n", lambda sample: got.append(sample.payload))
@@ -54,33 +52,33 @@ def test_one_bus_can_be_disturbed_alone(hub: MemoryHub) -> None:
     assert got == [b"good"] * 20 + [b"end"]
 
 
-def test_dropped_messages_are_gone_and_the_others_in_order() -> None:
+def test_dropped_messages_are_gone_and_the_others_in_order():
     got = run(MessageFaults(drop=0.3))
     assert got == sorted(set(got))
     assert 150 < len(got) < 270
 
 
-def test_doubled_messages_come_twice() -> None:
+def test_doubled_messages_come_twice():
     got = run(MessageFaults(double=0.3))
     assert got == sorted(got)
     assert set(got) == set(range(300))
     assert 330 < len(got) < 450
 
 
-def test_delayed_messages_come_later_but_come() -> None:
+def test_delayed_messages_come_later_but_come():
     got = run(MessageFaults(delay=0.3, longest_delay=5))
     assert sorted(got) == list(range(300))
     assert got != sorted(got)
     assert max(abs(place - n) for place, n in enumerate(got)) <= 10
 
 
-def test_the_same_seed_makes_the_same_faults() -> None:
+def test_the_same_seed_makes_the_same_faults():
     faults = MessageFaults(0.2, 0.2, 0.2)
     assert run(faults, seed=3) == run(faults, seed=3)
     assert run(faults, seed=3) != run(faults, seed=4)
 
 
-def test_a_cut_bus_is_dead_to_the_others_and_they_to_it(hub: MemoryHub) -> None:
+def test_a_cut_bus_is_dead_to_the_others_and_they_to_it(hub: MemoryHub):
     first, second = MemoryBus(hub), MemoryBus(hub)
     news: list[tuple[str, str, bool]] = []
     first.announce("one")
@@ -96,7 +94,7 @@ def test_a_cut_bus_is_dead_to_the_others_and_they_to_it(hub: MemoryHub) -> None:
     eventually(lambda: len(news) == 10)
 
 
-def test_an_answer_from_a_bus_that_was_cut_meanwhile_is_lost(hub: MemoryHub) -> None:
+def test_an_answer_from_a_bus_that_was_cut_meanwhile_is_lost(hub: MemoryHub):
     asker, server = MemoryBus(hub), MemoryBus(hub)
     kept: list[Request] = []
     server.serve("q", kept.append)
@@ -126,9 +124,7 @@ class _Question:
         self.refusal, self.retry_after = reason, retry_after
 
 
-def test_a_full_queue_counts_messages_refuses_questions_and_keeps_presence(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+def test_a_full_queue_counts_messages_refuses_questions_and_keeps_presence(caplog):
     dispatcher = Dispatcher("test", limit=2)
     release, started = threading.Event(), threading.Event()
     seen: list[str] = []
@@ -165,12 +161,12 @@ def test_a_full_queue_counts_messages_refuses_questions_and_keeps_presence(
         ({"mode": "router", "listen": ("tcp/x",)}, "endpoints look like"),
     ],
 )
-def test_settings_that_cannot_work(settings: dict[str, object], reason: str) -> None:
+def test_settings_that_cannot_work(settings: dict[str, object], reason: str):
     with pytest.raises(SettingsError, match=reason):
         BusSettings(**settings)  # type: ignore[arg-type]
 
 
-def test_what_a_robot_sends_wrong_fills_no_log() -> None:
+def test_what_a_robot_sends_wrong_fills_no_log():
     now = [1000.0]
     counted = Failures(lambda: now[0])
     keys = Keys("demo")
@@ -183,7 +179,7 @@ def test_what_a_robot_sends_wrong_fills_no_log() -> None:
     assert [counted.count(keys.server_status("s0")) for _ in range(3)] == [""] * 3, "a defect of its own"
 
 
-def test_names_of_robots_whose_messages_are_wrong_fill_no_memory(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_names_of_robots_whose_messages_are_wrong_fill_no_memory(monkeypatch):
     monkeypatch.setattr(dispatch, "MOST_ROBOTS", 10)
     failures = Failures(clock=lambda: 0.0)
     for number in range(100):
@@ -192,7 +188,7 @@ def test_names_of_robots_whose_messages_are_wrong_fill_no_memory(monkeypatch: py
     assert failures.count_of("x99") is None
 
 
-def test_a_flood_of_wrong_messages_is_one_line(hub: MemoryHub, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_flood_of_wrong_messages_is_one_line(hub: MemoryHub, caplog):
     keys = Keys("demo")
     robot, server = MemoryBus(hub), MemoryBus(hub)
     heard: list[int] = []

@@ -1,7 +1,5 @@
 """Small messages and answers to questions come back as they were."""
 
-from __future__ import annotations
-
 from types import SimpleNamespace
 
 import msgspec
@@ -50,7 +48,7 @@ scalars = st.one_of(
 )
 
 
-def test_small_messages() -> None:
+def test_small_messages():
     for message in (
         Mark(7, 2**64 - 1),
         Head(2**63, 7, {"s0": 3, "s1": 7}),
@@ -85,21 +83,21 @@ def test_small_messages() -> None:
         (Ack.decode, Ack(MapId("a/b", 1), 1, 1).encode()),
     ],
 )
-def test_nonsense_is_refused(decode: object, data: bytes) -> None:
+def test_nonsense_is_refused(decode: object, data: bytes):
     assert callable(decode)
     with pytest.raises(InvalidMessage):
         decode(data)
 
 
 @pytest.mark.parametrize(("covered", "numbers"), [(9, [4, 4]), (9, [2]), (9, [10]), (1, [])])
-def test_invalid_pieces_of_a_log_are_refused(covered: int, numbers: list[int]) -> None:
+def test_invalid_pieces_of_a_log_are_refused(covered: int, numbers: list[int]):
     with pytest.raises(InvalidValue):
         LogAnswer(1, 3, covered, tuple((number, b"") for number in numbers))
     with pytest.raises(InvalidValue):
         LogRequest(5, 4)
 
 
-def test_only_the_newest_refusals_travel_and_none_is_too_long() -> None:
+def test_only_the_newest_refusals_travel_and_none_is_too_long():
     ack = Ack(MapId("r0", 1), 1, 99, tuple(Refusal(k, "r" * 999) for k in range(1, 99)))
     back = Ack.decode(ack.encode())
     assert [refusal.sequence for refusal in back.refusals] == list(range(83, 99))
@@ -107,7 +105,7 @@ def test_only_the_newest_refusals_travel_and_none_is_too_long() -> None:
 
 
 @given(st.dictionaries(st.from_regex(r"[a-z_]{1,32}", fullmatch=True), scalars, max_size=20))
-def test_records(values: dict[str, bool | int | float | str]) -> None:
+def test_records(values: dict[str, bool | int | float | str]):
     back = decode_record(encode_record(values))
     assert back == values
     assert [type(value) for value in back.values()] == [type(value) for value in values.values()]
@@ -116,12 +114,12 @@ def test_records(values: dict[str, bool | int | float | str]) -> None:
 @pytest.mark.parametrize(
     "values", [{"x": "a\nb"}, {"x": float("nan")}, {"x" * 33: 1}, {"x": 2**70}, {"x": b""}]
 )
-def test_records_that_cannot_be_sent(values: dict[str, object]) -> None:
+def test_records_that_cannot_be_sent(values: dict[str, object]):
     with pytest.raises(InvalidValue):
         encode_record(values)  # type: ignore[arg-type]
 
 
-def test_a_view(some: SimpleNamespace) -> None:
+def test_a_view(some: SimpleNamespace):
     landmarks = some.node(120).landmarks
     encoded = encode_view(View(landmarks.pixels, landmarks.codes, some.camera))
     assert len(encoded) < 120 * 20
@@ -137,7 +135,7 @@ def test_a_view(some: SimpleNamespace) -> None:
         decode_view(nowhere)
 
 
-def test_a_view_that_cannot_be_sent(some: SimpleNamespace) -> None:
+def test_a_view_that_cannot_be_sent(some: SimpleNamespace):
     landmarks = some.node(3).landmarks
     for pixels, codes in (
         (landmarks.pixels[:2], landmarks.codes),
@@ -149,7 +147,7 @@ def test_a_view_that_cannot_be_sent(some: SimpleNamespace) -> None:
             encode_view(View(pixels, codes, some.camera))
 
 
-def test_a_relocalization() -> None:
+def test_a_relocalization():
     places = (
         Whereabouts(NodeId("r1", 3, 17), HERE, HERE, 0, 41, 0.75),
         Whereabouts(NodeId("r2", 1, 4), HERE, None, -1, 12, 0.25),
@@ -169,13 +167,13 @@ def test_a_relocalization() -> None:
     assert (same.certainty, same.candidates, same.reason) == (Certainty.UNKNOWN, (), nothing.reason)
 
 
-def test_a_relocalization_that_cannot_be_sent() -> None:
+def test_a_relocalization_that_cannot_be_sent():
     wrong = Whereabouts(NodeId("r1", 3, 17), HERE, HERE, 0, 41, 1.5)
     with pytest.raises(InvalidValue, match="probability"):
         encode(RelocalizeAnswer(Certainty.FOUND, (wrong,), ""))
 
 
-def test_a_route(some: SimpleNamespace) -> None:
+def test_a_route(some: SimpleNamespace):
     start, goal = NodeId("r0", 1, 2), NodeId("r2", 1, 9)
     request = RouteRequest(start, goal, ((start, NodeId("r1", 1, 1)),), Pose2(0.1, 0.2, -3))
     assert decode(encode(request), RouteRequest) == request
@@ -192,7 +190,7 @@ def test_a_route(some: SimpleNamespace) -> None:
     assert (nothing.legs, nothing.reason) == ((), "no way")
 
 
-def test_the_cache_returns_its_entries() -> None:
+def test_the_cache_returns_its_entries():
     request = KnownRequest(MapId("r0", 3), 1.25, -2.5, 8.7)
     assert decode(encode(request), KnownRequest) == request
     views = np.random.default_rng(1).uniform([-50, -50, -3, 0.1], [50, 50, 3, 1.2], (MAX_KNOWN, 4))
@@ -209,12 +207,12 @@ def test_the_cache_returns_its_entries() -> None:
 @pytest.mark.parametrize(
     "view", [[np.nan, 0, 0, 0.5], [0, np.inf, 0, 0.5], [2e6, 0, 0, 0.5], [0, 0, 9, 0.5], [0, 0, 0, -0.1]]
 )
-def test_impossible_views_are_not_returned(view: list[float]) -> None:
+def test_impossible_views_are_not_returned(view: list[float]):
     with pytest.raises(InvalidValue, match="out of range"):
         encode(KnownAnswer(np.array([view]), ""))
 
 
-def test_more_than_the_announced_size_is_refused() -> None:
+def test_more_than_the_announced_size_is_refused():
     with pytest.raises(InvalidValue, match="at most"):
         encode(KnownAnswer(np.zeros((MAX_KNOWN + 1, 4)), ""))
     with pytest.raises(InvalidValue, match="finite"):

@@ -1,7 +1,5 @@
 """Missions and statuses as bytes."""
 
-from __future__ import annotations
-
 import msgpack
 import pytest
 from hypothesis import given
@@ -38,21 +36,19 @@ statuses = st.builds(
 
 
 @given(orders, reports)
-def test_missions_come_back_as_they_were(order: MissionOrder, report: MissionReport) -> None:
+def test_missions_come_back_as_they_were(order: MissionOrder, report: MissionReport):
     assert decode(encode(order), MissionOrder) == order
     assert decode(encode(report), MissionReport) == report
 
 
 @given(statuses, stamps, st.none() | reports)
-def test_statuses_come_back_as_they_were(
-    status: Status, stamp_ns: int, mission: MissionReport | None
-) -> None:
+def test_statuses_come_back_as_they_were(status: Status, stamp_ns: int, mission: MissionReport | None):
     sent = AgentStatus(status, stamp_ns, "r0", mission=mission)
     assert decode(encode(sent), AgentStatus) == sent
 
 
 @pytest.mark.parametrize("name", ["doing", "detail", "nodes", "tracked", "map_from_robot", "finished"])
-def test_a_status_without_a_field_is_refused(name: str) -> None:
+def test_a_status_without_a_field_is_refused(name: str):
     fields = msgpack.unpackb(encode(AgentStatus(Status("turning", "", 0, 0, Pose2(), False), 5)))
     del fields["status"][name]
     with pytest.raises(InvalidMessage, match=name):

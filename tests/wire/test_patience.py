@@ -1,7 +1,5 @@
 """Asking servers that are busy."""
 
-from __future__ import annotations
-
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -28,7 +26,7 @@ def busy_twice(asked: list[float], answer: bytes) -> Callable[[Request], None]:
     return handle
 
 
-def test_a_busy_server_is_asked_again_at_its_time(hub: MemoryHub) -> None:
+def test_a_busy_server_is_asked_again_at_its_time(hub: MemoryHub):
     server, person = MemoryBus(hub), MemoryBus(hub)
     asked: list[float] = []
     server.serve("why", busy_twice(asked, b"because"))
@@ -58,7 +56,7 @@ def answered(reply: Reply) -> bool:
     return bool(reply.payload)
 
 
-def test_a_busy_server_is_asked_again_while_another_says_nothing(hub: MemoryHub, silent: MemoryBus) -> None:
+def test_a_busy_server_is_asked_again_while_another_says_nothing(hub: MemoryHub, silent: MemoryBus):
     server, robot = MemoryBus(hub), MemoryBus(hub)
     asked: list[float] = []
     server.serve("where", busy_twice(asked, b"here"))
@@ -69,7 +67,7 @@ def test_a_busy_server_is_asked_again_while_another_says_nothing(hub: MemoryHub,
     assert len(asked) == 3 and all(b - a >= 0.1 for a, b in pairwise(asked))
 
 
-def test_a_busy_server_alone_is_not_asked_again(hub: MemoryHub) -> None:
+def test_a_busy_server_alone_is_not_asked_again(hub: MemoryHub):
     """The robot goes on, and asks again at the time that the server names."""
     server, robot = MemoryBus(hub), MemoryBus(hub)
     asked: list[Request] = []
@@ -83,7 +81,7 @@ def test_a_busy_server_alone_is_not_asked_again(hub: MemoryHub) -> None:
     assert len(asked) == 1
 
 
-def test_a_slow_answer_counts_after_the_busy_one_was_asked_again(hub: MemoryHub) -> None:
+def test_a_slow_answer_counts_after_the_busy_one_was_asked_again(hub: MemoryHub):
     slow, busy, robot = MemoryBus(hub), MemoryBus(hub), MemoryBus(hub)
     first = threading.Event()
 
@@ -102,7 +100,7 @@ def test_a_slow_answer_counts_after_the_busy_one_was_asked_again(hub: MemoryHub)
 
 
 @pytest.mark.parametrize("timeout", [0.05, 0.3])
-def test_the_wait_ends_with_its_time(hub: MemoryHub, silent: MemoryBus, timeout: float) -> None:
+def test_the_wait_ends_with_its_time(hub: MemoryHub, silent: MemoryBus, timeout: float):
     server, robot = MemoryBus(hub), MemoryBus(hub)
     server.serve("where", lambda request: request.refuse("busy", 0.1))
     began = time.monotonic()
@@ -111,7 +109,7 @@ def test_the_wait_ends_with_its_time(hub: MemoryHub, silent: MemoryBus, timeout:
     assert replies and all(one.error == "busy" for one in replies)
 
 
-def test_a_server_that_is_always_busy_for_a_moment_is_asked_seldom(hub: MemoryHub, silent: MemoryBus) -> None:
+def test_a_server_that_is_always_busy_for_a_moment_is_asked_seldom(hub: MemoryHub, silent: MemoryBus):
     """One that lied so was asked 370 times a second, by up to 380 threads."""
     liar, robot = MemoryBus(hub), MemoryBus(hub)
     asked: list[str] = []
@@ -142,7 +140,7 @@ class Endless(MemoryBus):
 
 
 @pytest.mark.parametrize(("size", "most"), [(1, MOST_REPLIES), (2**20, MOST_BYTES // 2**20)])
-def test_replies_without_end_are_enough_at_some_time(hub: MemoryHub, size: int, most: int) -> None:
+def test_replies_without_end_are_enough_at_some_time(hub: MemoryHub, size: int, most: int):
     """A robot's memory grew by 1 GB within its patience."""
     robot = Endless(hub, bytes(size))
     assert len(BusyServers(robot, "where", b"", lambda reply: False).ask(5.0)) == most

@@ -1,7 +1,5 @@
 """One publisher for each key, and not more than fit."""
 
-from __future__ import annotations
-
 import json
 import threading
 import weakref
@@ -27,7 +25,7 @@ def session() -> Iterator[zenoh.Session]:
     session.close()  # type: ignore[no-untyped-call]
 
 
-def test_a_key_has_one_publisher_until_others_need_its_place(session: zenoh.Session) -> None:
+def test_a_key_has_one_publisher_until_others_need_its_place(session: zenoh.Session):
     publishers, got = Publishers(most=2), list[tuple[str, bytes]]()
     keys = ["a/1", "a/2", "a/1", "a/3", "a/1", "a/2", "a/2"]
     subscriber = session.declare_subscriber(
@@ -68,7 +66,7 @@ class SlowPublisher:
     """Taken back when nothing refers to it, as Zenoh's."""
 
 
-def test_a_key_whose_publisher_is_being_declared_holds_up_no_other() -> None:
+def test_a_key_whose_publisher_is_being_declared_holds_up_no_other():
     session, publishers = SlowSession(), Publishers()
     of = partial(publishers.of, cast(zenoh.Session, session))
     with ThreadPoolExecutor(2) as pool:

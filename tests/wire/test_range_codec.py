@@ -1,7 +1,5 @@
 """Ranges on the wire."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

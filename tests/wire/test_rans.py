@@ -1,7 +1,5 @@
 """The coder in lanes, against one lane in plain Python and against what information theory says."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -38,7 +36,7 @@ def push(writer: LaneWriter, symbols: Ints, column: Column) -> None:
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 30), st.integers(1, 12), st.integers(12, 18))
-def test_pushed_symbols_come_back(seed: int, lanes: int, steps: int, size: int) -> None:
+def test_pushed_symbols_come_back(seed: int, lanes: int, steps: int, size: int):
     random = np.random.default_rng(seed)
     columns = [some_column(random, int(random.integers(1, 60))) for _ in range(steps)]
     symbols = [random.integers(0, len(c.frequencies), lanes) for c in columns]
@@ -61,7 +59,7 @@ def test_pushed_symbols_come_back(seed: int, lanes: int, steps: int, size: int) 
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_many_columns_at_once_equal_one_by_one(seed: int) -> None:
+def test_many_columns_at_once_equal_one_by_one(seed: int):
     random = np.random.default_rng(seed)
     lanes, size = int(random.integers(0, 200)), int(random.integers(12, 32))
     alphabet = int(random.integers(1, 60))
@@ -86,7 +84,7 @@ def test_many_columns_at_once_equal_one_by_one(seed: int) -> None:
             LaneReader(short, lanes, size).pop(Columns.of(columns))
 
 
-def test_a_symbol_costs_its_entropy() -> None:
+def test_a_symbol_costs_its_entropy():
     random = np.random.default_rng(1)
     shares = np.array([0.7, 0.15, 0.1, 0.04, 0.01])
     column = Column(np.array([2867, 614, 410, 164, 41]))
@@ -100,7 +98,7 @@ def test_a_symbol_costs_its_entropy() -> None:
     assert bits / (lanes * steps) == pytest.approx(entropy + 15 / steps, rel=0.01)
 
 
-def test_one_rans_lane_in_plain_python() -> None:
+def test_one_rans_lane_in_plain_python():
     """The definition with whole numbers of any length and a string of bits."""
     random = np.random.default_rng(2)
     column, size = some_column(random, 20), 14
@@ -126,7 +124,7 @@ def test_one_rans_lane_in_plain_python() -> None:
 
 
 @given(st.lists(st.integers(0, 20).flatmap(lambda w: st.tuples(st.integers(0, (1 << w) - 1), st.just(w)))))
-def test_bits(pairs: list[tuple[int, int]]) -> None:
+def test_bits(pairs: list[tuple[int, int]]):
     numbers, widths = (np.array([p[k] for p in pairs], np.int64) for k in (0, 1))
     data = pack_bits(numbers, widths)
     text = "".join(f"{n:0{w}b}" for n, w in pairs if w)
@@ -138,7 +136,7 @@ def test_bits(pairs: list[tuple[int, int]]) -> None:
         BitReader(data).read(np.append(widths, 8 * len(data) + 1 - widths.sum()).clip(0, 24).repeat(2))
 
 
-def test_more_than_there_should_be_is_refused() -> None:
+def test_more_than_there_should_be_is_refused():
     for data in (b"\0", b"\1"):
         reader = BitReader(data)
         reader.read(np.array([0 if data == b"\0" else 4]))

@@ -1,7 +1,5 @@
 """Refusals as bytes: every word and number round-trips, and any bytes are read without harm."""
 
-from __future__ import annotations
-
 import struct
 
 import pytest
@@ -17,19 +15,19 @@ from mapweave.wire.refusal import LONGEST_PAUSE, MARK, decode_refusal, encode_re
 @given(
     st.text(min_size=1).filter(lambda t: "\0" not in t and t.isprintable()), st.floats(0, 2 * LONGEST_PAUSE)
 )
-def test_refusals_come_back(reason: str, retry_after: float) -> None:
+def test_refusals_come_back(reason: str, retry_after: float):
     reply = decode_refusal(encode_refusal(reason, retry_after))
     assert reply is not None
     assert reply.error == reason
     assert reply.retry_after == pytest.approx(min(retry_after, LONGEST_PAUSE), rel=1e-6, abs=1e-37)
 
 
-def test_no_reason_is_said_in_a_word() -> None:
+def test_no_reason_is_said_in_a_word():
     assert encode_refusal("") == b"refused: refused"
 
 
 @given(st.binary(max_size=40))
-def test_any_input_is_a_refusal_or_none(data: bytes) -> None:
+def test_any_input_is_a_refusal_or_none(data: bytes):
     assert decode_refusal(data) is None or data.startswith(MARK)
     reply = decode_refusal(MARK + data)
     assert isinstance(reply, Reply)
@@ -38,7 +36,7 @@ def test_any_input_is_a_refusal_or_none(data: bytes) -> None:
 
 
 @pytest.mark.parametrize("reason", [b"line\nby\x1b[31m line", 10**6 * b"a", b"\n", b"\xff\xfe"])
-def test_a_reason_can_be_passed_on_in_a_message(reason: bytes) -> None:
+def test_a_reason_can_be_passed_on_in_a_message(reason: bytes):
     """A robot may refuse with what no message may hold, and the record of missions holds its reason."""
     reply = decode_refusal(MARK + reason)
     assert reply is not None
@@ -49,6 +47,6 @@ def test_a_reason_can_be_passed_on_in_a_message(reason: bytes) -> None:
 
 
 @pytest.mark.parametrize("number", [float("nan"), float("inf"), -1.0, 1e9, 0.0])
-def test_a_pause_that_cannot_be_is_none(number: float) -> None:
+def test_a_pause_that_cannot_be_is_none(number: float):
     reply = decode_refusal(MARK + b"busy\0" + struct.pack("<f", number))
     assert reply == Reply(error="busy", retry_after=0.0)

@@ -1,7 +1,5 @@
 """ROS 2 over Zenoh against a second implementation, through a real router."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterator
 from typing import Any
@@ -51,7 +49,7 @@ def node(router: ZenohFleet) -> Iterator[Ros2Node]:
     one.close()
 
 
-def test_keys_and_tokens_are_those_of_the_design_document() -> None:
+def test_keys_and_tokens_are_those_of_the_design_document():
     keys = RmwZenohKeys(Ros2Link(domain=2), "8b20917502ee955ac4476e0266340d5c", "talker")
     chatter = Endpoint("/chatter", STRING, HASHES[STRING])
     assert keys.messages(chatter) == f"2/chatter/std_msgs::msg::dds_::String_/{HASHES[STRING]}"
@@ -73,14 +71,14 @@ def test_keys_and_tokens_are_those_of_the_design_document() -> None:
 
 
 @pytest.mark.parametrize("kind", HASHES)
-def test_hashes_are_those_that_ros_prints(kind: str) -> None:
+def test_hashes_are_those_that_ros_prints(kind: str):
     assert type_hash(kind) == HASHES[kind]
 
 
 @given(
     st.integers(-(2**63), 2**63 - 1), st.integers(-(2**63), 2**63 - 1), st.binary(min_size=16, max_size=16)
 )
-def test_attachments_have_33_bytes_and_both_forms_are_read(sequence: int, stamp_ns: int, gid: bytes) -> None:
+def test_attachments_have_33_bytes_and_both_forms_are_read(sequence: int, stamp_ns: int, gid: bytes):
     data = encode_attachment(Attachment(sequence, stamp_ns, gid))
     assert data == struct.pack("<qq", sequence, stamp_ns) + b"\x10" + gid
     named = b"\x0fsequence_number" + data[:8] + b"\x10source_timestamp" + data[8:16]
@@ -90,7 +88,7 @@ def test_attachments_have_33_bytes_and_both_forms_are_read(sequence: int, stamp_
 
 
 @given(st.binary(max_size=90))
-def test_other_attachments_are_refused(data: bytes) -> None:
+def test_other_attachments_are_refused(data: bytes):
     try:
         attachment = decode_attachment(data)
     except InvalidMessage:
@@ -98,7 +96,7 @@ def test_other_attachments_are_refused(data: bytes) -> None:
     assert encode_attachment(attachment) == data or len(data) == 77
 
 
-def test_both_sides_see_and_hear_each_other(ros: RosPeer, node: Ros2Node) -> None:
+def test_both_sides_see_and_hear_each_other(ros: RosPeer, node: Ros2Node):
     got: list[Arrival] = []
     twists = ros.subscriber("/bot/cmd_vel", TWIST)
     node.subscribe(node.link.topic("odom"), [ODOMETRY], got.append)
@@ -134,7 +132,7 @@ def test_both_sides_see_and_hear_each_other(ros: RosPeer, node: Ros2Node) -> Non
     assert not ros.failures
 
 
-def test_late_subscribers_get_the_last_message(router: ZenohFleet, ros: RosPeer, node: Ros2Node) -> None:
+def test_late_subscribers_get_the_last_message(router: ZenohFleet, ros: RosPeer, node: Ros2Node):
     said = node.publisher("/chatter", STRING, latched=True)
     # No subscriber is there yet, perhaps not even a session.
     said.publish(make(STRING, data="first"))
@@ -153,7 +151,7 @@ def test_late_subscribers_get_the_last_message(router: ZenohFleet, ros: RosPeer,
     assert Reader(got[0].data).text() == "kept"
 
 
-def test_humble_has_no_hashes(ros: RosPeer, node: Ros2Node) -> None:
+def test_humble_has_no_hashes(ros: RosPeer, node: Ros2Node):
     twists = ros.subscriber("/cmd_vel", TWIST, type_hash="TypeHashNotSupported")
     command = node.publisher("/cmd_vel", TWIST)
     eventually(lambda: command.subscribers)
@@ -177,7 +175,7 @@ def test_humble_has_no_hashes(ros: RosPeer, node: Ros2Node) -> None:
     assert decode(got[0].kind, got[0].data).range == 1.5
 
 
-def test_a_message_of_another_type_is_named_and_not_decoded(ros: RosPeer, node: Ros2Node) -> None:
+def test_a_message_of_another_type_is_named_and_not_decoded(ros: RosPeer, node: Ros2Node):
     got: list[Arrival] = []
     subscriber = node.subscribe("/odom", [ODOMETRY], got.append)
     ros.publisher("/odom", STRING).publish(Cdr().text("no odometry"))
@@ -186,7 +184,7 @@ def test_a_message_of_another_type_is_named_and_not_decoded(ros: RosPeer, node: 
     assert not got
 
 
-def test_a_bridge_has_plain_keys(router: ZenohFleet) -> None:
+def test_a_bridge_has_plain_keys(router: ZenohFleet):
     bridge = RosPeer(router.endpoints[0], bridge="/bot1")
     node = Ros2Node(Ros2Link(router.endpoints[0], namespace="/bot1", bridge=True), "mapweave")
     try:
@@ -211,7 +209,7 @@ def test_a_bridge_has_plain_keys(router: ZenohFleet) -> None:
         bridge.close()
 
 
-def test_a_link_refuses_what_is_no_name(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_link_refuses_what_is_no_name(monkeypatch):
     for wrong in ({"endpoint": "127.0.0.1"}, {"namespace": "/a b"}, {"namespace": "/1st"}):
         with pytest.raises(SettingsError):
             Ros2Link(**wrong)  # type: ignore[arg-type]

@@ -1,14 +1,11 @@
 """Several routers: what a client does when one is dead, and fleets that are spread over some."""
 
-from __future__ import annotations
-
 import json
 import os
 import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 import zenoh
@@ -50,7 +47,7 @@ def unreachable() -> tuple[socket.socket, list[socket.socket]]:
 
 
 @pytest.mark.slow
-def test_a_dead_first_router_does_not_hold_up_the_start(routers: Routers) -> None:
+def test_a_dead_first_router_does_not_hold_up_the_start(routers: Routers):
     alive = free_port()
     routers.router(alive)
     frozen, (off, waiting) = silent(), unreachable()
@@ -63,7 +60,7 @@ def test_a_dead_first_router_does_not_hold_up_the_start(routers: Routers) -> Non
         one.close()
 
 
-def test_a_client_goes_to_the_next_router_and_back(routers: Routers) -> None:
+def test_a_client_goes_to_the_next_router_and_back(routers: Routers):
     first, second = free_port(), free_port()
     one = routers.router(first)
     answers(one, b"first")
@@ -77,7 +74,7 @@ def test_a_client_goes_to_the_next_router_and_back(routers: Routers) -> None:
     eventually(lambda: answered(client) == {b"first"})
 
 
-def test_routers_that_join_each_other_carry_everything(routers: Routers) -> None:
+def test_routers_that_join_each_other_carry_everything(routers: Routers):
     """Agent - router - router - server; the order in which they start does not matter."""
     agents, between, servers = (free_port() for _ in range(3))
     # Its neighbour is not there yet.
@@ -99,12 +96,12 @@ def test_routers_that_join_each_other_carry_everything(routers: Routers) -> None
     eventually(lambda: alive[-1] == ("mapweave/alive/s0", False))
 
 
-def test_a_router_joins_one_other() -> None:
+def test_a_router_joins_one_other():
     with pytest.raises(SettingsError, match="a router joins one other, not 2"):
         BusSettings(mode="router", listen=(endpoint(1),), routers=(endpoint(2), endpoint(3)))
 
 
-def test_what_is_too_large_between_routers_is_dropped_and_the_link_stays(routers: Routers) -> None:
+def test_what_is_too_large_between_routers_is_dropped_and_the_link_stays(routers: Routers):
     here, there = free_port(), free_port()
     routers.router(here)
     server, client = routers.router(there, here), routers.client(here)
@@ -120,7 +117,7 @@ def test_what_is_too_large_between_routers_is_dropped_and_the_link_stays(routers
     assert size(9) == [9]
 
 
-def test_the_printed_configuration_is_the_whole_configuration(routers: Routers, tmp_path: Path) -> None:
+def test_the_printed_configuration_is_the_whole_configuration(routers: Routers, tmp_path):
     """A zenohd takes this file: Zenoh reads it, and a router by it joins another and carries messages."""
     here, there = free_port(), free_port()
     listen, join = endpoint(here), endpoint(there)

@@ -1,7 +1,5 @@
 """A metered bus does what the bus does, and its count is the sum of what the other side saw."""
 
-from __future__ import annotations
-
 import pytest
 
 from mapweave.hybridmap.errors import InvalidMessage
@@ -15,7 +13,7 @@ def pair(hub: MemoryHub) -> tuple[MemoryHub, TrafficMeter, MemoryBus]:
     return hub, TrafficMeter(MemoryBus(hub)), MemoryBus(hub)
 
 
-def test_published_messages_are_received(pair) -> None:
+def test_published_messages_are_received(pair):
     _, metered, other = pair
     received, seen = [], []
     other.subscribe("to/other", received.append)
@@ -29,7 +27,7 @@ def test_published_messages_are_received(pair) -> None:
     assert metered.traffic == len("to/other") + 8 + len("to/metered") + 6
 
 
-def test_questions_in_both_directions(pair) -> None:
+def test_questions_in_both_directions(pair):
     _, metered, other = pair
     metered.serve("ask/metered", lambda request: request.reply(request.payload * 2))
 
@@ -45,7 +43,7 @@ def test_questions_in_both_directions(pair) -> None:
     assert metered.traffic == before + len("ask/other") + 3 + len(reply.error)
 
 
-def test_without_a_connection_nothing_is_counted(pair) -> None:
+def test_without_a_connection_nothing_is_counted(pair):
     hub, metered, _ = pair
     hub.cut(metered._bus)
     assert not metered.connected()

@@ -1,7 +1,5 @@
 """Trajectory segments on the wire."""
 
-from __future__ import annotations
-
 import struct
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Values of any shape come back, and docs/wire.md names their fields."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, fields
@@ -74,7 +72,7 @@ SAMPLE = Sample(1, 0.5, "one", NodeId("a", 1, 2))
 
 
 @given(samples)
-def test_values_come_back(sample: Sample) -> None:
+def test_values_come_back(sample: Sample):
     data = encode(sample, LIMIT)
     assert decode(data, Sample, LIMIT) == sample
     assert encode(decode(data, Sample, LIMIT), LIMIT) == data
@@ -101,7 +99,7 @@ def test_values_come_back(sample: Sample) -> None:
         ({"newer": "two\nlines"}, "printable"),
     ],
 )
-def test_what_is_wrong_is_said_in_one_line(changed: dict[str, Any], reason: str) -> None:
+def test_what_is_wrong_is_said_in_one_line(changed: dict[str, Any], reason: str):
     plain = {"v": 1, **packed(SAMPLE)}
     decode(msgpack.packb(plain), Sample, LIMIT)
     with pytest.raises(InvalidMessage) as refused:
@@ -110,7 +108,7 @@ def test_what_is_wrong_is_said_in_one_line(changed: dict[str, Any], reason: str)
     assert "\n" not in str(refused.value)
 
 
-def test_fields_with_defaults_may_be_missing_and_unknown_ones_are_ignored() -> None:
+def test_fields_with_defaults_may_be_missing_and_unknown_ones_are_ignored():
     plain = packed(SAMPLE)
     few = {name: plain[name] for name in ("count", "share", "which", "node")}
     assert decode(msgpack.packb({"v": 1, **few, "newer": [b"x"]}), Sample, LIMIT) == SAMPLE
@@ -128,7 +126,7 @@ class Arrays:
 
 
 @given(st.integers(0, 2**32 - 1), st.lists(st.integers(0, 4), min_size=1, max_size=3))
-def test_arrays_come_back(seed: int, shape: list[int]) -> None:
+def test_arrays_come_back(seed: int, shape: list[int]):
     numbers = np.random.default_rng(seed).normal(size=shape) * 1e3
     arrays = Arrays(
         numbers, numbers.astype(np.float32), numbers.astype(np.int64),
@@ -174,7 +172,7 @@ def changed(plain: Any) -> Iterator[Any]:
             yield from ([*plain[:k], other, *plain[k + 1 :]] for other in changed(inner))
 
 
-def test_what_is_read_at_once_is_what_is_read_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_read_at_once_is_what_is_read_one_by_one(monkeypatch):
     """The same values, and where there is none the same reason."""
     node = NodeId("r0", 1, 3)
     wait = PortalWait(PortalStop("lift", PortalMeans.LIFT, node, node._replace(number=4)))
@@ -194,6 +192,6 @@ def test_what_is_read_at_once_is_what_is_read_one_by_one(monkeypatch: pytest.Mon
 
 
 @pytest.mark.parametrize("kind", LIMITS, ids=lambda kind: kind.__name__)
-def test_every_kind_of_message_can_be_read_at_once(kind: type) -> None:
+def test_every_kind_of_message_can_be_read_at_once(kind: type):
     names = [one.name for one in fields(kind)]
     assert list(typed._nested(kind).struct.__struct_fields__) == names

@@ -1,7 +1,5 @@
 """docs/wire_vectors.json: as the program writes it, and as a decoder reads it that knows the page alone."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -42,7 +40,7 @@ def agrees(found: Any, stated: Any, where: str) -> None:
         assert found == stated, where
 
 
-def test_a_decoder_written_from_the_page_reads_every_vector() -> None:
+def test_a_decoder_written_from_the_page_reads_every_vector():
     plain = Plain()
     for number, vector in enumerate(VECTORS):
         found = plain.decode(vector["what"], bytes.fromhex(vector["hex"]))
@@ -53,12 +51,12 @@ def test_a_decoder_written_from_the_page_reads_every_vector() -> None:
     )
 
 
-def test_the_page_describes_every_value() -> None:
+def test_the_page_describes_every_value():
     on_disk_alone = {KeptHistory, KeptPruned, KeptPruning}
     assert set(schema()) >= {kind.__name__ for kind in LIMITS if kind not in on_disk_alone}
 
 
-def test_every_key_is_on_the_page_and_has_a_vector() -> None:
+def test_every_key_is_on_the_page_and_has_a_vector():
     """A key that a program uses, with its names as the page writes them."""
     keys = Keys("demo")
     given = {"map_id": MapId("r0", 3), "agent": "r0", "server": "s0", "robot": "b0", "number": 7}
@@ -85,7 +83,7 @@ def test_every_key_is_on_the_page_and_has_a_vector() -> None:
             assert key in travelled, f"{key} has no vector"
 
 
-def test_the_file_is_what_the_program_writes() -> None:
+def test_the_file_is_what_the_program_writes():
     """Bytes that have been written are read for ever: a change here is a change of the format."""
     written = runpy.run_path(str(ROOT / "docs" / "wire_vectors.py"))["as_json"]()
     for made, kept in zip(json.loads(written), VECTORS, strict=True):

@@ -1,7 +1,5 @@
 """What the Zenoh bus must do besides the contract: missing and taken ports, and the process's end."""
 
-from __future__ import annotations
-
 import signal
 import socket
 import subprocess
@@ -23,7 +21,7 @@ from tests.waiting import eventually, free_port
 from tests.wire.fleets import Routers, ZenohFleet
 
 
-def test_a_client_may_come_before_its_router(routers: Routers) -> None:
+def test_a_client_may_come_before_its_router(routers: Routers):
     port = free_port()
     begin = time.monotonic()
     client = routers.client(port)
@@ -40,8 +38,8 @@ def test_a_client_may_come_before_its_router(routers: Routers) -> None:
 
 
 def test_a_client_whose_session_breaks_while_it_declares_connects_again(
-    routers: Routers, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+    routers: Routers, monkeypatch, caplog
+):
     declare, broken = Subscription._declare_in, iter([True])
 
     def declare_in(subscription: Subscription, session: zenoh.Session) -> Any:
@@ -57,7 +55,7 @@ def test_a_client_whose_session_breaks_while_it_declares_connects_again(
     assert "the transport is closed; trying again" in caplog.text
 
 
-def test_all_questions_to_a_robot_are_one_declaration(zenoh_fleet: ZenohFleet) -> None:
+def test_all_questions_to_a_robot_are_one_declaration(zenoh_fleet: ZenohFleet):
     """Eight made a third of what it cost a robot to connect beside 400 others."""
     client = zenoh_fleet.join()
     before = threading.active_count()
@@ -67,14 +65,14 @@ def test_all_questions_to_a_robot_are_one_declaration(zenoh_fleet: ZenohFleet) -
     assert threading.active_count() == before + 1
 
 
-def test_a_client_that_never_connects_closes_at_once(routers: Routers) -> None:
+def test_a_client_that_never_connects_closes_at_once(routers: Routers):
     client = routers.client(free_port())
     begin = time.monotonic()
     client.close()
     assert time.monotonic() - begin < 5
 
 
-def test_a_taken_port_is_reported_in_one_line(zenoh_fleet: ZenohFleet) -> None:
+def test_a_taken_port_is_reported_in_one_line(zenoh_fleet: ZenohFleet):
     with pytest.raises(NotConnected, match="the port is taken; stop the other server") as error:
         zenoh_fleet.open_router()
     assert "\n" not in str(error.value)
@@ -83,7 +81,7 @@ def test_a_taken_port_is_reported_in_one_line(zenoh_fleet: ZenohFleet) -> None:
 
 @pytest.mark.slow
 @pytest.mark.waits
-def test_idle_connections_block_no_other(routers: Routers) -> None:
+def test_idle_connections_block_no_other(routers: Routers):
     port = free_port()
     routers.router(port)
     with ExitStack() as stack:
@@ -105,7 +103,7 @@ def _is_closed(connection: socket.socket) -> bool:
 
 @pytest.mark.parametrize("declaring_thread_is_daemon", [False, True])
 @pytest.mark.parametrize("closes", [False, True])
-def test_the_interpreter_exits_cleanly(declaring_thread_is_daemon: bool, closes: bool) -> None:
+def test_the_interpreter_exits_cleanly(declaring_thread_is_daemon: bool, closes: bool):
     """Whether the bus is closed or forgotten, declared from a daemon thread or not, with a question open."""
     program = f"""
 import threading, time
@@ -142,12 +140,8 @@ if {closes}:
 
 @pytest.mark.parametrize(("limit", "most"), [("MOST_REPLIES", 20), ("MOST_REPLY_BYTES", 20_000)])
 def test_replies_without_end_fill_no_memory(
-    limit: str,
-    most: int,
-    zenoh_fleet: ZenohFleet,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    limit: str, most: int, zenoh_fleet: ZenohFleet, monkeypatch, caplog
+):
     """A client that answers a question again and again filled 1 GB of who had asked."""
 
     def answer(request: Any) -> None:
@@ -168,7 +162,7 @@ def test_replies_without_end_fill_no_memory(
     assert [reply.payload for reply in client.ask("b", b"", 5.0)] == [b"b"]
 
 
-def test_a_router_drops_what_is_too_large(zenoh_fleet: ZenohFleet) -> None:
+def test_a_router_drops_what_is_too_large(zenoh_fleet: ZenohFleet):
     """From clients; the server's own answers, a whole map for example, are as large as they are."""
     fleet = zenoh_fleet
     client, other = fleet.join(), fleet.join()
@@ -193,7 +187,7 @@ def test_a_router_drops_what_is_too_large(zenoh_fleet: ZenohFleet) -> None:
     assert fleet.router.ask("mapweave/log", str(2**25 + 1).encode(), 1.0) == []
 
 
-def test_a_router_puts_no_message_together_that_is_too_large(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_router_puts_no_message_together_that_is_too_large(monkeypatch):
     """What it drops for its kind it has first put together of its fragments, whatever they came to."""
     monkeypatch.setattr(zenoh_config, "LARGEST_MESSAGE", 2**19)
     with closing(ZenohFleet()) as fleet:
@@ -215,7 +209,7 @@ bus.ask("mapweave/map", b"", 60.0)
 
 
 @pytest.mark.slow
-def test_a_client_that_stops_reading_does_not_hold_up_new_keys(zenoh_fleet: ZenohFleet) -> None:
+def test_a_client_that_stops_reading_does_not_hold_up_new_keys(zenoh_fleet: ZenohFleet):
     """With 30 MB on their way to it, the router was closed for 16 s, and no one was answered for 17."""
     fleet, asked = zenoh_fleet, threading.Event()
     live = fleet.join()

@@ -1,7 +1,5 @@
 """What Zenoh logs, as records of this process: nothing is lost, and a failure of it stops nothing."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
@@ -40,7 +38,7 @@ def zenoh(words: str, level: str = "WARN") -> bytes:
 
 
 @pytest.mark.parametrize("how", [(), ("-u",)])
-def test_what_zenoh_says_otherwise_is_logged_as_it_says_it(how: tuple[str, ...]) -> None:
+def test_what_zenoh_says_otherwise_is_logged_as_it_says_it(how: tuple[str, ...]):
     written = zenoh("zenoh_transport::unicast: no room\nfor more") + zenoh("zenoh_link_tls: closed", "DEBUG")
     written += b"of another library\n" + zenoh("zenoh::net: failed", "ERROR") + b"without an end"
     output, log = run(written, how=how)
@@ -55,7 +53,7 @@ def test_what_zenoh_says_otherwise_is_logged_as_it_says_it(how: tuple[str, ...])
     ]
 
 
-def test_one_reason_is_logged_once_a_minute_and_counted(caplog: pytest.LogCaptureFixture) -> None:
+def test_one_reason_is_logged_once_a_minute_and_counted(caplog):
     now = 0.0
     refusals = Refusals(lambda: now)
     assert refusals.wait() is None
@@ -80,14 +78,14 @@ def test_one_reason_is_logged_once_a_minute_and_counted(caplog: pytest.LogCaptur
     ]
 
 
-def test_a_refusal_in_unknown_words_keeps_them() -> None:
+def test_a_refusal_in_unknown_words_keeps_them():
     assert meaning("received fatal alert: BadCertificate") == (
         "it does not accept this router's certificate (BadCertificate)"
     )
     assert meaning("strange things (os error 5)") == "its handshake failed (strange things (os error 5))"
 
 
-def test_a_failure_of_the_reader_leaves_output_as_it_was_and_stops_nothing() -> None:
+def test_a_failure_of_the_reader_leaves_output_as_it_was_and_stops_nothing():
     """A pipe that is not read takes 64 kB, and then a writer waits for ever."""
     broken = "zenoh_log.ZenohLog._take = lambda self, line: 1 / 0"
     more = 'import time; time.sleep(0.5); os.write(1, b"x" * 200_000 + b"\\n")'

@@ -4,8 +4,6 @@ The room is a box with pillars, its floor and walls covered with a random patter
 and some of them are false.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from pathlib import Path

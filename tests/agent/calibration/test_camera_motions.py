@@ -1,7 +1,5 @@
 """Camera motions by the wheels: against points that are projected by hand, and their small steps."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -1,7 +1,5 @@
 """A level lens against a camera that is tilted by hand, and odometry that is late."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Readings of the wheels, kept where pairs need them."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapweave.agent.calibration.counted_wheels import FIRST_ROOM, CountedWheels

@@ -1,7 +1,5 @@
 """The estimator on drives with known geometry, and against a second implementation."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

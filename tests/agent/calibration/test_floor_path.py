@@ -1,7 +1,5 @@
 """The wheels' scale by a floor that is no plane, and heights over a way against hand-made ones."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -58,7 +56,7 @@ def road_pairs(radius: float, seconds: float, seed: int) -> list[ImagePair]:
 
 
 @pytest.mark.parametrize("radius", first_quick([75.0, 1e6, -75.0], 2), ids=["dip", "plane", "crest"])
-def test_a_road_that_bends_tells_the_scale(radius: float) -> None:
+def test_a_road_that_bends_tells_the_scale(radius: float):
     """A street with a vertical curve of 500 m under a camera of 1.65 m, made smaller: 2 m ahead it is 27 mm
     off the plane under the robot, a tenth of the camera's height.
     """
@@ -71,7 +69,7 @@ def test_a_road_that_bends_tells_the_scale(radius: float) -> None:
     assert estimate.vector[Parameter.WHEEL_SCALE] == pytest.approx(-math.log(1.04), abs=0.01)
 
 
-def test_heights_are_those_where_the_camera_comes_nearest() -> None:
+def test_heights_are_those_where_the_camera_comes_nearest():
     """Ahead by 1 m, then turned down by 0.1 rad and ahead by another; y is down, z ahead."""
     down = np.array([0.0, 1.0, 0.0])
     level = CameraMotions(np.eye(3), np.array([0.0, 0.0, -1.0]), down)
@@ -88,7 +86,7 @@ def test_heights_are_those_where_the_camera_comes_nearest() -> None:
     assert off == pytest.approx([-0.1, 0.2, math.hypot(0.2, 0.3)])
 
 
-def test_a_way_goes_on_only_without_a_gap() -> None:
+def test_a_way_goes_on_only_without_a_gap():
     motion = CameraMotions(np.eye(3), np.zeros(3), np.array([0.0, 1.0, 0.0]))
     ways: list[list[DrivenStep]] = []
     for k in range(3 * FOLLOWED):

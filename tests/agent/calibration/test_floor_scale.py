@@ -1,7 +1,5 @@
 """The floor among what stands on it: mixtures of which the truth is known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -31,18 +29,18 @@ def error(floor: float, above: float, lane: bool) -> float:
     return float(np.mean(errors))
 
 
-def test_what_stands_in_the_lane_does_not_raise_the_floor() -> None:
+def test_what_stands_in_the_lane_does_not_raise_the_floor():
     """Feet of walls: seven points of ten stand on the floor, none is below."""
     assert error(0.3, 0.7, lane=True) == pytest.approx(0.0, abs=0.003)
     assert error(0.3, 0.7, lane=False) > 0.006
 
 
 @pytest.mark.parametrize(("floor", "above"), [(0.8, 0.1), (0.8, 0.0)], ids=["even", "below"])
-def test_false_points_do_not_move_the_floor(floor: float, above: float) -> None:
+def test_false_points_do_not_move_the_floor(floor: float, above: float):
     assert error(floor, above, lane=True) == pytest.approx(0.0, abs=0.001)
 
 
-def test_tiles_show_the_lane_and_corners_do_not(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tiles_show_the_lane_and_corners_do_not(monkeypatch):
     seen = []
     monkeypatch.setattr(estimator_module, "floor_scale", lambda *given: seen.append(given[-1]))
     rng = np.random.default_rng(1)

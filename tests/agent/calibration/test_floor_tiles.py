@@ -1,7 +1,5 @@
 """Tiles of the floor against images of a plane that are rendered ray by ray."""
 
-from __future__ import annotations
-
 import math
 
 import cv2

@@ -1,7 +1,5 @@
 """Points that calibration follows: none on edges."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

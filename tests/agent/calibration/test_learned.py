@@ -1,11 +1,8 @@
 """What a robot has learned of its geometry outlasts its process, and is given up where it is wrong."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from datetime import date
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,7 +29,7 @@ def known(heading: float, sigma: float = 0.003) -> LearnedGeometry:
     return LearnedGeometry(DECLARED, intrinsics, {P.HEADING: LearnedParameter(heading, sigma)})
 
 
-def test_what_is_learned_is_used_from_the_start_and_confirmed(tmp_path: Path) -> None:
+def test_what_is_learned_is_used_from_the_start_and_confirmed(tmp_path):
     """Two drives of one robot, each with wheels of its own."""
     first = watched(drive(np.random.default_rng(1), TRUE, 40.0), DECLARED, 1)
     learned = first.learned
@@ -52,7 +49,7 @@ def test_what_is_learned_is_used_from_the_start_and_confirmed(tmp_path: Path) ->
     assert now.sigma < was.sigma and abs(now.value - TRUE.heading) < 3.5 * now.sigma
 
 
-def test_a_camera_that_was_turned_is_learned_again() -> None:
+def test_a_camera_that_was_turned_is_learned_again():
     """It was turned between two drives: what was learned is given up, and said to be."""
     touched = OnlineCalibration(DESCRIPTION, known(math.radians(-2.0)))
     assert touched.geometry.heading == math.radians(-2.0)
@@ -65,7 +62,7 @@ def test_a_camera_that_was_turned_is_learned_again() -> None:
     assert learned.parameters[P.HEADING].value == pytest.approx(TRUE.heading, abs=math.radians(0.5))
 
 
-def test_less_than_both_sigmas_explain_is_no_contradiction() -> None:
+def test_less_than_both_sigmas_explain_is_no_contradiction():
     """1.5 degrees, which this drive alone is sure of, and an earlier one was not."""
     for sigma, given_up in ((0.003, 1), (0.02, 0)):
         online = OnlineCalibration(DESCRIPTION, known(math.radians(-1.5), sigma))
@@ -80,17 +77,17 @@ def test_less_than_both_sigmas_explain_is_no_contradiction() -> None:
         replace(DESCRIPTION, camera=replace(DESCRIPTION.camera, fx=300.0)),
     ],
 )
-def test_another_camera_or_declaration_uses_nothing_of_it(now: RobotDescription) -> None:
+def test_another_camera_or_declaration_uses_nothing_of_it(now: RobotDescription):
     plain, given = OnlineCalibration(now), OnlineCalibration(now, known(0.0))
     assert given.geometry == plain.geometry and given.description == plain.description
     assert given.learned is None
 
 
-def test_a_robot_that_corrects_nothing_keeps_nothing() -> None:
+def test_a_robot_that_corrects_nothing_keeps_nothing():
     assert OnlineCalibration(DESCRIPTION).learned is None
 
 
-def test_two_estimates_are_joined_as_least_squares_do() -> None:
+def test_two_estimates_are_joined_as_least_squares_do():
     """Weighted by their variances; but never surer than the estimator itself is."""
     value, sigma = joined(0.8, 0.1, 1.0, 0.05, P.FORWARD)
     design, weights = np.ones((2, 1)), np.array([100.0, 400.0])
@@ -114,7 +111,7 @@ def test_two_estimates_are_joined_as_least_squares_do() -> None:
         ("learned_on = 2026-11-29", "", "learned_on"),
     ],
 )
-def test_a_damaged_file_is_refused_with_the_reason(tmp_path: Path, old: str, new: str, words: str) -> None:
+def test_a_damaged_file_is_refused_with_the_reason(tmp_path, old: str, new: str, words: str):
     path = tmp_path / "r0.learned.toml"
     assert read_learned(path) is None
     write_learned(path, known(0.01), DAY)

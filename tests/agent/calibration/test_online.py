@@ -1,7 +1,5 @@
 """Calibration while mapping, on tracks that are drawn."""
 
-from __future__ import annotations
-
 import math
 import tracemalloc
 from collections.abc import Callable, Sequence
@@ -111,7 +109,7 @@ def test_a_wrong_geometry_is_named_and_mended(parameter: Parameter, amount: floa
 
 
 @pytest.mark.parametrize("wrong_m", [0.0, 0.3])
-def test_how_far_the_camera_may_stand_elsewhere_holds_from_the_first_image_on(wrong_m: float) -> None:
+def test_how_far_the_camera_may_stand_elsewhere_holds_from_the_first_image_on(wrong_m: float):
     """When nothing is known of it, too; and it is little once that is corrected, or right."""
     declared = replace(TRUE, forward=TRUE.forward + wrong_m)
     camera = replace(CAMERA, mount_forward=declared.forward, mount_height=declared.height)
@@ -136,7 +134,7 @@ def test_how_far_the_camera_may_stand_elsewhere_holds_from_the_first_image_on(wr
 
 
 @pytest.mark.parametrize(("declared_m", "truly"), first_quick([(0.28, "higher"), (0.32, "lower")], 1))
-def test_a_height_that_is_declared_wrongly_is_said_which_way(declared_m: float, truly: str) -> None:
+def test_a_height_that_is_declared_wrongly_is_said_which_way(declared_m: float, truly: str):
     """The wheels are right here: only what is said in brackets is true."""
     run = drive(np.random.default_rng(1), TRUE, 40.0)
     (cause,) = watched(run, replace(TRUE, height=declared_m), 1).causes
@@ -152,7 +150,7 @@ def with_long_wheels(seed: int) -> OnlineCalibration:
 
 
 @pytest.mark.parametrize("seed", first_quick([2, 3, 4], 1))
-def test_wheels_that_contradict_the_height_are_named_and_corrected(seed: int) -> None:
+def test_wheels_that_contradict_the_height_are_named_and_corrected(seed: int):
     """4 % may be the height's, too. But that the two do not go together is sure, and the height counts."""
     online = with_long_wheels(seed)
     assert [cause.parameter for cause in online.causes] == [Parameter.WHEEL_SCALE]
@@ -184,7 +182,7 @@ def floor_estimate(wheels: float, lengths: Lengths = Lengths.FLOOR) -> Estimate:
 )
 def test_a_contradiction_of_the_height_corrects_what_only_the_floor_shows(
     wheels: float, lengths: Lengths, corrected: bool
-) -> None:
+):
     """3.5 % are five sigmas of the ratio and three of the wheels alone.
 
     A floor that seems too near, so that wheels seem to go further, may be the feet of walls.
@@ -209,9 +207,7 @@ def test_a_contradiction_of_the_height_corrects_what_only_the_floor_shows(
         (0.983, Lengths.RANGERS, 0.965),
     ],
 )
-def test_wheels_that_were_corrected_follow_what_more_pairs_show(
-    later: float, lengths: Lengths, used: float
-) -> None:
+def test_wheels_that_were_corrected_follow_what_more_pairs_show(later: float, lengths: Lengths, used: float):
     """By a sigma of the ratio, 0.7 %, either way. By the floor."""
     online = OnlineCalibration(declaring(RobotDescription(CAMERA), TRUE))
     first, last = floor_estimate(0.965), floor_estimate(later, lengths)
@@ -223,7 +219,7 @@ def test_wheels_that_were_corrected_follow_what_more_pairs_show(
 
 
 @pytest.mark.parametrize("lengths", [Lengths.RANGERS, Lengths.BOTH])
-def test_wheels_that_proximity_sensors_show_are_named_by_their_own_sigma(lengths: Lengths) -> None:
+def test_wheels_that_proximity_sensors_show_are_named_by_their_own_sigma(lengths: Lengths):
     """Then it is not the height that may be wrong instead."""
     estimate = with_long_wheels(2).estimate
     assert estimate is not None
@@ -233,7 +229,7 @@ def test_wheels_that_proximity_sensors_show_are_named_by_their_own_sigma(lengths
 
 @pytest.mark.slow
 @pytest.mark.parametrize("amount", [math.log(1.05), -math.log(1.06)])
-def test_wheels_that_floor_and_rangers_contradict_are_corrected(amount: float) -> None:
+def test_wheels_that_floor_and_rangers_contradict_are_corrected(amount: float):
     """Two lengths against one. By the floor alone it might as well be the camera's height."""
     vector = TRUE.vector
     vector[Parameter.WHEEL_SCALE] += amount
@@ -247,7 +243,7 @@ def test_wheels_that_floor_and_rangers_contradict_are_corrected(amount: float) -
 
 @pytest.mark.slow
 @pytest.mark.parametrize("ranged", [1.0, 1.08])
-def test_right_wheels_are_left_alone_whatever_the_rangers_read(ranged: float) -> None:
+def test_right_wheels_are_left_alone_whatever_the_rangers_read(ranged: float):
     """Sensors that read 8 % too much are contradicted by wheels and floor."""
     online = watched(drive(np.random.default_rng(5), TRUE, 60.0, "turning"), TRUE, 5, ranged=ranged)
     assert not online.causes
@@ -265,7 +261,7 @@ def test_a_robot_that_stands_learns_nothing():
     assert not online.causes
 
 
-def test_wheels_that_count_backward_are_survived() -> None:
+def test_wheels_that_count_backward_are_survived():
     """No point has a depth by them: the image moves the other way."""
     run = drive(np.random.default_rng(1), TRUE, 20.0, "turning")
     run.wheels.way[:] *= -3.0
@@ -279,7 +275,7 @@ def test_a_clock_that_goes_back_is_survived():
     assert online.estimate is None
 
 
-def test_no_tick_does_two_of_the_costly_things(monkeypatch: pytest.MonkeyPatch):
+def test_no_tick_does_two_of_the_costly_things(monkeypatch):
     """Reducing a pair, telling the floor, solving: together they are a late tick on a small computer."""
     done: list[tuple[float, str]] = []
 
@@ -305,8 +301,8 @@ def test_no_tick_does_two_of_the_costly_things(monkeypatch: pytest.MonkeyPatch):
     ("pairs", "sigmas", "named"), [(100, 4.4, True), (100, 3.8, False), (96, 4.4, False)]
 )
 def test_a_curve_at_the_end_of_a_long_drive_names_a_delay_at_once(
-    pairs: int, sigmas: float, named: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    pairs: int, sigmas: float, named: bool, monkeypatch
+):
     """Not while pairs are few, nor where it is not sure: what lasts is named later."""
     spread = np.full(COUNT, 10.0)
     spread[Parameter.DELAY] = 0.05 / sigmas
@@ -343,9 +339,7 @@ def test_tracks_of_two_images_are_matched_as_by_numpy(mine: int, others: int):
         assert np.array_equal(found[1], second)
 
 
-def test_a_correction_of_the_wheels_says_by_how_much_the_way_was_longer(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_correction_of_the_wheels_says_by_how_much_the_way_was_longer(monkeypatch):
     """The map that was made by them is scaled by it."""
     scales, switched = [1.0], OnlineCalibration.switched
 

@@ -1,7 +1,5 @@
 """The wheels' scale by proximity sensors, in a room whose readings are worked out ray by ray."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 
@@ -59,7 +57,7 @@ def driving(
 
 
 @pytest.mark.parametrize(("seed", "scale"), [(0, 1.0), (1, 1.05), (2, 0.95)])
-def test_the_scale_is_found_within_its_sigma(seed: int, scale: float) -> None:
+def test_the_scale_is_found_within_its_sigma(seed: int, scale: float):
     rangers = RangerScale(BODY)
     for wheels, proximity in driving(seed, scale, 800):
         rangers.step(wheels, proximity)
@@ -69,7 +67,7 @@ def test_the_scale_is_found_within_its_sigma(seed: int, scale: float) -> None:
     assert abs(found.log - math.log(scale)) < 2.5 * found.sigma
 
 
-def test_a_person_who_walks_about_does_not_change_it() -> None:
+def test_a_person_who_walks_about_does_not_change_it():
     """Towards the robot and away from it, faster than it drives."""
 
     def walking(tick: int) -> np.ndarray:
@@ -82,7 +80,7 @@ def test_a_person_who_walks_about_does_not_change_it() -> None:
     assert found is None or abs(found.log) < 2.5 * found.sigma
 
 
-def test_a_scanner_counts_as_one_sensor_each_way() -> None:
+def test_a_scanner_counts_as_one_sensor_each_way():
     """One drive toward a wall is one stretch, however many beams see it: its wheels slip once."""
     bearings = tuple(math.radians(k) for k in range(-180, 180))
     rangers = RangerScale(RobotDescription(BODY.camera, ranger_bearings=bearings, ranger_reach=8.0))
@@ -93,7 +91,7 @@ def test_a_scanner_counts_as_one_sensor_each_way() -> None:
     assert rangers.scale() is None
 
 
-def test_without_a_sensor_along_the_way_or_a_drive_nothing_is_said() -> None:
+def test_without_a_sensor_along_the_way_or_a_drive_nothing_is_said():
     blind = RangerScale(RobotDescription(BODY.camera, ranger_bearings=(0.5, -0.5), ranger_reach=3.0))
     none = RangerScale(RobotDescription(BODY.camera))
     stands, far = RangerScale(BODY), RangerScale(BODY)

@@ -1,7 +1,5 @@
 """What pairs of images say of a turn corrects the mapping filter, as far as they know it better."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 
@@ -51,21 +49,21 @@ def corrections(seed: int, sway: float, filtered: Callable[[Array, Array], Array
 
 
 @pytest.mark.parametrize("sway", [0.0, math.radians(0.3)])
-def test_a_filter_that_drifts_is_corrected(sway: float) -> None:
+def test_a_filter_that_drifts_is_corrected(sway: float):
     """By 12 degrees in 40 s, whether the camera sways or not."""
     drift = math.radians(0.3)
     corrected = corrections(3, sway, lambda stamps, heading: heading + drift * (stamps - stamps[0]))
     assert math.degrees(corrected.sum()) == pytest.approx(-12.0, abs=2.0)
 
 
-def test_a_filter_that_is_right_is_left_nearly_alone() -> None:
+def test_a_filter_that_is_right_is_left_nearly_alone():
     """It knows more than any pair, so what the pairs err by is hardly taken over."""
     corrected = corrections(4, 0.0, lambda stamps, heading: heading)
     assert np.degrees(np.abs(corrected.cumsum()).max()) < 1.0
 
 
 @pytest.mark.parametrize(("by_pair", "by_filter"), [(1e-4, 2e-3), (6e-4, 2e-4), (1e-3, 1e-3)])
-def test_turns_are_weighed_by_their_variances(by_pair: float, by_filter: float) -> None:
+def test_turns_are_weighed_by_their_variances(by_pair: float, by_filter: float):
     """The error that is left is that of the mean weighted by the true variances, and little more."""
     rng = np.random.default_rng(8)
     correction, left = TurnCorrection(), []
@@ -78,14 +76,14 @@ def test_turns_are_weighed_by_their_variances(by_pair: float, by_filter: float) 
     assert 0.95 * best < np.std(left[500:]) < 1.15 * best
 
 
-def test_a_pair_that_is_far_off_turns_nothing_by_much() -> None:
+def test_a_pair_that_is_far_off_turns_nothing_by_much():
     """Tracks on what moves show a turn of 10 degrees, and are sure of it."""
     correction = TurnCorrection()
     correction.add(PairTurn(math.radians(10.0), 1e-8), 0.0)
     assert 0.0 < math.degrees(correction.take()) < 0.21
 
 
-def test_whole_turns_do_not_count() -> None:
+def test_whole_turns_do_not_count():
     correction = TurnCorrection()
     correction.add(PairTurn(0.2, 1e-12), 0.199 - math.tau)
     assert correction.take() == pytest.approx(0.001, rel=1e-3)

@@ -1,7 +1,5 @@
 """Costs against Dijkstra's search of another library, on random grids."""
 
-from __future__ import annotations
-
 import math
 
 import networkx as nx

@@ -1,7 +1,5 @@
 """What is in a robot's way: where it is, and which of its own edges lead past it."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -33,7 +31,7 @@ def seen(
     return obstruction(BODY, observation, FIX, AHEAD, to_goal, touched, beside)
 
 
-def test_a_robot_on_the_straight_way_is_the_obstacle_and_one_beside_it_is_only_named() -> None:
+def test_a_robot_on_the_straight_way_is_the_obstacle_and_one_beside_it_is_only_named():
     words, obstacle = seen(FREE, beside=RobotBeside(0.1, "r7", 0.5, 0.1, 0.2))
     assert words == "no progress; r7 is 0.1 m off"
     assert obstacle is not None and (obstacle.node, obstacle.robot) == (A, "r7")
@@ -43,7 +41,7 @@ def test_a_robot_on_the_straight_way_is_the_obstacle_and_one_beside_it_is_only_n
     assert behind.obstacle is None and "r7" in behind.words
 
 
-def test_what_is_near_is_right_before_the_robot_and_leaves_the_robot_outside() -> None:
+def test_what_is_near_is_right_before_the_robot_and_leaves_the_robot_outside():
     _, obstacle = seen(WALL_AHEAD)
     assert obstacle is not None and obstacle.robot == ""
     assert (obstacle.x, obstacle.y) == pytest.approx((1.0, 2.0 + BODY.radius + MARGIN))
@@ -52,14 +50,14 @@ def test_what_is_near_is_right_before_the_robot_and_leaves_the_robot_outside() -
     assert seen(FREE) == (NO_PROGRESS, None)
 
 
-def test_within_its_own_length_of_the_goal_only_another_robot_is_an_obstacle() -> None:
+def test_within_its_own_length_of_the_goal_only_another_robot_is_an_obstacle():
     words, obstacle = seen(WALL_AHEAD, to_goal=2.0 * BODY.radius)
     assert obstacle is None and "0.06 m off" in words
     beside = RobotBeside(0.1, "r7", 0.5, 0.1, 0.2)
     assert seen(WALL_AHEAD, "", beside, 2.0 * BODY.radius).obstacle is not None
 
 
-def test_the_own_map_leads_around_a_place_whichever_edges_pass_it() -> None:
+def test_the_own_map_leads_around_a_place_whichever_edges_pass_it():
     """A corridor of three parallel edges a few centimetres apart, and a way round of 6 m."""
     me, places = MapId("a", 1), [(0, 0), (3, 0), (0, 0.1), (3, 0.1), (0, -0.1), (3, -0.1), (0, 1.5), (3, 1.5)]
     joints = [(0, 1), (2, 3), (4, 5), (0, 2), (0, 4), (1, 3), (1, 5), (0, 6), (6, 7), (7, 1)]

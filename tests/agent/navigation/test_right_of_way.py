@@ -1,7 +1,5 @@
 """Robots let each other pass: what one does when its way is held, and two of them head-on in a corridor."""
 
-from __future__ import annotations
-
 import math
 import re
 from dataclasses import replace

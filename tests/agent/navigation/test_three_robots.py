@@ -1,7 +1,5 @@
 """Three robots want the same narrow edge at once: one drives, two wait and say so, then the next."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import pytest
@@ -86,7 +84,7 @@ AGAINST_ONE = [(3, 7), (2, 6), (6, 9)]
 
 
 @pytest.mark.parametrize("ways", first_quick([AGAINST_TWO, ONE_WAY, AGAINST_ONE], 2))
-def test_one_drives_and_two_wait_and_say_so_then_the_next(home, router, ways) -> None:  # noqa: F811
+def test_one_drives_and_two_wait_and_say_so_then_the_next(home, router, ways):  # noqa: F811
     corridor = Corridor(home, router, ways)
     corridor.until_all_are_there()
     assert len(corridor.waited) >= 2, "two waited for another one, and said so"
@@ -94,7 +92,7 @@ def test_one_drives_and_two_wait_and_say_so_then_the_next(home, router, ways) ->
 
 
 @pytest.mark.slow
-def test_two_against_one_end_although_the_first_has_taken_the_niche(home, router) -> None:  # noqa: F811
+def test_two_against_one_end_although_the_first_has_taken_the_niche(home, router):  # noqa: F811
     """The first makes way for the one that comes, and the second drives up: the niche is taken then, and
     these two waited head-on for ever. Here robots do not see those that have parked, so only the edge counts.
     """
@@ -104,7 +102,7 @@ def test_two_against_one_end_although_the_first_has_taken_the_niche(home, router
 
 @pytest.mark.parametrize("ways", [ONE_WAY])
 @pytest.mark.parametrize("dies", ["r1", "r2"])
-def test_a_waiting_robot_that_dies_holds_up_no_other(home, router, ways, dies) -> None:  # noqa: F811
+def test_a_waiting_robot_that_dies_holds_up_no_other(home, router, ways, dies):  # noqa: F811
     corridor = Corridor(home, router, ways)
     while dies not in corridor.yielding():
         corridor.tick()

@@ -152,7 +152,7 @@ def write_bag(
     [("mono8", False), ("rgb8", False), ("bgr8", False), ("bgra8", False), ("mono16", False), ("png", False),
      ("mono8", True)],
 )  # fmt: skip
-def test_a_bag_is_read_as_it_was(encoding: str, ros1: bool, drive: Drive, tmp_path: Path) -> None:
+def test_a_bag_is_read_as_it_was(encoding: str, ros1: bool, drive: Drive, tmp_path):
     path = tmp_path / ("drive.bag" if ros1 else "drive")
     write_bag(path, drive, encoding, ros1)
     replay = Replay(path, options=RecordingOptions(camera_height=0.3))
@@ -166,7 +166,7 @@ def test_a_bag_is_read_as_it_was(encoding: str, ros1: bool, drive: Drive, tmp_pa
         assert (observation.odometry.forward, observation.odometry.turn) == pytest.approx((forward, turn))
 
 
-def test_a_bag_of_the_first_recorders_of_ros2_is_read(drive: Drive, tmp_path: Path) -> None:
+def test_a_bag_of_the_first_recorders_of_ros2_is_read(drive: Drive, tmp_path):
     """They wrote the types without /msg/: as a bag's folder, its file alone, and its file cut off."""
     write_bag(tmp_path / "bag", drive, "bgra8")
     (file,) = (tmp_path / "bag").glob("*.db3")
@@ -186,14 +186,14 @@ def test_a_bag_of_the_first_recorders_of_ros2_is_read(drive: Drive, tmp_path: Pa
         }  # fmt: skip
 
 
-def test_a_single_mcap_file_is_read_without_its_folder(drive: Drive, tmp_path: Path) -> None:
+def test_a_single_mcap_file_is_read_without_its_folder(drive: Drive, tmp_path):
     write_bag(tmp_path / "drive", drive)
     (file,) = (tmp_path / "drive").glob("*.mcap")
     recording = open_recording(file, RecordingOptions(camera_height=0.3))
     assert len(recording) == COUNT
 
 
-def test_a_bag_whose_own_types_lack_a_field_is_refused_in_one_line(drive: Drive, tmp_path: Path) -> None:
+def test_a_bag_whose_own_types_lack_a_field_is_refused_in_one_line(drive: Drive, tmp_path):
     write_bag(tmp_path / "drive", drive)
     (file,) = (tmp_path / "drive").glob("*.mcap")
     data = file.read_bytes()
@@ -208,7 +208,7 @@ def test_a_bag_whose_own_types_lack_a_field_is_refused_in_one_line(drive: Drive,
             open_recording(file, RecordingOptions(camera_height=0.3))
 
 
-def test_topics_are_named_by_the_person_or_guessed(drive: Drive, tmp_path: Path) -> None:
+def test_topics_are_named_by_the_person_or_guessed(drive: Drive, tmp_path):
     write_bag(tmp_path / "drive", drive, odom="/ground_truth/odom")
     height = 0.3
     with pytest.raises(DeviceError, match=r"no odometry.*/ground_truth/odom \(nav_msgs/msg/Odometry\)"):
@@ -261,8 +261,8 @@ def check_prefix(path: Path, drive: Drive) -> int:
 @settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(share=st.floats(0.0, 0.99))
 def test_a_bag_cut_off_anywhere_is_used_up_to_there(
-    name: str, share: float, whole_bags: dict[str, bytes], drive: Drive, tmp_path: Path
-) -> None:
+    name: str, share: float, whole_bags: dict[str, bytes], drive: Drive, tmp_path
+):
     path = tmp_path / f"drive{SUFFIX[name]}"
     path.write_bytes(whole_bags[name][: int(share * len(whole_bags[name]))])
     check_prefix(path, drive)
@@ -270,8 +270,8 @@ def test_a_bag_cut_off_anywhere_is_used_up_to_there(
 
 @pytest.mark.parametrize("name", FORMATS)
 def test_the_longer_a_cut_bag_is_the_more_images_it_has(
-    name: str, whole_bags: dict[str, bytes], drive: Drive, tmp_path: Path
-) -> None:
+    name: str, whole_bags: dict[str, bytes], drive: Drive, tmp_path
+):
     whole, counts = whole_bags[name], list[int]()
     for share in (0.02, 0.3, 0.6, 0.9):
         path = tmp_path / f"drive{SUFFIX[name]}"
@@ -294,7 +294,7 @@ def moved(store: Any, stamp: int, frames: tuple[str, str], pose: Pose2) -> Any:
 
 
 @pytest.mark.parametrize("ros1", [False, True])
-def test_a_base_that_tells_its_odometry_by_tf_alone(ros1: bool, drive: Drive, tmp_path: Path) -> None:
+def test_a_base_that_tells_its_odometry_by_tf_alone(ros1: bool, drive: Drive, tmp_path):
     """What a localizer corrects, and where a second robot and a wheel are, is not its odometry."""
     path, store = tmp_path / ("drive.bag" if ros1 else "drive"), STORE1 if ros1 else STORE
     writer: Any = Writer1(path) if ros1 else Writer(path, version=8, storage_plugin=StoragePlugin.MCAP)
@@ -329,7 +329,7 @@ def test_a_base_that_tells_its_odometry_by_tf_alone(ros1: bool, drive: Drive, tm
         assert (observation.odometry.forward, observation.odometry.turn) == pytest.approx((forward, turn))
 
 
-def test_a_cut_bag_of_ros1_still_says_where_the_camera_is(drive: Drive, tmp_path: Path) -> None:
+def test_a_cut_bag_of_ros1_still_says_where_the_camera_is(drive: Drive, tmp_path):
     """Without its index it is read by ROS 1's standard types, of which rosbags lacks that of tf."""
     path = tmp_path / "drive.bag"
     across = make(STORE1, "geometry_msgs/msg/Vector3", x=0.1, y=0.0, z=0.3)
@@ -356,9 +356,7 @@ def test_a_cut_bag_of_ros1_still_says_where_the_camera_is(drive: Drive, tmp_path
     assert (camera.mount_height, camera.mount_forward) == pytest.approx((0.3, 0.1))
 
 
-def test_poses_that_go_back_in_time_are_left_out_and_said(
-    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_poses_that_go_back_in_time_are_left_out_and_said(drive: Drive, tmp_path, monkeypatch):
     write_bag(tmp_path / "drive", drive)
     messages = bag.Bag.messages
 
@@ -373,9 +371,7 @@ def test_poses_that_go_back_in_time_are_left_out_and_said(
 
 
 @pytest.mark.parametrize("late", [0, 5])
-def test_images_that_go_back_in_time_are_left_out_and_said(
-    late: int, drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_images_that_go_back_in_time_are_left_out_and_said(late: int, drive: Drive, tmp_path, monkeypatch):
     """The whole bag was refused for one of them. The first of a simulator may have no stamp at all."""
     write_bag(tmp_path / "drive", drive)
     messages = bag.Bag.messages
@@ -404,7 +400,7 @@ def test_images_that_go_back_in_time_are_left_out_and_said(
     )
 
 
-def test_a_clock_that_begins_at_zero_loses_no_message(drive: Drive, tmp_path: Path) -> None:
+def test_a_clock_that_begins_at_zero_loses_no_message(drive: Drive, tmp_path):
     """As a robot's own recordings of a simulation or of a replay have it."""
     writer = McapWriter(tmp_path / "drive", RobotDescription(drive.camera), True, lambda line: None)
     for k, (grey, (forward, turn)) in enumerate(zip(drive.images, drive.increments, strict=True)):
@@ -415,7 +411,7 @@ def test_a_clock_that_begins_at_zero_loses_no_message(drive: Drive, tmp_path: Pa
     assert [o.stamp_ns for o in iter(replay.sense, None)] == [k * STEP_NS for k in range(COUNT)]
 
 
-def test_images_of_distances_are_not_taken_where_there_are_others(drive: Drive, tmp_path: Path) -> None:
+def test_images_of_distances_are_not_taken_where_there_are_others(drive: Drive, tmp_path):
     opened = SimpleNamespace(
         path=tmp_path,
         topics=[
@@ -428,9 +424,7 @@ def test_images_of_distances_are_not_taken_where_there_are_others(drive: Drive, 
     assert "depth" in bag._chosen(opened, None, bag.IMAGE_TYPES, "images").name
 
 
-def test_odometry_without_orientation_is_refused(
-    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_odometry_without_orientation_is_refused(drive: Drive, tmp_path, monkeypatch):
     """Its heading was taken for 0 all the way, and the map was wrong."""
     write_bag(tmp_path / "drive", drive)
     messages = bag.Bag.messages
@@ -446,7 +440,7 @@ def test_odometry_without_orientation_is_refused(
         open_recording(tmp_path / "drive", OPTIONS)
 
 
-def test_a_pose_that_is_no_number_ends_the_odometry(drive: Drive, tmp_path: Path) -> None:
+def test_a_pose_that_is_no_number_ends_the_odometry(drive: Drive, tmp_path):
     spoiled = [*drive.poses[:6], *(Pose2(0.0, 0.0, 0.0) for _ in drive.poses[6:])]
     object.__setattr__(spoiled[6], "x", math.nan)
     write_bag(tmp_path / "drive", replace(drive, poses=spoiled))
@@ -456,9 +450,7 @@ def test_a_pose_that_is_no_number_ends_the_odometry(drive: Drive, tmp_path: Path
     assert "of /odom is not finite; what comes before is used" in line
 
 
-def test_what_is_damaged_of_odometry_beside_a_bag_is_said(
-    drive: Drive, poses_file: Path, tmp_path: Path
-) -> None:
+def test_what_is_damaged_of_odometry_beside_a_bag_is_said(drive: Drive, poses_file: Path, tmp_path):
     write_bag(tmp_path / "drive", drive)
     lines = poses_file.read_text().splitlines()
     poses_file.write_text("\n".join([*lines[:20], "no pose", ""]))
@@ -467,7 +459,7 @@ def test_what_is_damaged_of_odometry_beside_a_bag_is_said(
     assert line.startswith(f"{poses_file}: line 21: a pose is") and line.endswith("before it are used")
 
 
-def test_all_of_a_killed_recorder_but_the_last_seconds_is_there(drive: Drive, tmp_path: Path) -> None:
+def test_all_of_a_killed_recorder_but_the_last_seconds_is_there(drive: Drive, tmp_path):
     """A process records ten observations a second of its own clock; it is killed within a minute."""
     program = (
         "import sys\n"
@@ -501,9 +493,7 @@ def test_all_of_a_killed_recorder_but_the_last_seconds_is_there(drive: Drive, tm
         assert sum(1 for _ in reader.messages()) == reader.message_count
 
 
-def test_a_robot_that_is_lifted_between_two_images_was_lifted_at_the_second(
-    drive: Drive, tmp_path: Path
-) -> None:
+def test_a_robot_that_is_lifted_between_two_images_was_lifted_at_the_second(drive: Drive, tmp_path):
     """A base says so by a clock of its own, in a bag without definitions of messages."""
     said = {0.0: False, 2.4: True, 2.6: False, 5.5: True, 6.5: True, 7.5: False}
     write_bag(tmp_path / "drive", drive, "bgra8", lifted=said)
@@ -511,7 +501,7 @@ def test_a_robot_that_is_lifted_between_two_images_was_lifted_at_the_second(
     assert [k for k, observation in enumerate(seen) if observation.kidnapped] == [3, 6, 7]
 
 
-def test_a_camera_topic_that_lost_its_messages_is_reported_in_one_line() -> None:
+def test_a_camera_topic_that_lost_its_messages_is_reported_in_one_line():
     """Its count says that there are some; found by fuzzing."""
     topic = bag.BagTopic("/camera/camera_info", bag.CAMERA_TYPE, 3)
     opened = SimpleNamespace(path="walk.mcap", topics=[topic], damage=[], messages=lambda name: iter(()))
@@ -519,7 +509,7 @@ def test_a_camera_topic_that_lost_its_messages_is_reported_in_one_line() -> None
         bag._camera(opened, "/camera/image", RecordingOptions(), [])
 
 
-def test_the_topic_of_the_camera_may_be_given(drive: Drive, tmp_path: Path) -> None:
+def test_the_topic_of_the_camera_may_be_given(drive: Drive, tmp_path):
     write_bag(tmp_path / "drive", drive, info="/elsewhere/info", second="/other/info")
     given = replace(OPTIONS, camera_info_topic="/elsewhere/info")
     assert open_recording(tmp_path / "drive", given).camera == drive.camera
@@ -527,9 +517,7 @@ def test_the_topic_of_the_camera_may_be_given(drive: Drive, tmp_path: Path) -> N
         open_recording(tmp_path / "drive", replace(OPTIONS, camera_info_topic="/none"))
 
 
-def test_the_settings_name_the_topics_and_the_command_line_overrides_them(
-    drive: Drive, tmp_path: Path, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_the_settings_name_the_topics_and_the_command_line_overrides_them(drive: Drive, tmp_path, capfd):
     """There were options alone: they had to be given with every command."""
     path = tmp_path / "drive"
     write_bag(path, drive, info="/elsewhere/info", second="/other/info", odom="/amcl/odom")
@@ -553,13 +541,13 @@ def test_the_settings_name_the_topics_and_the_command_line_overrides_them(
     assert "odometry from /amcl/odom" in capfd.readouterr().out
 
 
-def test_a_recording_without_topics_does_without_those_of_the_settings(drive: Drive, tmp_path: Path) -> None:
+def test_a_recording_without_topics_does_without_those_of_the_settings(drive: Drive, tmp_path):
     folder = write_folder(tmp_path / "walk", drive.images, drive.increments)
     options = RecordingOptions(settings=RecordingSettings(image_topic="/cam/image_raw"))
     assert len(open_recording(folder, options)) == COUNT
 
 
-def test_what_a_bag_lacks_is_said_with_what_is_in_it(drive: Drive, tmp_path: Path) -> None:
+def test_what_a_bag_lacks_is_said_with_what_is_in_it(drive: Drive, tmp_path):
     write_bag(tmp_path / "drive", drive, odom="/ground_truth/odom")
     with pytest.raises(Incomplete, match="--camera-height METRES") as caught:
         open_recording(tmp_path / "drive")
@@ -570,9 +558,7 @@ def test_what_a_bag_lacks_is_said_with_what_is_in_it(drive: Drive, tmp_path: Pat
     assert counts == {"/cam/image_raw": COUNT, "/cam/camera_info": COUNT, "/ground_truth/odom": 4 * COUNT - 3}
 
 
-def test_three_coefficients_of_distortion_are_named(
-    drive: Drive, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_three_coefficients_of_distortion_are_named(drive: Drive, tmp_path, monkeypatch):
     """The third was taken for p1, without a word."""
     made = camera_info
     lens = np.array([0.1, 0.02, 0.001])
@@ -593,12 +579,12 @@ def test_three_coefficients_of_distortion_are_named(
         (None, ""),
     ],
 )
-def test_a_camera_that_does_not_look_ahead_is_named(mount: Mount | None, words: str) -> None:
+def test_a_camera_that_does_not_look_ahead_is_named(mount: Mount | None, words: str):
     lines = doubts(SimpleNamespace(d=[0.0] * 3), mount)
     assert len(lines) == bool(words) and words in "".join(lines)
 
 
-def test_a_lens_of_eight_coefficients_is_refused_with_what_to_do(drive: Drive) -> None:
+def test_a_lens_of_eight_coefficients_is_refused_with_what_to_do(drive: Drive):
     message = camera_info(STORE, BEGUN_NS, drive)
     message.d, message.distortion_model = np.full(8, 0.1), "rational_polynomial"
     with pytest.raises(

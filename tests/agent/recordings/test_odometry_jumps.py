@@ -35,7 +35,7 @@ def wrapped(increments: Array, images: tuple[int, ...], way: float) -> Array:
 
 @pytest.mark.parametrize("images", [(40,), (40, 41), (33, 52), (1,)])
 @pytest.mark.parametrize("way", [2.99, -5.59, 29.1])
-def test_counts_that_wrap_are_bridged_and_named(images: tuple[int, ...], way: float) -> None:
+def test_counts_that_wrap_are_bridged_and_named(images: tuple[int, ...], way: float):
     """By 16 bits of the encoders of a Koala, a Kobuki and a Create. They were mapped as driven."""
     right = drive()
     made, (line,) = bridged(wrapped(right, images, way), STAMPS)
@@ -47,7 +47,7 @@ def test_counts_that_wrap_are_bridged_and_named(images: tuple[int, ...], way: fl
 
 
 @given(st.integers(0, 1000), st.integers(1, 4), st.floats(0.0, 4.5))
-def test_a_right_drive_is_left_as_it_is(seed: int, fast: int, times: float) -> None:
+def test_a_right_drive_is_left_as_it_is(seed: int, fast: int, times: float):
     """Also one with a few quick steps, and one that hardly drives."""
     right = drive(seed)
     top = float(np.abs(right[:, 0]).max())
@@ -64,7 +64,7 @@ def test_a_right_drive_is_left_as_it_is(seed: int, fast: int, times: float) -> N
         assert bridged(still, STAMPS[: len(still)])[1] == []
 
 
-def test_an_image_that_is_late_makes_no_jump() -> None:
+def test_an_image_that_is_late_makes_no_jump():
     """The way since the image before is longer, and the time is, too."""
     right, stamps = drive(), STAMPS.copy()
     right[40, 0] *= 60
@@ -72,7 +72,7 @@ def test_an_image_that_is_late_makes_no_jump() -> None:
     assert bridged(right, stamps)[1] == []
 
 
-def test_a_recording_with_a_wrap_is_read_without_it(tmp_path) -> None:
+def test_a_recording_with_a_wrap_is_read_without_it(tmp_path):
     images = (np.full((240, 320), k, np.uint8) for k in range(COUNT))
     odometry = wrapped(drive(), (40,), 5.59).tolist()
     replay = Replay(write_folder(tmp_path / "walk", images, odometry, timed=True))

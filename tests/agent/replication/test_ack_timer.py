@@ -1,7 +1,5 @@
 """The time of an overdue acknowledgement against RFC 6298's equations."""
 
-from __future__ import annotations
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -20,7 +18,7 @@ def timed(*took: float) -> AckTimer:
 
 
 @given(st.lists(st.floats(0.0, 60.0), min_size=1, max_size=30))
-def test_it_is_rfc_6298_within_bounds(took: list[float]) -> None:
+def test_it_is_rfc_6298_within_bounds(took: list[float]):
     srtt, rttvar = took[0], took[0] / 2
     for r in took[1:]:
         rttvar = (1 - 1 / 4) * rttvar + 1 / 4 * abs(srtt - r)
@@ -28,14 +26,14 @@ def test_it_is_rfc_6298_within_bounds(took: list[float]) -> None:
     assert timed(*took).timeout == pytest.approx(min(max(srtt + 4 * rttvar, LEAST), MOST))
 
 
-def test_without_a_measurement_it_is_the_shortest() -> None:
+def test_without_a_measurement_it_is_the_shortest():
     timer = AckTimer(LEAST, MOST)
     timer.sent(1, 0.0)
     timer.settled(0, 5.0)
     assert timer.timeout == LEAST
 
 
-def test_one_change_is_timed_after_the_other() -> None:
+def test_one_change_is_timed_after_the_other():
     timer = AckTimer(LEAST, MOST)
     timer.sent(1, 0.0)
     timer.sent(2, 1.0)
@@ -43,7 +41,7 @@ def test_one_change_is_timed_after_the_other() -> None:
     assert timer.timeout == pytest.approx(2.0 + 4 * 1.0)
 
 
-def test_what_a_server_had_to_ask_for_says_nothing() -> None:
+def test_what_a_server_had_to_ask_for_says_nothing():
     timer = AckTimer(LEAST, MOST)
     timer.sent(7, 0.0)
     timer.asked_for(8, 20)
@@ -52,7 +50,7 @@ def test_what_a_server_had_to_ask_for_says_nothing() -> None:
     assert timer.timeout == LEAST
 
 
-def test_what_waited_for_a_server_that_was_away_says_nothing() -> None:
+def test_what_waited_for_a_server_that_was_away_says_nothing():
     timer = AckTimer(LEAST, MOST)
     timer.sent(7, 0.0)
     timer.forget()
@@ -60,6 +58,6 @@ def test_what_waited_for_a_server_that_was_away_says_nothing() -> None:
     assert timer.timeout == LEAST
 
 
-def test_it_falls_again_after_a_slow_hour() -> None:
+def test_it_falls_again_after_a_slow_hour():
     assert timed(*[8.0] * 20).timeout == pytest.approx(8.0, abs=0.5)
     assert timed(*[8.0] * 20, *[0.02] * 60).timeout == LEAST

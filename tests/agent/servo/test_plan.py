@@ -1,7 +1,5 @@
 """Plans of two legs and of the lattice end at the goal and keep the constraints, judged by projection."""
 
-from __future__ import annotations
-
 import math
 import tracemalloc
 from collections.abc import Callable
@@ -45,9 +43,7 @@ def check(plan: ServoPlan, start: Pose2, points: Array, camera: Camera, seen: Se
 
 
 @pytest.mark.parametrize("planner", [two_leg_plan, lattice_plan])
-def test_plans_lead_to_the_goal_in_view(
-    planner: Any, robot: RobotDescription, seen: Seen, draw: Draw
-) -> None:
+def test_plans_lead_to_the_goal_in_view(planner: Any, robot: RobotDescription, seen: Seen, draw: Draw):
     draw_points, draw_start = draw
     rng = np.random.default_rng(5)
     count = 0
@@ -66,9 +62,7 @@ def test_plans_lead_to_the_goal_in_view(
 
 @pytest.mark.parametrize("half", [0.3, 0.45, 0.6])
 @pytest.mark.parametrize("start", [Pose2(-1.9, 0.0, 0.0), Pose2(-1.65, -0.02, 0.65)])
-def test_a_wall_in_the_way_is_driven_around(
-    robot: RobotDescription, seen: Seen, half: float, start: Pose2
-) -> None:
+def test_a_wall_in_the_way_is_driven_around(robot: RobotDescription, seen: Seen, half: float, start: Pose2):
     # The lattice's moves are longer than its cells: once they jumped through the end of the wall.
     points = np.array([[x, y, 0.3] for x in (3.0, 4.0) for y in np.linspace(-2.0, 2.0, 9)])
     wall = np.column_stack([np.full(25, -0.9), np.linspace(-half, half, 25)])
@@ -83,7 +77,7 @@ def test_a_wall_in_the_way_is_driven_around(
     check(either, either.start, points, robot.camera, seen, wall)
 
 
-def test_there_is_no_plan_out_of_a_ring(robot: RobotDescription) -> None:
+def test_there_is_no_plan_out_of_a_ring(robot: RobotDescription):
     points = np.array([[3.0, y, 0.3] for y in np.linspace(-1.0, 1.0, 9)])
     angles = np.linspace(0.0, 2 * math.pi, 60)
     ring = np.column_stack([-1.6 + 0.4 * np.cos(angles), 0.4 * np.sin(angles)])
@@ -91,13 +85,13 @@ def test_there_is_no_plan_out_of_a_ring(robot: RobotDescription) -> None:
     assert thorough_plan(around, Pose2(-1.6, 0.0, 0.0)) is None
 
 
-def test_there_is_no_plan_to_a_goal_that_sees_nothing(robot: RobotDescription) -> None:
+def test_there_is_no_plan_to_a_goal_that_sees_nothing(robot: RobotDescription):
     points = np.array([[-3.0, y, 0.3] for y in np.linspace(-1.0, 1.0, 9)])
     around = Surroundings(FieldOfView(points, robot.camera), np.zeros((0, 2)), 0.2)
     assert thorough_plan(around, Pose2(-0.5, 0.0, math.pi)) is None
 
 
-def test_one_straight_leg_is_enough_ahead_of_the_goal(robot: RobotDescription) -> None:
+def test_one_straight_leg_is_enough_ahead_of_the_goal(robot: RobotDescription):
     points = np.array([[3.0, y, 0.3] for y in np.linspace(-1.0, 1.0, 9)])
     around = Surroundings(FieldOfView(points, robot.camera), np.zeros((0, 2)), 0.2)
     plan = two_leg_plan(around, Pose2(0.5, 0.0, 0.0), 0.05)
@@ -107,7 +101,7 @@ def test_one_straight_leg_is_enough_ahead_of_the_goal(robot: RobotDescription) -
 
 
 @pytest.mark.slow
-def test_the_lattice_is_bounded(robot: RobotDescription) -> None:
+def test_the_lattice_is_bounded(robot: RobotDescription):
     """Ten metres once took 13 s and 1.4 GB, and there was no end to it."""
     rng = np.random.default_rng(1)
     points = np.array([[4.0, y, 0.3] for y in np.linspace(-2.0, 2.0, 24)])

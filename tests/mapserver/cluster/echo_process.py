@@ -1,7 +1,5 @@
 """In place of the process between a server and Ray: answers with what it is asked."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

@@ -1,7 +1,5 @@
 """Shards in this process, asked by the same bytes as those of a cluster, that can be killed or held up."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor

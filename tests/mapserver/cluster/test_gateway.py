@@ -1,7 +1,5 @@
 """The way to the cluster: answers, failures, and a process that dies, with a process that is not Ray's."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -25,7 +23,7 @@ def gateway(monkeypatch: pytest.MonkeyPatch, address: str = "here") -> Iterator[
         opened.close()
 
 
-def test_requests_are_answered_and_failures_have_their_reason(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_requests_are_answered_and_failures_have_their_reason(monkeypatch):
     with gateway(monkeypatch) as opened:
         eventually(lambda: opened.workers == 3)
         answers = [opened.ask(k, b"%d" % k) for k in range(3)]
@@ -35,9 +33,7 @@ def test_requests_are_answered_and_failures_have_their_reason(monkeypatch: pytes
             opened.ask(0, b"fail").result(10.0)
 
 
-def test_what_a_dead_process_was_asked_fails_at_once_and_another_is_started(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_a_dead_process_was_asked_fails_at_once_and_another_is_started(monkeypatch):
     with gateway(monkeypatch) as opened:
         eventually(lambda: opened.workers)
         waiting = [opened.ask(0, b"silence"), opened.ask(0, b"die")]
@@ -48,7 +44,7 @@ def test_what_a_dead_process_was_asked_fails_at_once_and_another_is_started(
         assert opened.ask(1, b"again").result(10.0) == b"1 again"
 
 
-def test_a_cluster_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_cluster_that_does_not_answer_is_given_up(monkeypatch):
     monkeypatch.setattr(gateway_module, "SILENCE", 0.5)
     with gateway(monkeypatch) as opened:
         eventually(lambda: opened.workers)
@@ -56,9 +52,7 @@ def test_a_cluster_that_does_not_answer_is_given_up(monkeypatch: pytest.MonkeyPa
             opened.ask(0, b"silence").result(10.0)
 
 
-def test_without_a_cluster_every_request_fails_at_once_and_the_log_says_why(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_without_a_cluster_every_request_fails_at_once_and_the_log_says_why(monkeypatch, caplog):
     with gateway(monkeypatch, "nowhere") as opened:
         eventually(lambda: "nothing listens at nowhere" in caplog.text)
         assert opened.workers == 0
@@ -66,9 +60,7 @@ def test_without_a_cluster_every_request_fails_at_once_and_the_log_says_why(
             opened.ask(0, b"hello").result(0.0)
 
 
-def test_a_server_says_that_it_waits_for_its_cluster(
-    monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_server_says_that_it_waits_for_its_cluster(monkeypatch, caplog):
     monkeypatch.setattr(gateway_module, "SAID_EVERY", 0.2)
     with caplog.at_level("INFO"), gateway(monkeypatch, "slow") as opened:
         eventually(lambda: opened.workers == 3)
@@ -80,9 +72,7 @@ def test_a_server_says_that_it_waits_for_its_cluster(
 
 
 @pytest.mark.parametrize("request_of_it", [b"garbage", b"too long"])
-def test_a_process_that_sends_no_frame_is_started_again(
-    request_of_it: bytes, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_process_that_sends_no_frame_is_started_again(request_of_it: bytes, monkeypatch, caplog):
     with gateway(monkeypatch) as opened:
         eventually(lambda: opened.workers)
         with pytest.raises(ClusterGone):

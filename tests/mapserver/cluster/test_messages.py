@@ -1,7 +1,5 @@
 """Messages of the cluster: what arrives is what was sent, and nothing else is taken."""
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable
 from contextlib import suppress
@@ -79,7 +77,7 @@ def same_landmarks(one: Landmarks, other: Landmarks) -> bool:
     )
 
 
-def test_nodes_arrive_bit_by_bit() -> None:
+def test_nodes_arrive_bit_by_bit():
     other_camera = replace(NODES[1], camera=replace(NODES[1].camera, fx=300.1))
     empty = replace(NODES[2], landmarks=Landmarks.empty())
     for nodes in (NODES, [NODES[0], other_camera, empty, NODES[3]], [empty], []):
@@ -93,7 +91,7 @@ def test_nodes_arrive_bit_by_bit() -> None:
     assert isinstance(decoded(encoded(Reset()), ShardRequest), Reset)
 
 
-def test_answers_arrive_as_they_are() -> None:
+def test_answers_arrive_as_they_are():
     nearest = SHARD.answer(decoded(encoded(NEAREST), Question))
     assert isinstance(nearest, NearestLandmarks)
     read = answer_to(NEAREST, encoded(answer_message(nearest)))
@@ -109,7 +107,7 @@ def test_answers_arrive_as_they_are() -> None:
     assert answer_to(OVERLAPS, encoded(answer_message({}))) == {}
 
 
-def test_verdicts_arrive_as_they_are() -> None:
+def test_verdicts_arrive_as_they_are():
     pairs = PAIRS[:40]
     found, expected = decoded(answer_work(encoded(Comparison.of(pairs))), ComparisonAnswer), [*compare(pairs)]
     links = 0
@@ -137,7 +135,7 @@ def large(name: str, count: int) -> Node:
     return replace(NODES[0], id=NodeId(name * 32, MAX_NUMBER, MAX_NUMBER), landmarks=landmarks)
 
 
-def test_the_longest_messages_that_there_may_be_are_taken() -> None:
+def test_the_longest_messages_that_there_may_be_are_taken():
     node = large("a", MAX_LANDMARKS)
     some = [replace(node, id=NodeId(f"{k:032}", MAX_NUMBER, MAX_NUMBER)) for k in range(AT_ONCE)]
     change = encoded(ShardChange(STATE, ComparedNodes.of(some), Ids.of(one.id for one in some)))
@@ -156,12 +154,12 @@ def test_the_longest_messages_that_there_may_be_are_taken() -> None:
     assert max(map(len, (change, answer, overlaps))) < MOST_BYTES
 
 
-def test_too_long_a_message_is_refused_before_it_is_read() -> None:
+def test_too_long_a_message_is_refused_before_it_is_read():
     with pytest.raises(InvalidMessage, match="bytes, at most"):
         decoded(bytes(MOST_BYTES + 1), ShardRequest)
 
 
-def test_nothing_is_unpickled() -> None:
+def test_nothing_is_unpickled():
     class Run:
         def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
             return pytest.fail, ("it ran",)
@@ -191,7 +189,7 @@ def answered() -> NearestAnswer:
 
 
 @pytest.mark.parametrize("owner", [-2, 99])
-def test_an_answer_of_owners_that_are_not_there_is_refused(owner: int) -> None:
+def test_an_answer_of_owners_that_are_not_there_is_refused(owner: int):
     answer = answered()
     wrong = answer.owners.copy()
     wrong[1, 2] = owner
@@ -199,14 +197,14 @@ def test_an_answer_of_owners_that_are_not_there_is_refused(owner: int) -> None:
         answer_to(NEAREST, changed(answer, answer.owners, wrong))
 
 
-def test_an_answer_about_other_features_is_refused() -> None:
+def test_an_answer_about_other_features_is_refused():
     answer = answered()
     fewer = replace(answer, owners=answer.owners[1:], squared=answer.squared[1:])
     with pytest.raises(InvalidMessage, match="other features"):
         answer_to(NEAREST, encoded(fewer))
 
 
-def test_verdicts_on_other_pairs_are_none() -> None:
+def test_verdicts_on_other_pairs_are_none():
     pairs = next([p] for p in PAIRS if isinstance(next(iter(compare([p]))), Link))
     answer = ComparisonAnswer.of(compare(pairs))
     (link,) = answer.verdicts
@@ -222,14 +220,14 @@ def test_verdicts_on_other_pairs_are_none() -> None:
 
 
 @pytest.mark.parametrize("row", [-1, 2])
-def test_a_comparison_of_a_node_that_is_not_there_is_refused(row: int) -> None:
+def test_a_comparison_of_a_node_that_is_not_there_is_refused(row: int):
     comparison = Comparison.of(PAIRS[:1])
     message = changed(comparison, comparison.pairs, np.array([[0, row]]))
     with pytest.raises(InvalidMessage, match="a number that is not from 0 to 1"):
         answer_work(message)
 
 
-def test_codes_that_are_none_are_refused() -> None:
+def test_codes_that_are_none_are_refused():
     wrong = NEAREST.codes.copy()
     wrong[0, 0] = SYMBOLS
     message = changed(NEAREST, NEAREST.codes, wrong)
@@ -243,7 +241,7 @@ def test_codes_that_are_none_are_refused() -> None:
         decoded(message, Question)
 
 
-def test_columns_of_nodes_that_do_not_belong_together_are_refused() -> None:
+def test_columns_of_nodes_that_do_not_belong_together_are_refused():
     nodes = ComparedNodes.of(NODES[:3])
     change = ShardChange(STATE, nodes, Ids.of([]))
     for ends, words in (
@@ -289,9 +287,7 @@ def samples() -> list[tuple[bytes, Callable[[bytes], object]]]:
     changes=st.lists(st.tuples(st.floats(0.0, 1.0, exclude_max=True), st.integers(0, 255)), max_size=4),
     length=st.floats(0.0, 1.0) | st.just(1.0),
 )
-def test_a_damaged_message_is_taken_or_refused(
-    which: int, changes: list[tuple[float, int]], length: float
-) -> None:
+def test_a_damaged_message_is_taken_or_refused(which: int, changes: list[tuple[float, int]], length: float):
     """Nothing but a MapweaveError comes of it."""
     sample, read = samples()[which]
     data = bytearray(sample)
@@ -301,7 +297,7 @@ def test_a_damaged_message_is_taken_or_refused(
         read(bytes(data[: int(length * len(data))]))
 
 
-def test_frames_arrive_as_they_were_sent() -> None:
+def test_frames_arrive_as_they_were_sent():
     for request in (GatewayRequest(2**40, -1, b""), GatewayRequest(1, 3, b"\0\1")):
         assert GatewayRequest.read(request.packed()) == request
     for reply in (

@@ -1,7 +1,5 @@
 """A server whose cluster is not there does all by itself, and says why."""
 
-from __future__ import annotations
-
 import socket
 import sys
 from collections.abc import Callable
@@ -21,9 +19,7 @@ from tests.mapserver.house import MappedRoom
 from tests.waiting import eventually, free_port
 
 
-def test_the_server_needs_no_cluster(
-    mapped_room: Callable[[], MappedRoom], caplog: pytest.LogCaptureFixture
-) -> None:
+def test_the_server_needs_no_cluster(mapped_room: Callable[[], MappedRoom], caplog):
     room, bus = mapped_room(), MemoryBus(MemoryHub())
     nowhere = f"127.0.0.1:{free_port()}"
     settings = replace(ServerSettings(), cluster=ClusterSettings(nowhere, shards=2))
@@ -37,9 +33,7 @@ def test_the_server_needs_no_cluster(
 
 
 @pytest.mark.parametrize(("mode", "hinted"), [("", True), ("token", False)])
-def test_a_cluster_that_refuses_a_server_may_want_a_token(
-    monkeypatch: pytest.MonkeyPatch, mode: str, hinted: bool
-) -> None:
+def test_a_cluster_that_refuses_a_server_may_want_a_token(monkeypatch, mode: str, hinted: bool):
     """Ray itself says only that it could not connect."""
 
     def init(**_: object) -> None:
@@ -53,6 +47,6 @@ def test_a_cluster_that_refuses_a_server_may_want_a_token(
         assert ("RAY_AUTH_MODE=token" in str(raised.value)) is hinted
 
 
-def test_lock_step_and_a_cluster_exclude_each_other(capsys: pytest.CaptureFixture[str]) -> None:
+def test_lock_step_and_a_cluster_exclude_each_other(capsys):
     assert main(["server", "--lockstep", "--ray", "auto"]) == 2
     assert "--lockstep is repeatable, and a cluster is not" in capsys.readouterr().err

@@ -1,7 +1,5 @@
 """An index in shards gives what one index gives, whatever happens to the shards; else it says so."""
 
-from __future__ import annotations
-
 import random
 import threading
 from collections.abc import Iterator
@@ -88,7 +86,7 @@ def assert_same(index: ShardedIndex, one: PlaceIndex, nodes: tuple[Node, ...]) -
         )
 
 
-def test_shards_answer_as_one_index_before_they_are_there_and_after() -> None:
+def test_shards_answer_as_one_index_before_they_are_there_and_after():
     cluster, nodes = LocalShards(SHARDS), fleet()
     cluster.index.extend(nodes)
     assert cluster.index.status == "0 of 3 shards; 3 in this process"
@@ -99,7 +97,7 @@ def test_shards_answer_as_one_index_before_they_are_there_and_after() -> None:
         assert_same(cluster.index, one_index(nodes), nodes)
 
 
-def test_copies_of_a_place_take_no_votes_once_they_are_hidden() -> None:
+def test_copies_of_a_place_take_no_votes_once_they_are_hidden():
     """All nearest landmarks of each shard may be copies: then more are asked for."""
     nodes = fleet()
     copies = tuple(
@@ -112,7 +110,7 @@ def test_copies_of_a_place_take_no_votes_once_they_are_hidden() -> None:
             assert_alike(ranked, one_index(nodes).query(view_of(node), 16))
 
 
-def test_landmarks_that_are_wanted_are_counted_as_nodes_come_and_go() -> None:
+def test_landmarks_that_are_wanted_are_counted_as_nodes_come_and_go():
     """They decide which cells a shard searches: what is hidden, gone or put twice does not count."""
     nodes = fleet()
     shorter = replace(nodes[0], landmarks=nodes[0].landmarks.take(np.arange(5)))
@@ -128,14 +126,14 @@ def test_landmarks_that_are_wanted_are_counted_as_nodes_come_and_go() -> None:
         )
 
 
-def test_a_map_stays_whole_in_one_shard() -> None:
+def test_a_map_stays_whole_in_one_shard():
     with shards(fleet()) as cluster:
         for agent in {node.id.agent for node in fleet()}:
             ids = [node.id for node in fleet() if node.id.agent == agent]
             assert [sum(one in link for one in ids) for link in cluster.links].count(len(ids)) == 1
 
 
-def test_a_dead_shard_makes_answers_partial_until_it_is_filled_again() -> None:
+def test_a_dead_shard_makes_answers_partial_until_it_is_filled_again():
     nodes = fleet()
     with shards(nodes[:60]) as cluster:
         cluster.kill(1)
@@ -151,7 +149,7 @@ def test_a_dead_shard_makes_answers_partial_until_it_is_filled_again() -> None:
         assert_same(cluster.index, one_index(left), left)
 
 
-def test_a_shard_that_was_only_slow_is_current_again_without_being_filled() -> None:
+def test_a_shard_that_was_only_slow_is_current_again_without_being_filled():
     nodes = fleet()
     with shards(nodes, timeout=0.3) as cluster:
         server = cluster.servers[2]
@@ -165,7 +163,7 @@ def test_a_shard_that_was_only_slow_is_current_again_without_being_filled() -> N
         assert not cluster.index.query(view_of(nodes[0]), 16).missing
 
 
-def test_a_shard_lost_for_long_is_answered_for_in_this_process() -> None:
+def test_a_shard_lost_for_long_is_answered_for_in_this_process():
     nodes = fleet()
     with shards(nodes, stand_in_after=0.0) as cluster:
         cluster.kill(0)
@@ -178,7 +176,7 @@ def test_a_shard_lost_for_long_is_answered_for_in_this_process() -> None:
         assert_same(cluster.index, one_index(nodes), nodes)
 
 
-def test_without_the_cluster_the_server_answers_from_its_own_index() -> None:
+def test_without_the_cluster_the_server_answers_from_its_own_index():
     nodes = fleet()
     with shards(nodes) as cluster:
         cluster.gone = True
@@ -188,7 +186,7 @@ def test_without_the_cluster_the_server_answers_from_its_own_index() -> None:
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_whatever_is_lost_killed_or_slow_nothing_is_missing_in_the_end(seed: int) -> None:
+def test_whatever_is_lost_killed_or_slow_nothing_is_missing_in_the_end(seed: int):
     """Against one index: a whole answer is always the right one, and in the end all are whole."""
     nodes, rng = fleet(), random.Random(seed)
     with shards(timeout=0.2, stand_in_after=0.1) as cluster:
@@ -223,7 +221,7 @@ def test_whatever_is_lost_killed_or_slow_nothing_is_missing_in_the_end(seed: int
 
 
 @pytest.mark.slow
-def test_merging_by_shards_finds_the_same_links_though_one_dies() -> None:
+def test_merging_by_shards_finds_the_same_links_though_one_dies():
     building = Building.draw(4, 12, 2)
     log = [change for robot in range(4) for change in building.log(robot)]
     alone = Merger()
@@ -249,7 +247,7 @@ def test_merging_by_shards_finds_the_same_links_though_one_dies() -> None:
     assert max(off) < 1e-3
 
 
-def test_a_node_that_could_not_be_compared_with_all_does_not_pass_for_compared() -> None:
+def test_a_node_that_could_not_be_compared_with_all_does_not_pass_for_compared():
     building = Building.draw(2, 8, 3)
     cluster = LocalShards(SHARDS)
     merger = Merger(PlaceDatabase(index=cluster.index))
@@ -266,7 +264,7 @@ def test_a_node_that_could_not_be_compared_with_all_does_not_pass_for_compared()
     cluster.close()
 
 
-def test_a_place_that_is_certain_on_the_whole_map_is_not_on_a_part_of_it() -> None:
+def test_a_place_that_is_certain_on_the_whole_map_is_not_on_a_part_of_it():
     building = Building.draw(2, 16, 1)
     log = [change for robot in range(2) for change in building.log(robot)]
     nodes = [change.node for _, change in log if isinstance(change, NodePut)]

@@ -1,7 +1,5 @@
 """Nodes compared elsewhere: the same verdicts, whatever fails there."""
 
-from __future__ import annotations
-
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import combinations
 
@@ -16,7 +14,7 @@ from synthetic.building import Building
 
 
 @pytest.mark.parametrize("failing", [0, 3, 1])
-def test_verdicts_are_those_of_one_server(failing: int, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_verdicts_are_those_of_one_server(failing: int, monkeypatch):
     """With workers that never fail, at every third request, or always; in order, for several requests."""
     monkeypatch.setattr(work, "PAIRS", 5)
     nodes = [change.node for _, change in Building.draw(1, 8, 1).log(0) if isinstance(change, NodePut)]
@@ -43,7 +41,7 @@ def test_verdicts_are_those_of_one_server(failing: int, monkeypatch: pytest.Monk
             assert one.a_from_b.mean == other.a_from_b.mean
 
 
-def test_without_a_cluster_all_is_done_here(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_cluster_all_is_done_here(monkeypatch):
     monkeypatch.setattr(work, "PAIRS", 2)
     nodes = [change.node for _, change in Building.draw(1, 4, 1).log(0) if isinstance(change, NodePut)]
 
@@ -53,7 +51,7 @@ def test_without_a_cluster_all_is_done_here(monkeypatch: pytest.MonkeyPatch) -> 
     assert len([*WorkPool(call, lambda: 0).compare(list(combinations(nodes, 2)))]) == 6
 
 
-def test_workers_that_never_answer_are_not_waited_for_twice(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_workers_that_never_answer_are_not_waited_for_twice(monkeypatch):
     monkeypatch.setattr(work, "PATIENCE", 0.5)
     nodes = [change.node for _, change in Building.draw(1, 5, 1).log(0) if isinstance(change, NodePut)]
     pairs, asked = list(combinations(nodes, 2)), []

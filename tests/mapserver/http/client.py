@@ -1,7 +1,5 @@
 """What tests of the HTTP server ask it with."""
 
-from __future__ import annotations
-
 import http.client
 import json
 import socket

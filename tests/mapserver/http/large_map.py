@@ -1,7 +1,5 @@
 """A merged map of many nodes without landmarks, for what draws maps."""
 
-from __future__ import annotations
-
 import numpy as np
 import scipy.sparse as sparse
 from scipy.spatial import cKDTree

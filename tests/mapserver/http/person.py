@@ -1,7 +1,5 @@
 """A person at the page in a real browser, and the map of two robots that it shows."""
 
-from __future__ import annotations
-
 import json
 from typing import Any
 

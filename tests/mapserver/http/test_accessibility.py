@@ -1,7 +1,5 @@
 """The page by the rules of axe-core, in Chromium: every panel, light and dark, on a desk and on a phone."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -63,7 +61,7 @@ def page(server: MapServer, browser: Browser, monkeypatch: pytest.MonkeyPatch) -
 @pytest.mark.parametrize(
     ("scheme", "mobile"), [("light", False), ("dark", False), ("light", True), ("dark", True)]
 )
-def test_no_panel_of_the_page_violates_a_rule(page: Browser, scheme: str, mobile: bool) -> None:
+def test_no_panel_of_the_page_violates_a_rule(page: Browser, scheme: str, mobile: bool):
     person = Person(page)
     page.look(390 if mobile else 1280, 800, scheme, mobile)
     found = violations(page)
@@ -86,7 +84,7 @@ def test_no_panel_of_the_page_violates_a_rule(page: Browser, scheme: str, mobile
     assert not found, "\n".join(found)
 
 
-def test_what_violates_a_rule_is_found(page: Browser) -> None:
+def test_what_violates_a_rule_is_found(page: Browser):
     page.run(
         "const summary = document.getElementById('summary'), image = new Image();"
         "image.src = 'static/icon.svg'; summary.after(image); summary.style.color = '#ccc'"
@@ -95,7 +93,7 @@ def test_what_violates_a_rule_is_found(page: Browser) -> None:
 
 
 @pytest.mark.parametrize("scheme", ["light", "dark"])
-def test_the_login_violates_no_rule(server: MapServer, browser: Browser, tmp_path: Path, scheme: str) -> None:
+def test_the_login_violates_no_rule(server: MapServer, browser: Browser, tmp_path, scheme: str):
     logins = Logins(KeyFolder.create(tmp_path / "keys", "demo", Profile.LAB, [], "s0").path)
     with Web(("127.0.0.1", 0), server, logins=logins) as web:
         browser.look(1280, 800, scheme)

@@ -1,7 +1,5 @@
 """Connections of real clients: slow, broken, ambiguous or hostile ones block no other."""
 
-from __future__ import annotations
-
 import asyncio
 import resource
 import socket
@@ -42,14 +40,14 @@ NEVER = ConnectionTimeouts(head=600.0, whole=600.0)
         (b"Content-Length: 0\r\n", b"400"),
     ],
 )
-def test_lengths_that_are_refused_before_anything_is_read(served: Web, head: bytes, status: bytes) -> None:
+def test_lengths_that_are_refused_before_anything_is_read(served: Web, head: bytes, status: bytes):
     got = raw(served, b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\n" + head + b"\r\n")
     assert got.startswith(b"HTTP/1.1 " + status)
     assert b'{"error":' in got
     assert got.count(b"HTTP/1.1") == 1
 
 
-def test_a_too_long_request_gets_an_answer(served: Web) -> None:
+def test_a_too_long_request_gets_an_answer(served: Web):
     status, answer = post(served, body=bytes(MOST_BYTES + 1))
     assert (status, answer) == (413, {"error": "at most 16 MiB are taken"})
 
@@ -58,7 +56,7 @@ HEAD = b"POST /relocalize HTTP/1.1\r\nHost: localhost\r\nContent-Type: image/png
 HALF = HEAD + b"Content-Length: 1000\r\n\r\nabc"
 
 
-def test_closed_or_slow_connections_block_no_other(services: StubServices) -> None:
+def test_closed_or_slow_connections_block_no_other(services: StubServices):
     with Web(("127.0.0.1", 0), services, patience=0.5) as served:
         # No client is left to read an answer.
         assert raw(served, HALF, close=True) == b""
@@ -72,7 +70,7 @@ def test_closed_or_slow_connections_block_no_other(services: StubServices) -> No
             connection.close()
 
 
-def test_a_byte_now_and_then_takes_no_longer_than_anything_else(services: StubServices) -> None:
+def test_a_byte_now_and_then_takes_no_longer_than_anything_else(services: StubServices):
     with (
         Web(("127.0.0.1", 0), services, patience=0.5) as served,
         socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow,
@@ -81,7 +79,7 @@ def test_a_byte_now_and_then_takes_no_longer_than_anything_else(services: StubSe
         assert drip(slow, b"x").startswith(b"HTTP/1.1 408")
 
 
-def test_a_head_that_never_ends_is_dropped(services: StubServices) -> None:
+def test_a_head_that_never_ends_is_dropped(services: StubServices):
     with (
         Web(("127.0.0.1", 0), services, limits=ConnectionTimeouts(head=0.5)) as served,
         socket.create_connection(("127.0.0.1", served.port), timeout=20) as slow,
@@ -90,7 +88,7 @@ def test_a_head_that_never_ends_is_dropped(services: StubServices) -> None:
         assert drip(slow, b"x") == b""
 
 
-def test_a_client_that_reads_nothing_is_dropped(services: StubServices) -> None:
+def test_a_client_that_reads_nothing_is_dropped(services: StubServices):
     services.events = (MapEvent(10**18, MapEventKind.CONSTRAINED, "no" * 2000),) * 3000
     with (
         Web(("127.0.0.1", 0), services, limits=ConnectionTimeouts(stall=0.5)) as served,
@@ -119,7 +117,7 @@ def drip(connection: socket.socket, piece: bytes) -> bytes:
     raise AssertionError("it may go on for ever")
 
 
-def test_thousands_of_half_open_connections_block_no_other(services: StubServices) -> None:
+def test_thousands_of_half_open_connections_block_no_other(services: StubServices):
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     resource.setrlimit(resource.RLIMIT_NOFILE, (min(hard, 8192), hard))
     half = []
@@ -153,7 +151,7 @@ def test_thousands_of_half_open_connections_block_no_other(services: StubService
         (b"X: a\x00b\r\nContent-Length: 3\r\n", b"400"),
     ],
 )
-def test_ambiguous_requests_are_answered_once(served: Web, head: bytes, status: bytes) -> None:
+def test_ambiguous_requests_are_answered_once(served: Web, head: bytes, status: bytes):
     """What stands behind the first request is never taken for a second one."""
     got = raw(
         served,
@@ -180,7 +178,7 @@ ANSWERS = {
 
 
 @pytest.mark.parametrize("request_", ANSWERS)
-def test_every_answer_has_the_headers_and_names_no_version(served: Web, request_: bytes) -> None:
+def test_every_answer_has_the_headers_and_names_no_version(served: Web, request_: bytes):
     got = raw(served, request_, close=request_.startswith(b"noise"))
     head = got.partition(b"\r\n\r\n")[0].lower()
     assert got.startswith(b"HTTP/1.1 " + ANSWERS[request_])
@@ -198,7 +196,7 @@ def test_every_answer_has_the_headers_and_names_no_version(served: Web, request_
 @pytest.mark.parametrize(
     "kind", ["", "text/plain", "application/x-www-form-urlencoded", "image/svg+xml", "x"]
 )
-def test_a_body_of_another_type_is_refused(served: Web, path: str, kind: str) -> None:
+def test_a_body_of_another_type_is_refused(served: Web, path: str, kind: str):
     """Among them are those that a form of another site's page sends without asking first."""
     stated = b"Content-Type: %s\r\n" % kind.encode() if kind else b""
     head = b"POST %s HTTP/1.1\r\nHost: localhost\r\nContent-Length: 2\r\n" % path.encode()
@@ -206,12 +204,12 @@ def test_a_body_of_another_type_is_refused(served: Web, path: str, kind: str) ->
     assert got.startswith(b"HTTP/1.1 415") and b"send Content-Type: " in got
 
 
-def test_one_request_a_connection(served: Web) -> None:
+def test_one_request_a_connection(served: Web):
     got = raw(served, b"GET /status HTTP/1.1\r\nHost: localhost\r\n\r\n" * 3)
     assert got.count(b"HTTP/1.1 200") == 1 and b"\r\nconnection: close\r\n" in got.lower()
 
 
-def test_a_server_that_is_closed_leaves_nothing_behind(services: StubServices) -> None:
+def test_a_server_that_is_closed_leaves_nothing_behind(services: StubServices):
     with (
         Web(("127.0.0.1", 0), services, patience=600.0, limits=NEVER) as served,
         socket.create_connection(("127.0.0.1", served.port)) as half,
@@ -228,7 +226,7 @@ def test_a_server_that_is_closed_leaves_nothing_behind(services: StubServices) -
             assert ask(again, "GET", "/status")[0] == 200
 
 
-def test_a_server_ends_without_delay(services: StubServices) -> None:
+def test_a_server_ends_without_delay(services: StubServices):
     took = []
     for _ in range(5):
         with Web(("127.0.0.1", 0), services) as served:
@@ -239,7 +237,7 @@ def test_a_server_ends_without_delay(services: StubServices) -> None:
     assert min(took) < 0.1  # s
 
 
-def test_a_request_in_work_is_answered_when_the_server_ends(services: StubServices) -> None:
+def test_a_request_in_work_is_answered_when_the_server_ends(services: StubServices):
     begun = threading.Event()
 
     def slow_status() -> dict[str, Scalar]:
@@ -255,7 +253,7 @@ def test_a_request_in_work_is_answered_when_the_server_ends(services: StubServic
         assert answer.result()[0] == 200 and b"late" in answer.result()[2]
 
 
-def test_requests_that_come_as_the_server_ends_are_answered(served: Web) -> None:
+def test_requests_that_come_as_the_server_ends_are_answered(served: Web):
     """They were reset, or got neither an answer nor an end until the process had ended."""
     with ExitStack() as stack:
 
@@ -273,7 +271,7 @@ def test_requests_that_come_as_the_server_ends_are_answered(served: Web) -> None
         assert [client.recv(12) for client in clients] == [b"HTTP/1.1 200"] * 6
 
 
-def test_noise_instead_of_http(served: Web) -> None:
+def test_noise_instead_of_http(served: Web):
     rng = np.random.default_rng(3)
     for length in (1, 50, 5000):
         raw(served, rng.bytes(length) + b"\r\n\r\n", close=True)
@@ -290,17 +288,17 @@ def test_noise_instead_of_http(served: Web) -> None:
         ("[::1]:8080", ("::1", 8080)),
     ],
 )
-def test_addresses(text: str, address: tuple[str, int]) -> None:
+def test_addresses(text: str, address: tuple[str, int]):
     assert parse_address(text) == address
 
 
 @pytest.mark.parametrize("text", ["", "x", ":80", "65536", "-1", "a:b", "8080:", "²"])
-def test_addresses_that_are_none(text: str) -> None:
+def test_addresses_that_are_none(text: str):
     with pytest.raises(SettingsError, match=r"write a port, or HOST:PORT"):
         parse_address(text)
 
 
-def test_a_port_that_is_taken(served: Web, services: StubServices) -> None:
+def test_a_port_that_is_taken(served: Web, services: StubServices):
     with pytest.raises(NotConnected, match=r"cannot listen at http 127.0.0.1:\d+: the port is taken"):
         Web(("127.0.0.1", served.port), services)
     with pytest.raises(NotConnected, match="address"):
@@ -336,7 +334,7 @@ print(body.decode(), calls[0])
 """
 
 
-def test_a_server_that_can_open_no_more_files_says_so_in_one_line_and_goes_on() -> None:
+def test_a_server_that_can_open_no_more_files_says_so_in_one_line_and_goes_on():
     """By itself asyncio writes thousands of tracebacks a second, until the disk is full."""
     done = subprocess.run(
         [sys.executable, "-c", WITHOUT_FILES], capture_output=True, text=True, timeout=120, check=True
@@ -347,7 +345,7 @@ def test_a_server_that_can_open_no_more_files_says_so_in_one_line_and_goes_on() 
     assert int(calls) <= 10, "it is tried once a second"
 
 
-def test_who_has_connected_is_answered_when_a_busy_server_ends() -> None:
+def test_who_has_connected_is_answered_when_a_busy_server_ends():
     """While a library loads or computes, the server's thread comes to nothing for a while, again and again.
 
     It gave up on requests after a time in which it had not looked for them, and reset their connections.

@@ -1,10 +1,7 @@
 """Editing on the page in a real browser, by mouse and keyboard, with a real map server behind."""
 
-from __future__ import annotations
-
 from contextlib import ExitStack
 from datetime import datetime
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -36,7 +33,7 @@ PLAN_FROM_MERGED = Pose2(4.0, 4.0, 0.4)
 
 
 @pytest.mark.slow
-def test_the_map_is_corrected_on_the_page(browser: Browser, server: MapServer, tmp_path: Path) -> None:
+def test_the_map_is_corrected_on_the_page(browser: Browser, server: MapServer, tmp_path):
     port, stack = free_port(), ExitStack()
     stack.enter_context(Web(("127.0.0.1", port), server))
     person = opened(browser, port)
@@ -191,9 +188,7 @@ def test_the_map_is_corrected_on_the_page(browser: Browser, server: MapServer, t
 
 
 @pytest.mark.slow
-def test_a_plan_is_laid_under_the_map_on_the_page(
-    browser: Browser, server: MapServer, tmp_path: Path
-) -> None:
+def test_a_plan_is_laid_under_the_map_on_the_page(browser: Browser, server: MapServer, tmp_path):
     poses = {node: server.merged().pose(node) for node in server.merged().components[0]}
     (tmp_path / "map.yaml").write_text(
         f"image: hall.pgm\nresolution: {SCALE}\norigin: [0, 0, 0]\nnegate: 1\n"

@@ -1,7 +1,5 @@
 """Why maps are one, over HTTP and on the page in a real browser: the numbers are those of the merged map."""
 
-from __future__ import annotations
-
 import json
 from concurrent.futures import Future
 from dataclasses import replace
@@ -50,7 +48,7 @@ def compiled() -> None:
     explain_fleet(two_maps(), 10)
 
 
-def test_maps_and_nodes_are_explained(served: Web) -> None:
+def test_maps_and_nodes_are_explained(served: Web):
     status, result = ask(served, "")
     (one,) = result["maps"]
     assert status == 200 and one["joined"] and (one["first"], one["second"]) == ("r0.1", "r1.1")
@@ -80,12 +78,12 @@ def test_maps_and_nodes_are_explained(served: Web) -> None:
         ("?a=r0.1.1&b=r9.1.1", "there is no map r9.1; known are: r0.1, r1.1"),
     ],
 )
-def test_unknown_nodes_are_reported_in_one_line(served: Web, query: str, words: str) -> None:
+def test_unknown_nodes_are_reported_in_one_line(served: Web, query: str, words: str):
     status, result = ask(served, query)
     assert status == 400 and words in result["error"] and "\n" not in result["error"]
 
 
-def test_a_route_leads_over_what_it_must_pass(served: Web) -> None:
+def test_a_route_leads_over_what_it_must_pass(served: Web):
     start, first, second, goal = "r0.1.1", "r1.1.7", "r0.1.3", "r1.1.1"
     legs = [ask(served, f"?a={a}&b={b}", "route")[1] for a, b in pairwise((start, first, second, goal))]
     status, way = ask(served, f"?a={start}&b={goal}&via={first}&via={second}", "route")
@@ -104,14 +102,14 @@ def test_a_route_leads_over_what_it_must_pass(served: Web) -> None:
         assert status == 400 and words in result["error"] and "\n" not in result["error"], result
 
 
-def test_a_busy_server_gives_a_retry_time(served: Web, services: StubServices) -> None:
+def test_a_busy_server_gives_a_retry_time(served: Web, services: StubServices):
     services.refusal = Busy(0.5)
     status, result = ask(served, "")
     assert status == 503 and result["retry_after"] == 0.5
 
 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-def test_the_page_leads_from_maps_to_landmarks(served: Web, browser: Browser) -> None:
+def test_the_page_leads_from_maps_to_landmarks(served: Web, browser: Browser):
     browser.open(f"http://127.0.0.1:{served.port}/why")
     eventually(lambda: "r0.1 and r1.1 are one map: " in browser.run(RESULT))
     a, b = (NodeId.parse(word) for word in browser.run(LINKS)[0].split(" - "))
@@ -143,7 +141,7 @@ def test_the_page_leads_from_maps_to_landmarks(served: Web, browser: Browser) ->
 
 @pytest.mark.slow
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-def test_the_page_shows_the_route_of_its_form_and_of_its_address(served: Web, browser: Browser) -> None:
+def test_the_page_shows_the_route_of_its_form_and_of_its_address(served: Web, browser: Browser):
     start, goal = NodeId("r0", 1, 1), NodeId("r1", 1, 7)
     explanation = explain_route(Router(two_maps()), start, goal)
     assert explanation.found and ask(served, f"?a={start}&b={goal}", "route") == (
@@ -181,7 +179,7 @@ def test_the_page_shows_the_route_of_its_form_and_of_its_address(served: Web, br
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 def test_the_history_is_listed_newest_first_and_goes_on(
     served: Web, services: StubServices, browser: Browser
-) -> None:
+):
     shown = "return [...document.querySelectorAll('#history li')].map(one => one.textContent)"
     services.events = (MapEvent(10**18, MapEventKind.JOINED, "r0.1 and r1.1 are one map now"),)
     browser.open(f"http://127.0.0.1:{served.port}/")
@@ -191,14 +189,14 @@ def test_the_history_is_listed_newest_first_and_goes_on(
     eventually(lambda: browser.run(shown) == ["2001-09-09 01:46:47 UTC parted: <b>x", joined])
 
 
-def test_the_history_is_listed_with_times(served: Web, services: StubServices) -> None:
+def test_the_history_is_listed_with_times(served: Web, services: StubServices):
     services.events = (MapEvent(10**18, MapEventKind.CONSTRAINED, "no"),)
     with urlopen(f"http://127.0.0.1:{served.port}/history", timeout=20) as reply:
         (event,) = json.load(reply)["history"]
     assert event == {"stamp_ns": 10**18, "time": "2001-09-09 01:46:40", "kind": "constrained", "words": "no"}
 
 
-def test_a_way_leads_from_node_to_node(served: Web) -> None:
+def test_a_way_leads_from_node_to_node(served: Web):
     for query, words in (("", "write /route?a="), ("?a=r0.1&b=r1.1", "from node to node")):
         status, result = ask(served, query, "route")
         assert status == 400 and words in result["error"]
@@ -206,8 +204,8 @@ def test_a_way_leads_from_node_to_node(served: Web) -> None:
 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 def test_maps_that_are_one_by_way_of_others_show_the_way_on_the_page(
-    served: Web, services: StubServices, browser: Browser, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    served: Web, services: StubServices, browser: Browser, monkeypatch
+):
     """And what is held against maps, which the shell says too."""
     ids = tuple(MapId(name, 1) for name in ("r0", "r1", "r2"))
     merged = merger_of(looked_around(ids, seed=6)).merged()

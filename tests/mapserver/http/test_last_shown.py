@@ -1,9 +1,6 @@
 """What the page showed last: another content than a server writes keeps none from starting."""
 
-from __future__ import annotations
-
 import zlib
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +14,7 @@ BAD = [
 
 
 @pytest.mark.parametrize("content", BAD, ids=["robots", "map", "deep"])
-def test_what_no_server_writes_is_not_shown(content: bytes, tmp_path: Path) -> None:
+def test_what_no_server_writes_is_not_shown(content: bytes, tmp_path):
     path = tmp_path / "s0.shown"
     path.write_bytes(MAGIC + zlib.compress(content))
     assert read_shown(path) is NOTHING

@@ -1,7 +1,5 @@
 """The WebSocket of the page, with a client of another library than the server's."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import json
@@ -137,7 +135,7 @@ def less(merged: MergedMap) -> MergedMap:
     return replace(merged, graphs=(graph,), links=(), superseded=superseded)
 
 
-def test_a_viewer_gets_the_map_and_what_changes(served: Web, services: StubServices) -> None:
+def test_a_viewer_gets_the_map_and_what_changes(served: Web, services: StubServices):
     services.events = (MapEvent(10**18, MapEventKind.JOINED, "r0.1 and r1.1 are one map now"),)
     merged = two_maps()
     with viewer(served) as first:
@@ -186,7 +184,7 @@ def test_a_viewer_gets_the_map_and_what_changes(served: Web, services: StubServi
             first.until("map")
 
 
-def test_a_component_has_its_floor_as_soon_as_it_is_labelled(served: Web, services: StubServices) -> None:
+def test_a_component_has_its_floor_as_soon_as_it_is_labelled(served: Web, services: StubServices):
     with viewer(served) as watching:
         assert watching.until("map")["components"][0]["floor"] == ""
         label = Annotation("r1.1", Floor(NodeId("r1", 1, 2), "ground"), False, "anna", 1)
@@ -195,7 +193,7 @@ def test_a_component_has_its_floor_as_soon_as_it_is_labelled(served: Web, servic
         eventually(lambda: watching.until("map")["components"][0]["floor"] == "ground")
 
 
-def test_robots_come_twice_a_second(served: Web, services: StubServices) -> None:
+def test_robots_come_twice_a_second(served: Web, services: StubServices):
     status = Status("turning", "", 3, 40, Pose2(), False, covariance=(0.04, 0.01, 0.09, 0.001))
     services.fleet = FleetStatus(
         (RobotEntry("r0", True, 0.2, AgentStatus(status, 5, "r0", 1, battery=0.5), Pose2(1.0, 2.0, 0.3), 0),)
@@ -210,7 +208,7 @@ def test_robots_come_twice_a_second(served: Web, services: StubServices) -> None
         assert watching.last["state"]["server"] == {"summary": "12 nodes"}
 
 
-def test_a_map_file_is_read_only(services: StubServices, served: Web) -> None:
+def test_a_map_file_is_read_only(services: StubServices, served: Web):
     services.read_only = True
     with viewer(served) as watching:
         hello = watching.until("hello")
@@ -218,14 +216,14 @@ def test_a_map_file_is_read_only(services: StubServices, served: Web) -> None:
 
 
 @pytest.mark.parametrize("headers", [{"Host": "evil.example"}, {"Origin": "http://evil.example"}])
-def test_pages_of_other_sites_do_not_watch(served: Web, headers: dict[str, str]) -> None:
+def test_pages_of_other_sites_do_not_watch(served: Web, headers: dict[str, str]):
     # The library writes Host by itself: a second one is refused as well.
     with pytest.raises(InvalidStatus) as refused, viewer(served, **headers):
         pass
     assert refused.value.response.status_code in (400, 403)
 
 
-def test_who_takes_nothing_or_says_too_much_is_dropped(services: StubServices) -> None:
+def test_who_takes_nothing_or_says_too_much_is_dropped(services: StubServices):
     with Web(("127.0.0.1", 0), services, limits=ConnectionTimeouts(head=0.5, whole=0.5, stall=0.5)) as served:
         services.holds["summary"] = "x" * 20_000_000
         with socket.socket() as slow:
@@ -247,7 +245,7 @@ def test_who_takes_nothing_or_says_too_much_is_dropped(services: StubServices) -
             assert closed.value.rcvd is not None and closed.value.rcvd.code == 1009, "too long"
 
 
-def test_viewers_that_are_closed_or_asleep_leave_nothing(services: StubServices) -> None:
+def test_viewers_that_are_closed_or_asleep_leave_nothing(services: StubServices):
     """So many each day as may watch at once, and no one could watch any more."""
     limits = ConnectionTimeouts(head=5.0, whole=5.0, stall=0.5)
     with Web(("127.0.0.1", 0), services, limits=limits) as served:
@@ -265,9 +263,7 @@ def test_viewers_that_are_closed_or_asleep_leave_nothing(services: StubServices)
                 assert watching.until("state")
 
 
-def test_an_unchanged_state_is_said_again(
-    services: StubServices, served: Web, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_unchanged_state_is_said_again(services: StubServices, served: Web, monkeypatch):
     """By it a page knows that its server is there."""
     monkeypatch.setattr(live, "SAID_AGAIN", 0.6)
     with viewer(served) as watching:
@@ -275,7 +271,7 @@ def test_an_unchanged_state_is_said_again(
         assert watching.until("state") == first
 
 
-def test_only_so_many_watch(served: Web) -> None:
+def test_only_so_many_watch(served: Web):
     with ExitStack() as stack:
         viewers = [stack.enter_context(viewer(served)) for _ in range(MOST_VIEWERS + 1)]
         with pytest.raises(ConnectionClosed) as refused:
@@ -284,7 +280,7 @@ def test_only_so_many_watch(served: Web) -> None:
         assert viewers[0].until("state")
 
 
-def test_a_server_that_ends_says_so_to_viewers(services: StubServices) -> None:
+def test_a_server_that_ends_says_so_to_viewers(services: StubServices):
     with Web(("127.0.0.1", 0), services) as served, viewer(served) as watching:
         watching.until("state")
         served.close()
@@ -314,7 +310,7 @@ class SlowSocket:
         self.taken.append(json.loads(text))
 
 
-def test_a_slow_viewer_gets_the_newest_state(services: StubServices, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_viewer_gets_the_newest_state(services: StubServices, monkeypatch):
     monkeypatch.setattr("mapweave.mapserver.http.live.EVERY", 0.005)
     looks = 0
 
@@ -355,9 +351,7 @@ keys = st.dictionaries(st.integers(0, 12), st.integers(1, 3), max_size=8)
 
 
 @given(st.lists(keys, min_size=1, max_size=8), st.data())
-def test_a_difference_from_any_version_gives_the_rows(
-    steps: list[dict[int, int]], data: st.DataObject
-) -> None:
+def test_a_difference_from_any_version_gives_the_rows(steps: list[dict[int, int]], data: st.DataObject):
     table = RowTable([("key", "<u4"), ("value", "<f4")])
     copies: list[np.ndarray] = []
     for version, step in enumerate(steps, 1):

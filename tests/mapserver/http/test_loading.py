@@ -1,10 +1,7 @@
 """The page while a map server loads: all as it was last shown, and "ask again" to all else."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
 from urllib.error import HTTPError
 from urllib.request import Request, urlopen
 
@@ -62,7 +59,7 @@ def answer(web: Web, path: str, body: bytes | None = None) -> tuple[int, dict]:
         return error.code, json.load(error)
 
 
-def test_all_is_shown_as_before_until_the_server_has_merged() -> None:
+def test_all_is_shown_as_before_until_the_server_has_merged():
     server, loading = StubServices(), LoadingServer()
     server.holds = {"summary": "12 nodes", "settled": False, "merged": False}
     with Web(("127.0.0.1", 0), loading, before=before()) as web, viewer(web) as person:
@@ -116,7 +113,7 @@ def test_all_is_shown_as_before_until_the_server_has_merged() -> None:
         assert kept.history == server.events and [robot["robot"] for robot in kept.robots] == ["r0"]
 
 
-def test_a_robot_that_no_common_node_places_is_shown_without_a_place() -> None:
+def test_a_robot_that_no_common_node_places_is_shown_without_a_place():
     elsewhere = FleetStatus((at("r1", Pose2(1.0, 1.0, 0.0)),))
     only_r1 = two_maps().graphs[0].nodes[-1]
     assert only_r1.agent == "r1"
@@ -131,7 +128,7 @@ def test_a_robot_that_no_common_node_places_is_shown_without_a_place() -> None:
 
 
 @pytest.mark.parametrize("there", [False, True])
-def test_what_a_server_waits_for_is_said(there: bool) -> None:
+def test_what_a_server_waits_for_is_said(there: bool):
     shown, loading = before() if there else NOTHING, LoadingServer()
     words = "waiting: no database"
     loading.wait(words)
@@ -143,14 +140,14 @@ def test_what_a_server_waits_for_is_said(there: bool) -> None:
         eventually(lambda: person.until("state")["server"]["summary"] == (NOT_THERE if shown else "loading"))
 
 
-def test_without_a_map_of_before_the_page_says_that_the_server_loads() -> None:
+def test_without_a_map_of_before_the_page_says_that_the_server_loads():
     with Web(("127.0.0.1", 0), LoadingServer()) as web, viewer(web) as person:
         assert person.until("state")["server"]["summary"] == "loading"
         assert "map" not in person.last
 
 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-def test_the_page_lists_a_map_of_before_without_robots(browser: Browser) -> None:
+def test_the_page_lists_a_map_of_before_without_robots(browser: Browser):
     """The panel beside the map was empty until the server had merged."""
     with Web(("127.0.0.1", 0), LoadingServer(), before=replace(before(), robots=())) as web:
         browser.open(f"http://127.0.0.1:{web.port}/")
@@ -159,7 +156,7 @@ def test_the_page_lists_a_map_of_before_without_robots(browser: Browser) -> None
         assert browser.run(listed)
 
 
-def test_what_was_shown_is_kept_or_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_what_was_shown_is_kept_or_left_out(tmp_path, caplog):
     path = tmp_path / "s0.sqlite.shown"
     assert read_shown(path) == NOTHING and not caplog.records
     write_shown(path, before())
@@ -174,7 +171,7 @@ def test_what_was_shown_is_kept_or_left_out(tmp_path: Path, caplog: pytest.LogCa
     assert "the next start shows no map" in caplog.text
 
 
-def test_the_page_of_the_demo_is_that_of_its_recording() -> None:
+def test_the_page_of_the_demo_is_that_of_its_recording():
     kept, made = read_shown(DEMO_PAGE), page()
     shown, fresh = json.loads(kept.map), json.loads(made.map)
     assert shown["components"] == fresh["components"]

@@ -3,8 +3,6 @@
 `TABLE` has every route: a new one is without a line until it is decided who may ask it.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import select
@@ -116,11 +114,11 @@ def routes(services: StubServices) -> set[tuple[str, str]]:
     return found
 
 
-def test_every_route_is_in_the_table(services: StubServices) -> None:
+def test_every_route_is_in_the_table(services: StubServices):
     assert routes(services) == TABLE.keys()
 
 
-def test_each_role_may_ask_what_the_table_says(keyed: Keyed) -> None:
+def test_each_role_may_ask_what_the_table_says(keyed: Keyed):
     """What it may not is refused before anything of the request is looked at."""
     filled = {
         "{node}": "r0.1.1",
@@ -152,7 +150,7 @@ def watched(keyed: Keyed, name: str) -> int:
         )
 
 
-def test_a_session_is_a_cookie_that_pages_cannot_read_or_send_elsewhere(keyed: Keyed) -> None:
+def test_a_session_is_a_cookie_that_pages_cannot_read_or_send_elsewhere(keyed: Keyed):
     status, headers, answer = keyed.log_in(keyed.tokens["otto"])
     cookie = headers["Set-Cookie"]
     assert (status, answer) == (200, {"name": "otto", "role": "operator"})
@@ -168,7 +166,7 @@ def test_a_session_is_a_cookie_that_pages_cannot_read_or_send_elsewhere(keyed: K
     assert keyed.ask("GET", "/robots", **session) == 401
 
 
-def test_no_one_chooses_the_secret_of_a_session(keyed: Keyed) -> None:
+def test_no_one_chooses_the_secret_of_a_session(keyed: Keyed):
     """Else who has planted a cookie in a browser would share the session of who logs in there."""
     name = keyed.session("otto")["Cookie"].partition("=")[0]
     planted = {"Cookie": f"{name}={'a' * 43}", "Origin": f"http://{keyed.site}"}
@@ -178,9 +176,7 @@ def test_no_one_chooses_the_secret_of_a_session(keyed: Keyed) -> None:
     assert keyed.ask("GET", "/robots", **planted) == 401
 
 
-def test_a_token_in_an_address_lets_no_one_in_and_is_in_no_log(
-    keyed: Keyed, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_token_in_an_address_lets_no_one_in_and_is_in_no_log(keyed: Keyed, caplog):
     caplog.set_level(logging.DEBUG)
     token = keyed.tokens["otto"]
     for path in (f"/robots?token={token}", f"/robots?access_token={token}", f"/static/{token}"):
@@ -193,7 +189,7 @@ def test_a_token_in_an_address_lets_no_one_in_and_is_in_no_log(
 
 
 @pytest.mark.parametrize("path", ["/stop", "/robots/r0/stop", "/constraints", "/annotations", "/logout"])
-def test_a_page_of_another_site_cannot_use_a_session(keyed: Keyed, path: str) -> None:
+def test_a_page_of_another_site_cannot_use_a_session(keyed: Keyed, path: str):
     """As bytes: a browser may be old, and the cookie be sent along in spite of SameSite."""
     session = keyed.session("otto")
     other_port = session["Origin"].rpartition(":")[0] + ":1"
@@ -205,7 +201,7 @@ def test_a_page_of_another_site_cannot_use_a_session(keyed: Keyed, path: str) ->
     assert keyed.ask("GET", "/robots", **session) == 200, "it is not logged out, either"
 
 
-def test_a_page_of_another_site_cannot_watch_by_a_session(keyed: Keyed) -> None:
+def test_a_page_of_another_site_cannot_watch_by_a_session(keyed: Keyed):
     session = keyed.session("vera")
     for headers in ({"Cookie": session["Cookie"]}, {**session, "Origin": "http://evil.example"}):
         with pytest.raises(InvalidStatus) as refused, keyed.watch(**headers):
@@ -230,9 +226,7 @@ def damage_tokens(keyed: Keyed) -> None:
 
 
 @pytest.mark.parametrize("end", [revoke_identity, revoke_tokens, damage_tokens])
-def test_revoking_ends_tokens_sessions_and_viewers_at_once(
-    keyed: Keyed, end: Callable[[Keyed], None]
-) -> None:
+def test_revoking_ends_tokens_sessions_and_viewers_at_once(keyed: Keyed, end: Callable[[Keyed], None]):
     session = keyed.session("vera")
     with keyed.watch(**session) as watching:
         assert json.loads(watching.recv(timeout=20))["name"] == "vera"
@@ -248,7 +242,7 @@ def test_revoking_ends_tokens_sessions_and_viewers_at_once(
         assert keyed.ask("GET", "/robots", "otto") == 200
 
 
-def test_a_token_and_a_session_end_by_themselves(keyed: Keyed, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_token_and_a_session_end_by_themselves(keyed: Keyed, monkeypatch):
     keyed.tokens["vera"] = keyed.folder.token("vera", -1e-6)
     assert keyed.ask("GET", "/robots", "vera") == 401
     now = [0.0]
@@ -259,7 +253,7 @@ def test_a_token_and_a_session_end_by_themselves(keyed: Keyed, monkeypatch: pyte
     assert open_ones.find(secrets[-1]) is None
 
 
-def test_failed_logins_are_limited_and_logged(keyed: Keyed, caplog: pytest.LogCaptureFixture) -> None:
+def test_failed_logins_are_limited_and_logged(keyed: Keyed, caplog):
     caplog.set_level(logging.INFO, "mapweave.mapserver")
     assert keyed.log_in(keyed.tokens["otto"])[0] == 200
     answers = [keyed.log_in("mapweave_guess")[0] for _ in range(sessions.MOST_FAILURES + 1)]
@@ -275,7 +269,7 @@ def test_failed_logins_are_limited_and_logged(keyed: Keyed, caplog: pytest.LogCa
         assert keyed.ask("GET", "/robots", Authorization=scheme) == 401
 
 
-def test_what_failed_long_ago_is_forgotten() -> None:
+def test_what_failed_long_ago_is_forgotten():
     now = [0.0]
     failures = sessions.FailedAttempts(lambda: now[0])
     for _ in range(sessions.MOST_FAILURES):
@@ -288,7 +282,7 @@ def test_what_failed_long_ago_is_forgotten() -> None:
     assert len(failures._times) == sessions.MOST_ADDRESSES
 
 
-def test_addresses_of_one_ipv6_network_are_one() -> None:
+def test_addresses_of_one_ipv6_network_are_one():
     """Each of a network's 2^64 addresses had ten attempts of its own, each a line of the log."""
     failures = sessions.FailedAttempts(lambda: 0.0)
     for number in range(sessions.MOST_FAILURES):
@@ -302,19 +296,19 @@ def test_addresses_of_one_ipv6_network_are_one() -> None:
 
 
 @pytest.mark.parametrize("body", [b"{}", b'{"token": 3}', b'{"token": "x", "name": "otto"}', b"\xff", b"[]"])
-def test_a_login_that_is_none(keyed: Keyed, body: bytes) -> None:
+def test_a_login_that_is_none(keyed: Keyed, body: bytes):
     given = {"Content-Type": "application/json"}
     assert ask(keyed.web, "POST", "/login", body, given)[0] == 400
     assert ask(keyed.web, "POST", "/login", body, {"Content-Type": "text/plain"})[0] == 415
     assert ask(keyed.web, "POST", "/login", body.ljust(2000), given)[0] == 413
 
 
-def test_the_name_of_the_server_is_known_with_keys(keyed: Keyed) -> None:
+def test_the_name_of_the_server_is_known_with_keys(keyed: Keyed):
     assert keyed.ask("GET", "/robots", "vera", Host="maps.example") == 200
     assert keyed.ask("GET", "/robots", "vera", Host="evil.example") == 403
 
 
-def test_without_keys_this_machine_alone_is_served(services: StubServices, tmp_path: Path) -> None:
+def test_without_keys_this_machine_alone_is_served(services: StubServices, tmp_path):
     for host in ("0.0.0.0", "192.0.2.1", "::", "maps.local"):
         with pytest.raises(SettingsError, match="without keys people are served on this machine alone"):
             Web((host, 0), services)
@@ -332,9 +326,7 @@ def test_without_keys_this_machine_alone_is_served(services: StubServices, tmp_p
         assert login[0] == 400 and b"no keys" in login[2]
 
 
-def test_who_logs_in_over_https_sees_the_certificate_of_the_authority(
-    services: StubServices, tmp_path: Path
-) -> None:
+def test_who_logs_in_over_https_sees_the_certificate_of_the_authority(services: StubServices, tmp_path):
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, [], "s0")
     folder.add("otto", Role.OPERATOR)
     token, server = folder.token("otto", 1.0), folder.key_file("s0")
@@ -362,7 +354,7 @@ def test_who_logs_in_over_https_sees_the_certificate_of_the_authority(
 
 @pytest.mark.parametrize("version", [ssl.TLSVersion.TLSv1, ssl.TLSVersion.TLSv1_1])
 @pytest.mark.filterwarnings("ignore:ssl.TLSVersion:DeprecationWarning")
-def test_https_is_of_this_day(version: ssl.TLSVersion, services: StubServices, tmp_path: Path) -> None:
+def test_https_is_of_this_day(version: ssl.TLSVersion, services: StubServices, tmp_path):
     """Older versions of TLS, and plain HTTP, are given nothing."""
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, ["127.0.0.1"], "s0")
     context = server_context(read_key_file(folder.key_file("s0")).credentials)
@@ -382,7 +374,7 @@ def test_https_is_of_this_day(version: ssl.TLSVersion, services: StubServices, t
                 assert b"HTTP" not in tcp.recv(1000)
 
 
-def test_handshakes_that_are_never_begun_make_room(services: StubServices, tmp_path: Path) -> None:
+def test_handshakes_that_are_never_begun_make_room(services: StubServices, tmp_path):
     """Hundreds were held until their time was over: with the limit of open files no one else got in."""
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, [], "s0")
     tls = server_context(read_key_file(folder.key_file("s0")).credentials)
@@ -431,8 +423,8 @@ def encrypted(web: Web, context: ssl.SSLContext, data: bytes) -> bytes:
 
 
 def test_one_who_asks_without_end_gets_the_time_to_retry_and_no_other_waits(
-    tmp_path: Path, services: StubServices, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    tmp_path, services: StubServices, monkeypatch
+):
     """By name, whatever the way of logging in; what costs nothing is not counted."""
     now = 0.0
     monkeypatch.setattr("mapweave.mapserver.http.web.Rates", lambda: Rates(clock=lambda: now))
@@ -453,9 +445,7 @@ def test_one_who_asks_without_end_gets_the_time_to_retry_and_no_other_waits(
 
 
 @pytest.mark.parametrize(("path", "name"), [("/login", ""), ("/constraints", "otto")])
-def test_bodies_that_never_arrive_hold_up_no_other(
-    tmp_path: Path, services: StubServices, path: str, name: str
-) -> None:
+def test_bodies_that_never_arrive_hold_up_no_other(tmp_path, services: StubServices, path: str, name: str):
     """Neither a stranger's nor a member's: other questions are answered, and other bodies arrive."""
     keyed = Keyed(tmp_path / "keys", services, patience=600.0)
     token = f"Authorization: Bearer {keyed.tokens[name]}\r\n" if name else ""
@@ -476,9 +466,7 @@ def test_bodies_that_never_arrive_hold_up_no_other(
         assert keyed.log_in(keyed.tokens["vera"])[0] == 200
 
 
-def test_a_route_counts_as_many_questions_as_it_has_legs(
-    tmp_path: Path, services: StubServices, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_route_counts_as_many_questions_as_it_has_legs(tmp_path, services: StubServices, monkeypatch):
     """Else one question by way of sixteen places would be worth seventeen."""
     now = 0.0
     monkeypatch.setattr("mapweave.mapserver.http.web.Rates", lambda: Rates(clock=lambda: now))
@@ -493,7 +481,7 @@ def test_a_route_counts_as_many_questions_as_it_has_legs(
         assert keyed.ask("GET", way, "otto") == 200
 
 
-def test_without_keys_addresses_have_rates() -> None:
+def test_without_keys_addresses_have_rates():
     now = 0.0
     rates = Rates(clock=lambda: now)
 

@@ -1,7 +1,5 @@
 """Photos on the page in a real browser: one is chosen, sent, and the answer shown, or why there is none."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
@@ -69,7 +67,7 @@ def image(tmp_path: Path) -> Path:
     return path
 
 
-def test_a_picture_is_answered_on_the_page(page: Browser, services: StubServices, image: Path) -> None:
+def test_a_picture_is_answered_on_the_page(page: Browser, services: StubServices, image: Path):
     eventually(lambda: page.run(STATUS) == "12 nodes")
     page.run("document.getElementById('tab-photo').click()")
     page.type("#hfov", "90")
@@ -85,7 +83,7 @@ def test_a_picture_is_answered_on_the_page(page: Browser, services: StubServices
     assert services.views[-1].camera.fx == pytest.approx(80.0)
 
 
-def test_an_unknown_place_is_explained(page: Browser, services: StubServices, image: Path) -> None:
+def test_an_unknown_place_is_explained(page: Browser, services: StubServices, image: Path):
     near = SimilarPlace(NodeId("r0", 1, 3), 14, 9, 10, "only 31% of the matches agree on one pose", 0.6)
     services.answer = RelocalizeAnswer(Certainty.UNKNOWN, (), "not recognised", (near,))
     page.type("#image", str(image))
@@ -101,7 +99,7 @@ def test_an_unknown_place_is_explained(page: Browser, services: StubServices, im
 @pytest.mark.parametrize(("matches", "inliers", "doubted"), [(77, 0, True), (14, 9, False), (31, 10, False)])
 def test_a_camera_that_was_given_wrongly_is_suspected(
     page: Browser, services: StubServices, image: Path, matches: int, inliers: int, doubted: bool
-) -> None:
+):
     """A photo with the default height of the lens and angle of view was only said to agree on no pose."""
     near = SimilarPlace(NodeId("r0", 1, 3), matches, inliers, 10, "matches agree on no pose", None)
     services.answer = RelocalizeAnswer(Certainty.UNKNOWN, (), "not recognised", (near,))
@@ -111,8 +109,8 @@ def test_a_camera_that_was_given_wrongly_is_suspected(
 
 
 def test_the_answer_to_the_photo_before_does_not_replace_that_to_the_last_one(
-    page: Browser, services: StubServices, image: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    page: Browser, services: StubServices, image: Path, monkeypatch
+):
     """A photo of which the answer took longer was answered below the picture of the next one."""
     asked: list[Future[RelocalizeAnswer]] = []
 
@@ -137,14 +135,14 @@ def test_the_answer_to_the_photo_before_does_not_replace_that_to_the_last_one(
     assert page.run(KIND) == "place" and len(page.run(ROWS)) == 2
 
 
-def test_no_unknown_distance_is_shown(page: Browser, services: StubServices, image: Path) -> None:
+def test_no_unknown_distance_is_shown(page: Browser, services: StubServices, image: Path):
     services.answer = PLACE
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "place")
     assert page.run(ROWS)[1] == ["r0.1.7", "not known", "not known", "6°", "90 %"]
 
 
-def test_an_answer_names_the_place_and_the_floor(page: Browser, services: StubServices, image: Path) -> None:
+def test_an_answer_names_the_place_and_the_floor(page: Browser, services: StubServices, image: Path):
     (where,) = PLACE.candidates
     services.answer = replace(PLACE, candidates=(replace(where, place="<b>kitchen", floor="ground"),))
     page.type("#image", str(image))
@@ -153,8 +151,8 @@ def test_an_answer_names_the_place_and_the_floor(page: Browser, services: StubSe
 
 
 def test_robots_and_photos_are_named_in_coordinates_of_a_plan(
-    page: Browser, services: StubServices, image: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    page: Browser, services: StubServices, image: Path, monkeypatch
+):
     """Of plan office under component 1, and of none under component 0."""
     monkeypatch.setattr(services, "plans", lambda: PlacedPlans((PLAN,)), raising=False)
     at = Pose2(2.0, 1.0, 0.0)
@@ -176,8 +174,8 @@ def test_robots_and_photos_are_named_in_coordinates_of_a_plan(
 
 
 def test_nodes_are_named_and_found_in_coordinates_of_a_plan(
-    page: Browser, services: StubServices, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    page: Browser, services: StubServices, monkeypatch
+):
     """As robots and photos are: what the panel shows can be typed, in the search and for missions."""
     placed = replace(PLAN, name="ground floor", parts=(replace(PLAN.parts[0], component=0),))
     monkeypatch.setattr(services, "plans", lambda: PlacedPlans((placed,)), raising=False)
@@ -208,7 +206,7 @@ def test_nodes_are_named_and_found_in_coordinates_of_a_plan(
     assert len(services.ways) == 1
 
 
-def test_what_is_no_image_is_not_sent(page: Browser, services: StubServices, tmp_path: Path) -> None:
+def test_what_is_no_image_is_not_sent(page: Browser, services: StubServices, tmp_path):
     (tmp_path / "notes.log").write_text("no image")
     page.type("#image", str(tmp_path / "notes.log"))
     eventually(lambda: page.run(KIND) == "box failed")
@@ -216,7 +214,7 @@ def test_what_is_no_image_is_not_sent(page: Browser, services: StubServices, tmp
     assert not page.run("return document.getElementById('shown').checkVisibility()") and not services.views
 
 
-def test_a_robot_passes_places_on_its_way(page: Browser, services: StubServices) -> None:
+def test_a_robot_passes_places_on_its_way(page: Browser, services: StubServices):
     node = NodeId("r0", 1, 1)
     services.said = Annotations(
         tuple(Annotation(name, Place(node), False, "anna", 1) for name in ("east", "east wing"))
@@ -237,7 +235,7 @@ def test_a_robot_passes_places_on_its_way(page: Browser, services: StubServices)
     eventually(lambda: services.reasons == ["", "a guest & a dog wait"])
 
 
-def test_errors_are_shown_on_the_page(page: Browser, services: StubServices, image: Path) -> None:
+def test_errors_are_shown_on_the_page(page: Browser, services: StubServices, image: Path):
     services.refusal = InvalidValue("<b>this</b> is no place")
     page.type("#image", str(image))
     eventually(lambda: page.run(KIND) == "box failed")
@@ -247,7 +245,7 @@ def test_errors_are_shown_on_the_page(page: Browser, services: StubServices, ima
 
 
 @pytest.mark.slow
-def test_a_busy_server_is_asked_again(page: Browser, services: StubServices, image: Path) -> None:
+def test_a_busy_server_is_asked_again(page: Browser, services: StubServices, image: Path):
     services.refusal = Busy(0.2)
     page.type("#image", str(image))
     eventually(lambda: "waiting" in page.run(RESULT))
@@ -256,9 +254,7 @@ def test_a_busy_server_is_asked_again(page: Browser, services: StubServices, ima
 
 
 @pytest.mark.parametrize(("robots", "gap"), [(2, 0.0), (4, 40.0)])
-def test_labels_do_not_lie_on_each_other(
-    page: Browser, services: StubServices, robots: int, gap: float
-) -> None:
+def test_labels_do_not_lie_on_each_other(page: Browser, services: StubServices, robots: int, gap: float):
     """Robots so many px apart, amid places at one node."""
     node = NodeId("r0", 1, 1)
     places = [Annotation(f"place {k}", Place(node), False, "anna", 1) for k in range(6)]
@@ -283,7 +279,7 @@ def test_labels_do_not_lie_on_each_other(
     assert all({f"r{k}", f"r{k}: driving"} & set(texts) for k in range(robots))
 
 
-def test_the_selected_node_has_its_name_at_every_scale(page: Browser) -> None:
+def test_the_selected_node_has_its_name_at_every_scale(page: Browser):
     """Its neighbour's name lay in its ring, and its own was left out; from afar no node has a name."""
     eventually(lambda: page.run("return mapweave.model.rowOf('r0.1.3')") is not None)
     Person(page).search("r0.1.3")
@@ -299,7 +295,7 @@ def test_the_selected_node_has_its_name_at_every_scale(page: Browser) -> None:
         assert (texts.count("r0.1.3"), within) == (1, []), scale
 
 
-def test_a_number_and_its_unit_are_on_one_line(page: Browser) -> None:
+def test_a_number_and_its_unit_are_on_one_line(page: Browser):
     """Beside the scroll bar of a long answer, the m of the lens's height was on a line of its own."""
     page.run("document.getElementById('tab-photo').click();"
              "document.getElementById('answer').style.minHeight = '2000px'")  # fmt: skip
@@ -313,13 +309,13 @@ def test_a_number_and_its_unit_are_on_one_line(page: Browser) -> None:
     assert lines == {width: [True, True] for width in (320, 900, 1280)}
 
 
-def test_a_browser_that_cannot_draw_says_so(page: Browser) -> None:
+def test_a_browser_that_cannot_draw_says_so(page: Browser):
     assert page.run("return document.getElementById('undrawn').hidden")
     page.run("mapweave.painter.worker.dispatchEvent(new ErrorEvent('error'))")
     assert "cannot draw the map" in page.run("return document.querySelector('#map [role=alert]').innerText")
 
 
-def test_fingers_hit_every_button(page: Browser, services: StubServices) -> None:
+def test_fingers_hit_every_button(page: Browser, services: StubServices):
     services.fleet = FleetStatus((RobotEntry("r0", True),))
     page.look(390, 844, mobile=True)
     try:
@@ -335,7 +331,7 @@ def test_fingers_hit_every_button(page: Browser, services: StubServices) -> None
     assert small == []
 
 
-def test_screen_readers_name_every_control(page: Browser, services: StubServices) -> None:
+def test_screen_readers_name_every_control(page: Browser, services: StubServices):
     """By the accessibility tree that Chromium gives them, panel by panel."""
     services.fleet = FleetStatus((RobotEntry("r0", True),))
     eventually(lambda: page.run("return document.querySelectorAll('#robots button').length"))
@@ -351,7 +347,7 @@ def test_screen_readers_name_every_control(page: Browser, services: StubServices
     assert not nameless and len(seen) > 6, seen
 
 
-def test_no_button_touches_another_one(page: Browser) -> None:
+def test_no_button_touches_another_one(page: Browser):
     near = at_widths(page, (320, 390, 1280), """
         const found = [];
         for (const panel of ["fleet", "why", "edit", "photo"]) {
@@ -372,7 +368,7 @@ def test_no_button_touches_another_one(page: Browser) -> None:
     assert near == {width: [] for width in (320, 390, 1280)}
 
 
-def test_components_that_grow_keep_their_order(page: Browser) -> None:
+def test_components_that_grow_keep_their_order(page: Browser):
     """Of two robots that map, the one with more nodes was drawn above the other, and they changed places."""
     above = page.run("""
         return import('/static/map_model.js').then(({ MapModel }) => {
@@ -398,7 +394,7 @@ def test_components_that_grow_keep_their_order(page: Browser) -> None:
     assert above == ["r0.1.1", "r0.1.1 r1.1.1", "r0.1.1 r1.1.1", "r0.1.1 r1.1.1 r2.1.1"]
 
 
-def test_a_map_without_room_is_drawn_when_it_has_some(page: Browser) -> None:
+def test_a_map_without_room_is_drawn_when_it_has_some(page: Browser):
     """As on a phone, where the keyboard may leave none."""
     eventually(lambda: page.run("return mapweave.painter.bitmap !== null"))
     page.run("document.getElementById('map').style.display = 'none'")
@@ -411,7 +407,7 @@ def test_a_map_without_room_is_drawn_when_it_has_some(page: Browser) -> None:
     assert page.run("return document.getElementById('undrawn').hidden")
 
 
-def test_robots_of_a_server_that_is_gone_are_not_alive(browser: Browser, services: StubServices) -> None:
+def test_robots_of_a_server_that_is_gone_are_not_alive(browser: Browser, services: StubServices):
     """They stayed green, and their arrows on the map as where they are."""
     services.fleet = FleetStatus((RobotEntry("r0", True, 0.2),))
     person = Person(browser)
@@ -432,7 +428,7 @@ def test_robots_of_a_server_that_is_gone_are_not_alive(browser: Browser, service
     assert "last heardbefore the map server was gone" in person.text("selected")
 
 
-def test_no_choice_of_a_form_is_cut_off(page: Browser) -> None:
+def test_no_choice_of_a_form_is_cut_off(page: Browser):
     page.look(1280, 800)
     page.run("document.getElementById('tab-edit').click()")
     cut = """
@@ -454,14 +450,12 @@ return cut"""
     assert page.run(cut) == []
 
 
-def test_an_angle_is_never_minus_nothing(page: Browser) -> None:
+def test_an_angle_is_never_minus_nothing(page: Browser):
     degrees = "return import('/static/dom.js').then(({ degrees }) => [-0.001, 0.5, -3.2].map(degrees))"
     assert page.run(degrees) == ["0°", "29°", "-183°"]
 
 
-def test_lists_that_change_keep_what_is_pressed_or_has_the_focus(
-    page: Browser, services: StubServices
-) -> None:
+def test_lists_that_change_keep_what_is_pressed_or_has_the_focus(page: Browser, services: StubServices):
     """Each status made all of them again: a click that a status came into was lost, and so was the focus."""
     services.said = Annotations((Annotation("hall", Place(NodeId("r0", 1, 1)), False, "anna", 1),))
     services.fleet = FleetStatus((RobotEntry("r0", True), RobotEntry("r1", True)))
@@ -495,7 +489,7 @@ def test_lists_that_change_keep_what_is_pressed_or_has_the_focus(
     assert page.run(focused) == "hall"
 
 
-def test_numbers_in_events_are_no_names_of_maps(page: Browser, services: StubServices) -> None:
+def test_numbers_in_events_are_no_names_of_maps(page: Browser, services: StubServices):
     """The position of a goal was a button, and there was no map 1.9."""
     words = "r0: go to r0.1.5 (1.9,-0.25) via r0.1 and b-2.1.7, after 12.5 s"
     services.events = (MapEvent(10**18, MapEventKind.COMMANDED, words),)
@@ -504,7 +498,7 @@ def test_numbers_in_events_are_no_names_of_maps(page: Browser, services: StubSer
     assert page.run(buttons) == ["r0.1.5", "r0.1", "b-2.1.7"]
 
 
-def test_who_a_robot_waits_for_and_where_it_is_sent_are_said(page: Browser, services: StubServices) -> None:
+def test_who_a_robot_waits_for_and_where_it_is_sent_are_said(page: Browser, services: StubServices):
     """Of a robot that waits the list said for no one, and of a goal with a name the panel said no node."""
     doing = Status("waiting for another robot", "r1 drives there", 1, 8, Pose2(), False)
     order = MissionOrder("m1", "r0", MissionKind.GO, 1, "anna", NodeId("r0", 1, 5), "kitchen")
@@ -535,7 +529,7 @@ return [Math.min(...asked.map(view => view.scale)) / scale, now.scale / scale];
 SHARP = "const p = mapweave.painter; return !p.waiting && p.drawn?.scale === mapweave.viewport.scale"
 
 
-def test_while_the_map_is_zoomed_its_bitmap_is_scaled_and_sharp_at_rest(page: Browser) -> None:
+def test_while_the_map_is_zoomed_its_bitmap_is_scaled_and_sharp_at_rest(page: Browser):
     """A bitmap was drawn for each step: at 20 000 nodes the worker took a core that the page had need of."""
     eventually(lambda: page.run(SHARP))
     first, last = page.run(ZOOMED)

@@ -1,7 +1,5 @@
 """The page by touch, by keyboard and with a screen reader, in a real browser."""
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator
@@ -109,7 +107,7 @@ def along(start: Finger, end: Finger, steps: int = 8) -> list[Finger]:
     ]
 
 
-def test_one_finger_moves_the_map_and_not_the_page(phone: Browser) -> None:
+def test_one_finger_moves_the_map_and_not_the_page(phone: Browser):
     start, end = (150.0, 120.0), (230.0, 200.0)
     held, scale = plane(phone, start), phone.run("return mapweave.viewport.scale")
     page_before = phone.run(PAGE_MOVED)
@@ -121,7 +119,7 @@ def test_one_finger_moves_the_map_and_not_the_page(phone: Browser) -> None:
 
 
 @pytest.mark.parametrize("apart", [30.0, 160.0])
-def test_two_fingers_zoom_the_map_and_not_the_page(phone: Browser, apart: float) -> None:
+def test_two_fingers_zoom_the_map_and_not_the_page(phone: Browser, apart: float):
     """Two points of the map stay under two fingers, which moves and zooms it: closer, and farther."""
     first, other = (150.0, 150.0), (150.0 + 80.0, 150.0 + 60.0)  # 100 px
     # The same direction: a map does not turn.
@@ -137,7 +135,7 @@ def test_two_fingers_zoom_the_map_and_not_the_page(phone: Browser, apart: float)
     assert "Select a node" in Person(phone).text("selected")
 
 
-def test_a_finger_that_stays_after_two_moves_the_map_on(phone: Browser) -> None:
+def test_a_finger_that_stays_after_two_moves_the_map_on(phone: Browser):
     """Without a jump, and without choosing what it lifts from."""
     one, two, end = (120.0, 120.0), (200.0, 180.0), (160.0, 90.0)
     touch(phone, {0: one}, {0: one, 1: two}, {0: one, 1: (230.0, 200.0)}, {0: one})
@@ -147,7 +145,7 @@ def test_a_finger_that_stays_after_two_moves_the_map_on(phone: Browser) -> None:
     assert "Select a node" in Person(phone).text("selected")
 
 
-def test_a_tap_chooses_a_node(phone: Browser) -> None:
+def test_a_tap_chooses_a_node(phone: Browser):
     """So close that the nodes, which stand centimetres apart, are apart on the screen."""
     u, v = phone.run(
         "const m = mapweave.model, row = m.rowOf('r0.1.1'), v = mapweave.viewport;"
@@ -157,7 +155,7 @@ def test_a_tap_chooses_a_node(phone: Browser) -> None:
     eventually(lambda: "Node r0.1.1" in Person(phone).text("selected"))
 
 
-def test_the_focus_goes_where_a_choice_leads(page: Browser) -> None:
+def test_the_focus_goes_where_a_choice_leads(page: Browser):
     """It was lost with what was pressed: the next key began at the top of the page."""
     person = Person(page)
     page.run("document.querySelector('#robots button').focus()")
@@ -180,7 +178,7 @@ def test_the_focus_goes_where_a_choice_leads(page: Browser) -> None:
     eventually(lambda: page.run(FOCUSED) == "why")
 
 
-def test_what_is_selected_on_the_map_is_announced(page: Browser) -> None:
+def test_what_is_selected_on_the_map_is_announced(page: Browser):
     """By key, or by the search: the focus stays where it was, and a screen reader said nothing."""
     person = Person(page)
     page.run("mapweave.painter.canvas.focus()")
@@ -194,7 +192,7 @@ def test_what_is_selected_on_the_map_is_announced(page: Browser) -> None:
     eventually(lambda: person.text("announcement") == "Robot r1")
 
 
-def test_a_status_that_stays_is_not_read_again(page: Browser, services: StubServices) -> None:
+def test_a_status_that_stays_is_not_read_again(page: Browser, services: StubServices):
     """Firefox reports each text that is set: "live" was read out twice a second."""
     page.run("""
         window.written = [];
@@ -209,7 +207,7 @@ def test_a_status_that_stays_is_not_read_again(page: Browser, services: StubServ
     assert page.run("return written") == []
 
 
-def test_the_page_has_one_heading_and_its_landmarks_on_every_screen(page: Browser) -> None:
+def test_the_page_has_one_heading_and_its_landmarks_on_every_screen(page: Browser):
     """On a phone the title was not there for screen readers either."""
     for width, mobile in ((1280, False), (390, True)):
         page.look(width, 800, mobile=mobile)
@@ -225,7 +223,7 @@ def test_the_page_has_one_heading_and_its_landmarks_on_every_screen(page: Browse
         assert {"main", "search", "complementary", "tablist"} <= {node["role"]["value"] for node in nodes}
 
 
-def test_visible_words_are_part_of_the_names_that_are_spoken(page: Browser) -> None:
+def test_visible_words_are_part_of_the_names_that_are_spoken(page: Browser):
     """Who speaks to a computer says what is written on a button: "Fit" was "Show the whole map"."""
     differing = page.run("""
         return [...document.querySelectorAll("button[aria-label], a[aria-label]")].filter(one =>
@@ -236,7 +234,7 @@ def test_visible_words_are_part_of_the_names_that_are_spoken(page: Browser) -> N
     assert differing == []
 
 
-def test_all_words_have_contrast_as_they_are_shown(page: Browser) -> None:
+def test_all_words_have_contrast_as_they_are_shown(page: Browser):
     """By the computed styles. The hints in fields had 4.3 to 1 in the light theme, 3.9 in the dark one."""
     low = {}
     for panel in ("fleet", "selected", "why", "events", "edit", "photo"):
@@ -247,7 +245,7 @@ def test_all_words_have_contrast_as_they_are_shown(page: Browser) -> None:
     assert not any(low.values()), json.dumps(low)
 
 
-def test_the_open_tab_is_marked_in_colours_of_the_system(page: Browser) -> None:
+def test_the_open_tab_is_marked_in_colours_of_the_system(page: Browser):
     """Shadows and backgrounds are left out there: no tab looked open, and components had no colour."""
     page.devtools("Emulation.setEmulatedMedia", features=FORCED)
     widths = page.run(
@@ -267,7 +265,7 @@ def test_the_open_tab_is_marked_in_colours_of_the_system(page: Browser) -> None:
     assert opacities and set(opacities) == {"1"}
 
 
-def test_a_small_or_enlarged_page_scrolls_one_way(page: Browser) -> None:
+def test_a_small_or_enlarged_page_scrolls_one_way(page: Browser):
     """1280x1024 px at 400 %, and a small phone on its side: the panel was 34 px high."""
     page.run("document.querySelector('#robots button').click()")
     for width, height in ((320, 256), (667, 375)):

@@ -1,7 +1,5 @@
 """The page in a real browser whose server is away: behind a silent network, started again, or full."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from collections.abc import Iterator
@@ -85,7 +83,7 @@ def relayed(services: StubServices) -> Iterator[tuple[Web, Relay]]:
 
 def test_a_network_that_says_nothing_any_more_is_noticed(
     browser: Browser, services: StubServices, relayed: tuple[Web, Relay]
-) -> None:
+):
     """As after a phone has slept: the page held a connection on which nothing came, and said "live"."""
     served, relay = relayed
     services.fleet = FleetStatus((RobotEntry("r0", True, 0.2),))
@@ -111,7 +109,7 @@ def test_a_network_that_says_nothing_any_more_is_noticed(
     eventually(lambda: browser.run(NODES) == fewer())
 
 
-def test_a_server_that_starts_again_is_shown_as_it_is_now(browser: Browser, services: StubServices) -> None:
+def test_a_server_that_starts_again_is_shown_as_it_is_now(browser: Browser, services: StubServices):
     person, after = Person(browser), StubServices()
     after.map, after.fleet = less(two_maps()), FleetStatus((RobotEntry("r7", True, 0.1),))
     with Web(("127.0.0.1", 0), services) as served:
@@ -126,7 +124,7 @@ def test_a_server_that_starts_again_is_shown_as_it_is_now(browser: Browser, serv
         assert browser.run(NODES) == fewer()
 
 
-def test_one_viewer_too_many_is_given_the_reason(browser: Browser, services: StubServices) -> None:
+def test_one_viewer_too_many_is_given_the_reason(browser: Browser, services: StubServices):
     """The page said that there was no server."""
     person = Person(browser)
     with Web(("127.0.0.1", 0), services) as served, ExitStack() as stack:

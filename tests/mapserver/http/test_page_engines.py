@@ -1,7 +1,5 @@
 """The page in Firefox and WebKit: the map is drawn, a node is chosen on it, and a link is explained."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from pathlib import Path
@@ -43,9 +41,7 @@ return [a, b]"""
 
 @pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES)
-def test_the_page_works_in_other_browsers(
-    engine: Callable[[Path], AbstractContextManager[Page]], tmp_path: Path
-) -> None:
+def test_the_page_works_in_other_browsers(engine: Callable[[Path], AbstractContextManager[Page]], tmp_path):
     services = StubServices()
     services.fleet = FleetStatus((RobotEntry("r0", True),))
     with Web(("127.0.0.1", 0), services) as served, engine(tmp_path) as page:

@@ -1,7 +1,5 @@
 """The page in a real browser with robots that drive: server, simulator and two agents as processes."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from pathlib import Path
@@ -126,7 +124,7 @@ def fleet(tmp_path: Path, request: pytest.FixtureRequest) -> Iterator[Fleet]:
 @needs_simulator
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 @pytest.mark.timeout(600)
-def test_robots_that_drive_are_watched_and_sent(fleet: Fleet, browser: Browser) -> None:
+def test_robots_that_drive_are_watched_and_sent(fleet: Fleet, browser: Browser):
     """They map, and move on the page; one is sent to a node, and parks there; the server starts again."""
     person = Person(browser)
     person, goal = Person(browser), NodeId("r0", 1, 1)
@@ -189,7 +187,7 @@ def test_robots_that_drive_are_watched_and_sent(fleet: Fleet, browser: Browser) 
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("fleet", ["office"], indirect=True)
-def test_robots_that_were_sent_stand_once_the_last_page_is_closed(fleet: Fleet, browser: Browser) -> None:
+def test_robots_that_were_sent_stand_once_the_last_page_is_closed(fleet: Fleet, browser: Browser):
     """Of two pages the first may close, and the last one be loaded again; what no person has sent goes on.
 
     An office is not explored before the end.

@@ -1,7 +1,5 @@
 """Words of robots and of other people on the page in a real browser: shown as they are, and nothing else."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 
@@ -64,7 +62,7 @@ def person(browser: Browser, services: StubServices) -> Iterator[Person]:
 
 
 @pytest.mark.parametrize("kind", first_quick(list(HOSTILE), 2))
-def test_words_of_a_robot_are_text(person: Person, services: StubServices, kind: str) -> None:
+def test_words_of_a_robot_are_text(person: Person, services: StubServices, kind: str):
     words = HOSTILE[kind]
     page, many = person.page, (words * LONGEST)[:LONGEST]
     order = MissionOrder("m1", "r0", MissionKind.GO, 1, words[:60], FIRST, words[:60], because=words)
@@ -81,7 +79,7 @@ def test_words_of_a_robot_are_text(person: Person, services: StubServices, kind:
 
 
 @pytest.mark.parametrize("kind", first_quick(list(HOSTILE), 2))
-def test_names_and_reasons_of_other_people_are_text(browser: Browser, server: MapServer, kind: str) -> None:
+def test_names_and_reasons_of_other_people_are_text(browser: Browser, server: MapServer, kind: str):
     name = HOSTILE[kind][:64].strip()
     with Web(("127.0.0.1", 0), server) as served:
         page = (person := opened(browser, served.port)).page

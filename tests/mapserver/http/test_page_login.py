@@ -1,7 +1,5 @@
 """Logging in on the page in a real browser: a viewer looks, an operator commands, and the record says who."""
 
-from __future__ import annotations
-
 import base64
 import hashlib
 import os
@@ -42,7 +40,7 @@ fetch("constraints", { method: "POST", headers: { "Content-Type": "application/j
 
 
 @pytest.mark.slow
-def test_a_viewer_looks_and_an_operator_commands(house: House, tmp_path: Path) -> None:
+def test_a_viewer_looks_and_an_operator_commands(house: House, tmp_path):
     _, control = house.robot()
     folder = KeyFolder.create(tmp_path / "keys", "fleet", Profile.LAB, [], "s0")
     tokens = {}
@@ -106,7 +104,7 @@ def test_a_viewer_looks_and_an_operator_commands(house: House, tmp_path: Path) -
 
 
 @pytest.mark.slow
-def test_the_page_over_https(tmp_path: Path) -> None:
+def test_the_page_over_https(tmp_path):
     """Login, session and the live map, with the certificate of the fleet's authority."""
     folder = KeyFolder.create(tmp_path / "keys", "fleet", Profile.PRODUCTION, [], "s0")
     folder.add("vera", Role.VIEWER)

@@ -1,7 +1,5 @@
 """Names on the page in a real browser: typed for nodes, replaced, restored; floors and time windows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import pytest
@@ -45,7 +43,7 @@ def name_place(person: Person, name: str, nodes: str) -> None:
     eventually(lambda: f"{name} place" in person.page.run(PLACES))
 
 
-def test_a_name_that_is_not_known_leaves_nothing_to_apply(person: Person, server: MapServer) -> None:
+def test_a_name_that_is_not_known_leaves_nothing_to_apply(person: Person, server: MapServer):
     page = person.page
     person.fill("edit-nodes", str(LAST))
     assert "only checked" in person.edit("retire", "dark")
@@ -63,7 +61,7 @@ def test_a_name_that_is_not_known_leaves_nothing_to_apply(person: Person, server
     assert not server.constraints().made
 
 
-def test_places_and_positions_stand_for_nodes(person: Person, server: MapServer) -> None:
+def test_places_and_positions_stand_for_nodes(person: Person, server: MapServer):
     page = person.page
     name_place(person, "east", str(FIRST))
     name_place(person, "east wing", str(LAST))
@@ -97,7 +95,7 @@ def test_places_and_positions_stand_for_nodes(person: Person, server: MapServer)
     assert "Nothing is mapped within 2 m of 90,90" in person.text("announcement")
 
 
-def test_what_another_person_says_is_shown_at_once(browser: Browser, server: MapServer) -> None:
+def test_what_another_person_says_is_shown_at_once(browser: Browser, server: MapServer):
     """A closure of another operator was seen up to 10 s later; the page looks so rarely by itself."""
     source = "window.setInterval = () => 0"
     script = browser.devtools("Page.addScriptToEvaluateOnNewDocument", source=source)
@@ -122,9 +120,7 @@ return %s.every(([x, y]) => mapweave.viewport.holds(...m.inNode(row, x, y), 0));
 """
 
 
-def test_the_whole_map_is_shown_with_the_areas_that_people_have_named(
-    person: Person, server: MapServer
-) -> None:
+def test_the_whole_map_is_shown_with_the_areas_that_people_have_named(person: Person, server: MapServer):
     """Of a hall that is wider than its nodes the edge was beyond the window."""
     page = person.page
     page.look(320, 600)
@@ -142,7 +138,7 @@ def test_the_whole_map_is_shown_with_the_areas_that_people_have_named(
     assert page.run(HALL_IN_VIEW % (FIRST, wide))
 
 
-def test_a_place_that_was_replaced_is_restored(person: Person, server: MapServer) -> None:
+def test_a_place_that_was_replaced_is_restored(person: Person, server: MapServer):
     page = person.page
     name_place(person, "kitchen", str(FIRST))
     name_place(person, "kitchen", str(LAST))
@@ -161,7 +157,7 @@ def test_a_place_that_was_replaced_is_restored(person: Person, server: MapServer
     assert kitchen is not None and kitchen.body.anchor == LAST
 
 
-def test_floors_are_named_wherever_a_place_is_shown(person: Person, server: MapServer) -> None:
+def test_floors_are_named_wherever_a_place_is_shown(person: Person, server: MapServer):
     page = person.page
     person.fill("edit-nodes", str(LAST))
     person.edit("floor", "stairs", label="ground")
@@ -173,7 +169,7 @@ def test_floors_are_named_wherever_a_place_is_shown(person: Person, server: MapS
     eventually(lambda: [*person.facts().items()][1:2] == [("floor", "ground")])
 
 
-def test_a_time_window_is_retired(person: Person, server: MapServer) -> None:
+def test_a_time_window_is_retired(person: Person, server: MapServer):
     person.fill("edit-nodes", str(LAST))
     person.fill("edit-kind", "retire")
     shown = "return document.getElementById('edit-retire-begin').checkVisibility()"
@@ -202,7 +198,7 @@ document.dispatchEvent(new Event('mapchanged'));
 """
 
 
-def test_a_late_answer_does_not_replace_a_newer_one(person: Person, server: MapServer) -> None:
+def test_a_late_answer_does_not_replace_a_newer_one(person: Person, server: MapServer):
     """Lists of places and corrections went back to what they had been, until the next change."""
     page = person.page
     server.annotate(Annotation("kitchen", Place(FIRST), False, "bob", 1))

@@ -1,7 +1,5 @@
 """Robots on the page in a real browser: where they drive, their missions, and what is known of them."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from dataclasses import replace
@@ -75,7 +73,7 @@ def select(person: Person) -> None:
 
 def test_what_became_of_a_mission_replaces_what_was_said_when_it_was_given(
     person: Person, services: DrivenServices
-) -> None:
+):
     """Beside "done" the panel went on saying that it was running."""
     select(person)
     person.page.type("#goal", "hall\n")
@@ -92,9 +90,7 @@ def test_what_became_of_a_mission_replaces_what_was_said_when_it_was_given(
     assert person.page.run(SENT.format("className")) == "bad"
 
 
-def test_what_has_not_reached_its_robot_is_not_shown_as_good(
-    person: Person, services: DrivenServices
-) -> None:
+def test_what_has_not_reached_its_robot_is_not_shown_as_good(person: Person, services: DrivenServices):
     """Also a stop, after which it may be driving, was written in green."""
     services.answers_with = MissionState.SENT
     select(person)
@@ -103,7 +99,7 @@ def test_what_has_not_reached_its_robot_is_not_shown_as_good(
     assert person.page.run(SENT.format("className")) == "warn"
 
 
-def test_a_robot_at_the_beginning_of_its_map_is_at_zero(person: Person, services: DrivenServices) -> None:
+def test_a_robot_at_the_beginning_of_its_map_is_at_zero(person: Person, services: DrivenServices):
     """It was at -0.00 m there."""
     services.fleet = robot_at(-0.006, 0.004)
     select(person)
@@ -129,9 +125,7 @@ return [mapweave.painter.labels.texts.map(one => one.text).filter(text => text.s
 """Texts at goals, and whether the way to the first node and from there to the second is drawn."""
 
 
-def test_the_goal_of_a_mission_and_the_way_there_are_on_the_map(
-    person: Person, services: DrivenServices
-) -> None:
+def test_the_goal_of_a_mission_and_the_way_there_are_on_the_map(person: Person, services: DrivenServices):
     """One saw only the words: not where the robot was going."""
     services.map = merger_of(logs()).merged()
     first, second = sorted(node for node in services.map.poses if node.map == A)[-1:-3:-1]
@@ -171,7 +165,7 @@ return import("/static/goals.js").then(({ drawGoals }) => {
 """The lines that are drawn of a way, px, at some scales, px a metre."""
 
 
-def test_a_way_is_drawn_over_few_points_and_passes_all(person: Person) -> None:
+def test_a_way_is_drawn_over_few_points_and_passes_all(person: Person):
     """The ways of 40 robots took half of a frame: each joint of a wide line takes as long as a short line."""
     # With a corner and 3 cm of noise; beyond a portal, in another part of the map, it goes on.
     here = [[min(k, 40), max(k - 40, 0) + k % 2 * 0.03, 0] for k in range(64)]
@@ -189,7 +183,7 @@ def test_a_way_is_drawn_over_few_points_and_passes_all(person: Person) -> None:
         assert len(first) > 40 if scale == 200 else len(first) <= 5
 
 
-def test_the_selected_robot_stays_in_view(person: Person, services: DrivenServices) -> None:
+def test_the_selected_robot_stays_in_view(person: Person, services: DrivenServices):
     select(person)
     before = person.page.run(VIEW)
     services.fleet = robot_at(0.2, 0.0)
@@ -209,7 +203,7 @@ def test_the_selected_robot_stays_in_view(person: Person, services: DrivenServic
 
 def test_a_robot_that_does_not_know_where_it_is_stays_where_it_was_last(
     person: Person, services: DrivenServices
-) -> None:
+):
     """As at the beginning of each drive: it vanished from the map."""
     drawn = (
         "const { robots, labels } = mapweave.painter;"
@@ -226,16 +220,14 @@ def test_a_robot_that_does_not_know_where_it_is_stays_where_it_was_last(
     eventually(lambda: person.page.run(drawn) == [[[0.7, 0.25, True, True]], "r0: driving"])
 
 
-def test_a_click_on_a_robot_moves_no_map(person: Person) -> None:
+def test_a_click_on_a_robot_moves_no_map(person: Person):
     before = person.page.run(VIEW)
     person.mouse(person.at_robot())
     person.shows("Robot r0")
     assert person.page.run(VIEW) == before
 
 
-def test_the_whole_map_is_shown_with_the_robots_that_are_near(
-    person: Person, services: DrivenServices
-) -> None:
+def test_the_whole_map_is_shown_with_the_robots_that_are_near(person: Person, services: DrivenServices):
     """One that mapped at the edge was drawn at the edge of the window, or beyond it."""
     person.page.look(320, 600)
     left, bottom, right, top = person.page.run("return mapweave.model.bounds()")
@@ -256,9 +248,7 @@ def test_the_whole_map_is_shown_with_the_robots_that_are_near(
     assert person.page.run("return mapweave.viewport.scale") == scale
 
 
-def test_the_facts_of_a_robot_can_be_marked_while_statuses_come(
-    person: Person, services: DrivenServices
-) -> None:
+def test_the_facts_of_a_robot_can_be_marked_while_statuses_come(person: Person, services: DrivenServices):
     """They were made again twice a second, and what was marked was lost."""
     select(person)
     person.page.run(
@@ -271,7 +261,7 @@ def test_the_facts_of_a_robot_can_be_marked_while_statuses_come(
     assert person.page.run("return getSelection().toString()") == "driving: 3 nodes further"
 
 
-def test_battery_queue_lag_and_trouble_are_shown(person: Person, services: DrivenServices) -> None:
+def test_battery_queue_lag_and_trouble_are_shown(person: Person, services: DrivenServices):
     select(person)
     services.fleet = robot_at(
         0.0, 0.0, battery=0.62, unsent=17, last_error="the disk is full", error_age=200.0
@@ -285,7 +275,7 @@ def test_battery_queue_lag_and_trouble_are_shown(person: Person, services: Drive
     assert "battery" not in person.text("selected")
 
 
-def test_words_that_say_what_to_type_are_not_cut_off(person: Person) -> None:
+def test_words_that_say_what_to_type_are_not_cut_off(person: Person):
     select(person)
     cut = person.page.run("""
         const c = document.createElement('canvas').getContext('2d');
@@ -298,7 +288,7 @@ def test_words_that_say_what_to_type_are_not_cut_off(person: Person) -> None:
     assert cut == []
 
 
-def test_another_mouse_button_neither_selects_nor_moves(person: Person, services: DrivenServices) -> None:
+def test_another_mouse_button_neither_selects_nor_moves(person: Person, services: DrivenServices):
     """A right click selected; with the menu that it opens its end is not heard of, and the map hung on."""
     page, before = person.page, person.page.run(VIEW)
     x, y = person.at_robot()

@@ -1,12 +1,9 @@
 """20 000 nodes on the page in a real browser: bytes, time to the first picture, frames."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
@@ -95,7 +92,7 @@ class DrivenServices(StubServices):
 @pytest.mark.slow
 @pytest.mark.alone
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-def test_20_000_nodes_are_smooth(tmp_path: Path) -> None:
+def test_20_000_nodes_are_smooth(tmp_path):
     services = DrivenServices(large_map(robots=40, nodes=500, links=3000))
     with Web(("127.0.0.1", 0), services) as served, Browser(tmp_path) as page:
         page.look(1280, 800)
@@ -129,7 +126,7 @@ def test_20_000_nodes_are_smooth(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.skipif(there_is_none(), reason=f"needs {' and '.join(PROGRAMS)} on the PATH")
-def test_a_map_file_of_20_000_nodes_is_opened_and_shown(tmp_path: Path) -> None:
+def test_a_map_file_of_20_000_nodes_is_opened_and_shown(tmp_path):
     """By `mapweave open` as a process."""
     merged = large_map(robots=40, nodes=500, links=3000)
     edges = {edge.id: edge for edge in (link.edge() for link in merged.links)}

@@ -1,7 +1,5 @@
 """The page and its files: all asked for at once, of the right types, and the map is ready for the viewer."""
 
-from __future__ import annotations
-
 import re
 from urllib.error import HTTPError
 from urllib.request import urlopen
@@ -16,7 +14,7 @@ from tests.mapserver.stub_services import StubServices
 from tests.waiting import eventually
 
 
-def test_the_browser_asks_for_all_modules_at_once(served: Web) -> None:
+def test_the_browser_asks_for_all_modules_at_once(served: Web):
     root = f"http://127.0.0.1:{served.port}"
     page = urlopen(f"{root}/", timeout=10).read().decode()
     named = re.findall(r'<link rel="modulepreload" href="static/(\w+\.js)">', page)
@@ -38,7 +36,7 @@ def test_the_browser_asks_for_all_modules_at_once(served: Web) -> None:
             urlopen(f"{root}/static/{wrong}", timeout=10)
 
 
-def test_the_page_names_no_options_of_commands() -> None:
+def test_the_page_names_no_options_of_commands():
     """A person at the page has none: what may not be done there is said in words."""
     files = (path for path in STATIC.iterdir() if path.suffix in {".html", ".js"})
     said = {"map file": READ_ONLY, **{path.name: path.read_text(encoding="utf-8") for path in files}}
@@ -58,7 +56,7 @@ def luminance(colour: str) -> float:
 
 
 @pytest.mark.parametrize("theme", [0, 1], ids=["light", "dark"])
-def test_words_have_the_contrast_that_people_with_weak_eyes_need(theme: int) -> None:
+def test_words_have_the_contrast_that_people_with_weak_eyes_need(theme: int):
     """Level AA of WCAG 2.2, 4.5 to 1: "parted" in the timeline had 4.4, and a doubt about a plan 4.1."""
     css = (STATIC / "page.css").read_text(encoding="utf-8").partition("* {")[0]
     block = css.split("prefers-color-scheme: dark")[theme].replace("#fff;", "#ffffff;")
@@ -69,7 +67,7 @@ def test_words_have_the_contrast_that_people_with_weak_eyes_need(theme: int) -> 
             assert (light + 0.05) / (dark + 0.05) >= 4.5, f"{words} on {behind}"
 
 
-def test_the_map_is_ready_when_the_viewer_comes(served: Web, services: StubServices) -> None:
+def test_the_map_is_ready_when_the_viewer_comes(served: Web, services: StubServices):
     looked = []
     real = services.merged
     services.merged = lambda: (looked.append(1), real())[1]  # type: ignore[method-assign]

@@ -107,7 +107,7 @@ def show(page: Browser, node: NodeId) -> None:
     Person(page).shows(f"Node {node}")
 
 
-def test_a_node_is_shown_with_its_view(fleet: Fleet, page: Browser) -> None:
+def test_a_node_is_shown_with_its_view(fleet: Fleet, page: Browser):
     node = fleet.node("r0")
     show(page, node)
     eventually(lambda: page.run(SHOWN.format("#selected")) == 1)
@@ -122,7 +122,7 @@ def test_a_node_is_shown_with_its_view(fleet: Fleet, page: Browser) -> None:
     assert page.run("return document.querySelectorAll('#selected svg image ~ circle').length") == landmarks
 
 
-def test_a_node_without_a_view_is_shown_as_before(fleet: Fleet, page: Browser) -> None:
+def test_a_node_without_a_view_is_shown_as_before(fleet: Fleet, page: Browser):
     """Of a robot that keeps none nothing is asked."""
     page.errors()
     node = fleet.node("r2")
@@ -142,7 +142,7 @@ def ask_why(page: Browser, a: NodeId, b: NodeId) -> None:
     )
 
 
-def test_a_link_is_shown_over_both_views(fleet: Fleet, page: Browser) -> None:
+def test_a_link_is_shown_over_both_views(fleet: Fleet, page: Browser):
     a, b = fleet.node("r0"), fleet.node("r1")
     ask_why(page, a, b)
     eventually(lambda: page.run(SHOWN.format("#result")) == 2)
@@ -160,7 +160,7 @@ def test_a_link_is_shown_over_both_views(fleet: Fleet, page: Browser) -> None:
     assert view[0] > 0.8 * (panel[0] - 40) and name[1] > 9
 
 
-def test_a_link_says_which_view_is_missing_and_why(fleet: Fleet, page: Browser) -> None:
+def test_a_link_says_which_view_is_missing_and_why(fleet: Fleet, page: Browser):
     a, b = fleet.node("r0"), fleet.node("r2")
     ask_why(page, a, b)
     eventually(lambda: page.run(SHOWN.format("#result")) == 1)
@@ -169,7 +169,7 @@ def test_a_link_says_which_view_is_missing_and_why(fleet: Fleet, page: Browser) 
     assert f"No view of {b}: r2 is away, or keeps no views" in words and f"No view of {a}" not in words
 
 
-def test_a_view_that_is_lost_is_left_out(fleet: Fleet, page: Browser) -> None:
+def test_a_view_that_is_lost_is_left_out(fleet: Fleet, page: Browser):
     """The robot keeps views, but the one of this node is gone from its disk."""
     node = max(fleet.agents["r1"].pipeline.map.nodes)
     (fleet.folder / "r1.views" / f"{node}.jpg").unlink()
@@ -218,7 +218,7 @@ def photo(page: Browser, tmp_path: Path) -> Callable[[np.ndarray], Path]:
 @pytest.mark.parametrize("give", [choose, drop])
 def test_a_photo_is_found_where_it_was_taken(
     page: Browser, photo: Callable[[np.ndarray], Path], give: Callable[[Browser, Path], None]
-) -> None:
+):
     """All maps begin where the first robot was, so that the truth is in the frame of the merged map."""
     taken = Pose2(0.3, 0.2, 0.1)
     give(page, photo(PhotoWalls().render(taken)))
@@ -256,7 +256,7 @@ def test_a_photo_of_a_phone_is_found_upright(
     photo: Callable[[np.ndarray], Path],
     give: Callable[[Browser, Path], None],
     megapixels: float,
-) -> None:
+):
     """A small one is sent as it is, and a large one made smaller by the page."""
     taken = Pose2(0.3, 0.2, 0.1)
     image = PhotoWalls().render(taken)
@@ -273,7 +273,7 @@ def test_a_photo_of_a_phone_is_found_upright(
     assert width > height, "shown as it was held"
 
 
-def test_a_photo_that_no_browser_here_reads_is_refused_in_one_line(page: Browser, tmp_path: Path) -> None:
+def test_a_photo_that_no_browser_here_reads_is_refused_in_one_line(page: Browser, tmp_path):
     """Phones of one maker write HEIC, which Chromium does not read."""
     file = tmp_path / "IMG_0001.heic"
     file.write_bytes(struct.pack(">I", 24) + b"ftypheic" + bytes(4) + b"mif1heic" + bytes(5000))
@@ -294,7 +294,7 @@ def test_a_photo_that_shows_too_little_says_where_to_turn(
     give: Callable[[Browser, Path], None],
     heading: float,
     side: str,
-) -> None:
+):
     """Turned so far that one edge of the image shows what the robots have mapped."""
     give(page, photo(PhotoWalls().render(Pose2(0.3, 0.0, heading))))
     eventually(lambda: page.run(ANSWER.format("dataset.certainty")) == "unknown")
@@ -307,7 +307,7 @@ def test_a_photo_that_shows_too_little_says_where_to_turn(
     assert page.run("return mapweave.page.photo") == []
 
 
-def test_a_photo_of_another_place_is_not_known(page: Browser, photo: Callable[[np.ndarray], Path]) -> None:
+def test_a_photo_of_another_place_is_not_known(page: Browser, photo: Callable[[np.ndarray], Path]):
     cat = cv2.cvtColor(skimage.data.chelsea(), cv2.COLOR_RGB2GRAY)
     drop(page, photo(cv2.resize(cat, (CAMERA.width, CAMERA.height))))
     eventually(lambda: page.run(ANSWER.format("dataset.certainty")) == "unknown")

@@ -1,7 +1,5 @@
 """HTTP with a real client: answers, refusals as one JSON object, and nothing that brings the server down."""
 
-from __future__ import annotations
-
 import json
 import math
 import re
@@ -26,7 +24,7 @@ from tests.mapserver.http.client import ask, post
 from tests.mapserver.stub_services import ANSWER, StubServices, picture, two_maps
 
 
-def test_an_image_in_and_json_out(served: Web, services: StubServices) -> None:
+def test_an_image_in_and_json_out(served: Web, services: StubServices):
     for kind in (".png", ".jpg"):
         status, answer = post(served, body=picture(kind=kind))
         assert status == 200
@@ -41,7 +39,7 @@ def test_an_image_in_and_json_out(served: Web, services: StubServices) -> None:
     assert all(len(view) > 20 for view in services.views)
 
 
-def test_the_view_of_a_node_is_an_image_and_nothing_else(served: Web, services: StubServices) -> None:
+def test_the_view_of_a_node_is_an_image_and_nothing_else(served: Web, services: StubServices):
     node = next(iter(two_maps().maps[MapId("r0", 1)].nodes))
     status, headers, content = ask(served, "GET", f"/nodes/{node}/view")
     assert status == 404 and json.loads(content) == {"error": "r0 is away, or keeps no views"}
@@ -54,9 +52,7 @@ def test_the_view_of_a_node_is_an_image_and_nothing_else(served: Web, services: 
     assert ask(served, "GET", "/nodes/r0/view")[0] == 400
 
 
-def test_a_node_is_asked_for_by_the_name_of_a_place_and_by_a_position(
-    served: Web, services: StubServices
-) -> None:
+def test_a_node_is_asked_for_by_the_name_of_a_place_and_by_a_position(served: Web, services: StubServices):
     merged = two_maps()
     node = next(node for node in merged.poses if node not in merged.superseded)
     services.said = Annotations((Annotation("the kitchen", Place(node), False, "anna", 1),))
@@ -70,7 +66,7 @@ def test_a_node_is_asked_for_by_the_name_of_a_place_and_by_a_position(
     assert status == 400 and "'nowhere' is no place of this map" in json.loads(content)["error"]
 
 
-def test_the_camera_as_it_is_given(served: Web, services: StubServices) -> None:
+def test_the_camera_as_it_is_given(served: Web, services: StubServices):
     assert post(served, "?hfov=90&height_m=0.3&forward_m=0.1")[0] == 200
     camera = services.views[-1].camera
     assert (camera.width, camera.height) == (160, 120)
@@ -88,7 +84,7 @@ def test_the_camera_as_it_is_given(served: Web, services: StubServices) -> None:
     assert services.views[-1].camera.fx == pytest.approx(camera.fx)
 
 
-def test_a_large_image_is_made_smaller_with_its_camera(served: Web, services: StubServices) -> None:
+def test_a_large_image_is_made_smaller_with_its_camera(served: Web, services: StubServices):
     assert (
         post(served, "?fx=1000&cx=800&cy=600&width=2048&height=1536", picture(2048, 1536, ".jpg"))[0] == 200
     )
@@ -112,7 +108,7 @@ def form(*parts: tuple[str, bytes], boundary: str = "frontier") -> tuple[bytes, 
     }
 
 
-def test_a_form_with_a_camera_file(served: Web, services: StubServices) -> None:
+def test_a_form_with_a_camera_file(served: Web, services: StubServices):
     toml = b"width = 160\nheight = 120\nfx = 99.0\nfy = 98.0\ncx = 80\ncy = 60\nheight_m = 0.3\n"
     as_json = json.dumps({"fx": 99.0, "fy": 98.0, "distortion": [0.1, 0, 0, 0, 0]}).encode()
     for camera in (toml, as_json):
@@ -144,7 +140,7 @@ def test_a_form_with_a_camera_file(served: Web, services: StubServices) -> None:
         ("?height_m=1e300", "height_m must be a number"),
     ],
 )
-def test_cameras_that_cannot_be(served: Web, query: str, words: str) -> None:
+def test_cameras_that_cannot_be(served: Web, query: str, words: str):
     status, answer = post(served, query)
     assert status == 400
     assert words in answer["error"]
@@ -171,7 +167,7 @@ def huge_png() -> bytes:
         (picture(8, 8), "camera: image size 8x8 is out of range"),
     ],
 )
-def test_images_that_are_none(served: Web, body: bytes, words: str) -> None:
+def test_images_that_are_none(served: Web, body: bytes, words: str):
     status, answer = post(served, body=body)
     assert status == 400
     assert words in answer["error"]
@@ -200,7 +196,7 @@ def test_images_that_are_none(served: Web, body: bytes, words: str) -> None:
     ],
     ids=["no-boundary", "no-parts", "no-image", "cut", "many", "no-name", "no-toml", "deep-json", "digits"],
 )
-def test_forms_that_are_none(served: Web, body: bytes, content_type: str, words: str) -> None:
+def test_forms_that_are_none(served: Web, body: bytes, content_type: str, words: str):
     status, answer = post(served, body=body or b"x", **{"Content-Type": content_type})
     assert status == 400
     assert words in answer["error"]
@@ -217,7 +213,7 @@ def test_forms_that_are_none(served: Web, body: bytes, content_type: str, words:
     ],
     ids=["dots", "brackets", "open-lists", "deep-json", "many-lines"],
 )
-def test_a_camera_costs_next_to_nothing(served: Web, camera: bytes) -> None:
+def test_a_camera_costs_next_to_nothing(served: Web, camera: bytes):
     body, headers = form(("image", picture()), ("camera", camera))
     tracemalloc.start()
     begin = time.monotonic()
@@ -231,7 +227,7 @@ def test_a_camera_costs_next_to_nothing(served: Web, camera: bytes) -> None:
 @pytest.mark.parametrize(
     "camera", [b"a" + b".a" * 2_000 + b" = 1", b"fx = {a = 1}", b"[camera]\nfx = 1", b"fx\n"]
 )
-def test_a_camera_is_flat(served: Web, camera: bytes) -> None:
+def test_a_camera_is_flat(served: Web, camera: bytes):
     body, headers = form(("image", picture()), ("camera", camera))
     status, answer = post(served, body=body, **headers)
     assert status == 400 and (
@@ -239,14 +235,14 @@ def test_a_camera_is_flat(served: Web, camera: bytes) -> None:
     )
 
 
-def test_a_camera_with_remarks(served: Web, services: StubServices) -> None:
+def test_a_camera_with_remarks(served: Web, services: StubServices):
     toml = b"# phone\r\nfx = 99.0  # px\n\nfy = 1_00\ndistortion = [0.1, -2e-2, 0, 0, 0,]\n"
     body, headers = form(("image", picture()), ("camera", toml))
     assert post(served, body=body, **headers)[0] == 200
     assert (services.views[-1].camera.fx, services.views[-1].camera.fy) == (99.0, 100.0)
 
 
-def test_a_head_of_a_part_costs_next_to_nothing(served: Web) -> None:
+def test_a_head_of_a_part_costs_next_to_nothing(served: Web):
     head = b'--b\r\nContent-Disposition: form-data; name="image"' + b"; a*0=b" * 100_000
     begin = time.monotonic()
     status, answer = post(
@@ -273,7 +269,7 @@ def test_a_head_of_a_part_costs_next_to_nothing(served: Web) -> None:
 )
 def test_pages_of_other_sites_are_refused(
     served: Web, services: StubServices, headers: dict[str, str], words: str
-) -> None:
+):
     status, answer = post(served, **headers)
     assert status == 403 and words in answer["error"]
     assert not services.views
@@ -285,7 +281,7 @@ def test_pages_of_other_sites_are_refused(
 @pytest.mark.parametrize(
     ("site", "part"), [("cross-site", "document"), ("same-origin", "script"), ("none", "document")]
 )
-def test_links_lead_here_and_own_pages_show_own_parts(served: Web, site: str, part: str) -> None:
+def test_links_lead_here_and_own_pages_show_own_parts(served: Web, site: str, part: str):
     headers = {"Sec-Fetch-Site": site, "Sec-Fetch-Dest": part}
     assert ask(served, "GET", "/", headers=headers)[0] == 200
 
@@ -293,7 +289,7 @@ def test_links_lead_here_and_own_pages_show_own_parts(served: Web, site: str, pa
 @pytest.mark.parametrize(
     "host", ["localhost", "LOCALHOST:8080", "127.0.0.1", "[::1]:8080", socket.gethostname()]
 )
-def test_own_pages_ask_by_any_name_of_this_machine(served: Web, host: str) -> None:
+def test_own_pages_ask_by_any_name_of_this_machine(served: Web, host: str):
     for headers in (
         {"Host": host},
         {"Host": host, "Origin": f"http://{host}"},
@@ -302,22 +298,20 @@ def test_own_pages_ask_by_any_name_of_this_machine(served: Web, host: str) -> No
         assert post(served, **headers)[0] == 200
 
 
-def test_a_busy_server_gives_a_retry_time(served: Web, services: StubServices) -> None:
+def test_a_busy_server_gives_a_retry_time(served: Web, services: StubServices):
     services.refusal = Busy(1.26)
     status, headers, content = ask(served, "POST", "/relocalize", picture())
     assert (status, headers["Retry-After"]) == (503, "2")
     assert json.loads(content) == {"error": "busy, retry after 1.3 s", "retry_after": 1.26}
 
 
-def test_a_defect_is_answered_and_logged(
-    served: Web, services: StubServices, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_defect_is_answered_and_logged(served: Web, services: StubServices, caplog):
     services.refusal = ZeroDivisionError("a defect")
     assert post(served) == (500, {"error": "the server failed: a defect"})
     assert "ZeroDivisionError" in caplog.text
 
 
-def test_the_page_and_the_status(served: Web) -> None:
+def test_the_page_and_the_status(served: Web):
     status, headers, content = ask(served, "GET", "/")
     assert (status, headers["Content-Type"]) == (200, "text/html; charset=utf-8")
     assert b'type="file"' in content
@@ -350,7 +344,7 @@ def test_the_page_and_the_status(served: Web) -> None:
         ("POST", "/static/page.js", 405),
     ],
 )
-def test_missing_pages(served: Web, method: str, path: str, status: int) -> None:
+def test_missing_pages(served: Web, method: str, path: str, status: int):
     got, headers, content = ask(served, method, path, b"x" if method == "POST" else None)
     assert (got, headers["Content-Type"]) == (status, "application/json")
     assert json.loads(content)["error"]
@@ -360,7 +354,7 @@ def test_missing_pages(served: Web, method: str, path: str, status: int) -> None
 @pytest.mark.parametrize(("size", "status"), [(16_384, 404), (16_385, 400), (70_000, 400)])
 def test_a_long_head_is_refused_however_it_arrives(
     served: Web, size: int, status: int, pieces: tuple[int, ...]
-) -> None:
+):
     frame = "GET /{} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
     request = frame.format("x" * (size - len(frame) + 2)).encode()
     assert len(request) == size
@@ -374,7 +368,7 @@ def test_a_long_head_is_refused_however_it_arrives(
     assert answer.startswith(f"HTTP/1.1 {status} ".encode())
 
 
-def test_pages_load_nothing_but_files_of_this_server(served: Web) -> None:
+def test_pages_load_nothing_but_files_of_this_server(served: Web):
     for path in ("/", "/why", "/static/page.js", "/static/page.css", "/status", "/nothing"):
         _, headers, content = ask(served, "GET", path)
         assert headers["Content-Security-Policy"].startswith("default-src 'none'; script-src 'self'; ")
@@ -383,9 +377,7 @@ def test_pages_load_nothing_but_files_of_this_server(served: Web) -> None:
         assert not re.search(rb"<script(?! src=)|<style| on[a-z]+=|javascript:", content)
 
 
-def test_a_large_map_may_take_longer_than_other_answers(
-    services: StubServices, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_large_map_may_take_longer_than_other_answers(services: StubServices, monkeypatch):
     """Packing 20 000 nodes takes minutes: over HTTP it was given up after 10 s, over Zenoh after 120 s."""
     packed: Future[bytes] = Future()
     monkeypatch.setattr(services, "map_file", lambda: packed, raising=False)

@@ -1,7 +1,5 @@
 """What a viewer sends: it has nothing to say, and cannot make it long."""
 
-from __future__ import annotations
-
 import asyncio
 import tracemalloc
 import zlib
@@ -86,14 +84,14 @@ def sent_after(frames: bytes) -> tuple[bytes, int, list[Any]]:
     return (*asyncio.run(converse()), came)
 
 
-def test_a_compressed_message_takes_no_memory() -> None:
+def test_a_compressed_message_takes_no_memory():
     """Before, 256 kB took 256 MB and more before they were found too long."""
     sent, peak, came = sent_after(compressed_zeros(CHUNK))
     assert peak < 8_000_000 and not came
     assert b"exceeds the maximum size" in sent
 
 
-def test_a_short_message_comes_as_it_was() -> None:
+def test_a_short_message_comes_as_it_was():
     """Also one in two frames, of which the server reads more than one piece."""
     text = bytes([1]) + bytes([0x80 | 126]) + (600).to_bytes(2, "big") + bytes(4) + b"a" * 600
     text += bytes([0x80]) + bytes([0x80 | 126]) + (400).to_bytes(2, "big") + bytes(4) + b"b" * 400
@@ -102,7 +100,7 @@ def test_a_short_message_comes_as_it_was() -> None:
 
 
 @pytest.mark.parametrize("header", [b"Sec-WebSocket-Extensions: \x84", b"Sec-WebSocket-Protocol: \xe9"])
-def test_a_head_that_cannot_be_read_is_refused_and_leaves_nothing(served: Web, header: bytes) -> None:
+def test_a_head_that_cannot_be_read_is_refused_and_leaves_nothing(served: Web, header: bytes):
     """Before, each was counted as a connection for ever: a thousand of them, and no page came any more."""
     head = HEAD.removesuffix(b"\r\n") + header + b"\r\n\r\n"
     eventually(lambda: served.connections == 0)

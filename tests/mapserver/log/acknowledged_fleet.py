@@ -1,7 +1,5 @@
 """Robots with journals and a server with a store, and what of them is on the disk."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Iterator
 from contextlib import closing, contextmanager

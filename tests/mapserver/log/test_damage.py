@@ -1,7 +1,5 @@
 """Flipped bits in the store: the server starts, says what is lost, and robots make the store whole again."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 from collections.abc import Iterable, Iterator
@@ -76,9 +74,7 @@ def all_is_whole(store: Store) -> bool:
 
 
 @pytest.mark.parametrize("seed", first_quick(range(14), 1, 6))
-def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
-    whole: Path, fleet: Fleet, seed: int, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(whole: Path, fleet: Fleet, seed: int, caplog):
     logs, maps = truth(whole)
     rng = np.random.default_rng(seed)
     rows = bodies_in(fleet.path)
@@ -124,7 +120,7 @@ def test_a_flipped_bit_in_a_change_is_healed_by_its_robot(
 @pytest.mark.parametrize("seed", first_quick(range(20), 2, 6))
 def test_what_a_lost_change_retired_stays_retired(
     whole: Path, fleet: Fleet, seed: int, position_lost: bool, compacted: bool
-) -> None:
+):
     """Robots have dropped such changes together with what they undid: no disk has them any more."""
     _, maps = truth(whole)
     if compacted:
@@ -153,8 +149,8 @@ def test_what_a_lost_change_retired_stays_retired(
 
 @pytest.mark.parametrize("seed", first_quick(range(60), 2, 20))
 def test_a_flipped_bit_anywhere_is_repaired_or_reported_in_one_line(
-    whole: Path, fleet: Fleet, seed: int, caplog: pytest.LogCaptureFixture
-) -> None:
+    whole: Path, fleet: Fleet, seed: int, caplog
+):
     logs, maps = truth(whole)
     rng = np.random.default_rng(1000 + seed)
     # Half of them where a page is described rather than filled: there a bit does most.
@@ -187,7 +183,7 @@ def without_journal(path: Path) -> bytes:
     return path.read_bytes()
 
 
-def test_a_damaged_schema_that_is_no_text_is_reported_in_one_line(whole: Path, fleet: Fleet) -> None:
+def test_a_damaged_schema_that_is_no_text_is_reported_in_one_line(whole: Path, fleet: Fleet):
     """SQLite quotes it in its error, which then is no text; found by fuzzing."""
     data = without_journal(fleet.path)
     assert b"tableloglog" in data and b"CREATE TABLE log " in data
@@ -200,7 +196,7 @@ def test_a_damaged_schema_that_is_no_text_is_reported_in_one_line(whole: Path, f
     assert "\n" not in str(caught.value)
 
 
-def test_a_damaged_schema_with_a_line_break_is_reported_in_one_line(fleet: Fleet) -> None:
+def test_a_damaged_schema_with_a_line_break_is_reported_in_one_line(fleet: Fleet):
     """SQLite quotes it as it is; found by fuzzing a journal."""
     path = fleet.folder / "r0"
     data = without_journal(path)
@@ -211,7 +207,7 @@ def test_a_damaged_schema_with_a_line_break_is_reported_in_one_line(fleet: Fleet
     assert "\n" not in str(caught.value)
 
 
-def test_the_state_of_a_log_may_be_lost(whole: Path, fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+def test_the_state_of_a_log_may_be_lost(whole: Path, fleet: Fleet, caplog):
     """Its robot may not be there: its map is served all the same, and its log goes on when it comes."""
     logs, maps = truth(whole)
     with fleet.disk() as disk:
@@ -225,7 +221,7 @@ def test_the_state_of_a_log_may_be_lost(whole: Path, fleet: Fleet, caplog: pytes
     assert fleet.served() == maps
 
 
-def test_damage_is_remembered_until_the_robot_comes(fleet: Fleet) -> None:
+def test_damage_is_remembered_until_the_robot_comes(fleet: Fleet):
     with fleet.disk() as disk:
         disk.execute("UPDATE change SET crc = crc + 1 WHERE agent = 'r1' AND sequence IN (3, 4, 9)")
     for _ in range(2):
@@ -236,7 +232,7 @@ def test_damage_is_remembered_until_the_robot_comes(fleet: Fleet) -> None:
 
 
 @pytest.mark.parametrize("bit", first_quick(range(8), 3))
-def test_a_damaged_key_misleads_no_reader(whole: Path, fleet: Fleet, bit: int) -> None:
+def test_a_damaged_key_misleads_no_reader(whole: Path, fleet: Fleet, bit: int):
     """A row that claims to be of another map: what it was stands between its neighbours."""
     logs, maps = truth(whole)
     one = MapId("r1", 1)
@@ -253,9 +249,7 @@ def test_a_damaged_key_misleads_no_reader(whole: Path, fleet: Fleet, bit: int) -
     assert fleet.served() == maps
 
 
-def test_a_change_that_this_program_cannot_read_costs_only_itself(
-    fleet: Fleet, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_change_that_this_program_cannot_read_costs_only_itself(fleet: Fleet, caplog):
     which = "WHERE agent = 'r1' AND sequence = 6"
     with fleet.disk() as disk:
         row = disk.execute(f"SELECT * FROM change {which}").fetchone()
@@ -267,7 +261,7 @@ def test_a_change_that_this_program_cannot_read_costs_only_itself(
     fleet.stop_server()
 
 
-def test_a_damaged_constraint_costs_only_itself(fleet: Fleet, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_damaged_constraint_costs_only_itself(fleet: Fleet, caplog):
     with fleet.disk() as disk:
         disk.execute("UPDATE manual_constraint SET body = body || x'00' WHERE number = 2")
     with closing(SqliteStore(fleet.path)) as store:
@@ -276,7 +270,7 @@ def test_a_damaged_constraint_costs_only_itself(fleet: Fleet, caplog: pytest.Log
     assert "1 damaged rows of table manual_constraint" in caplog.text
 
 
-def test_the_number_of_constraints_is_limited(fleet: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_number_of_constraints_is_limited(fleet: Fleet, monkeypatch):
     monkeypatch.setattr("mapweave.mapserver.log.store.MAX_CONSTRAINTS", 7)
     store = SqliteStore(fleet.path)
     book = ConstraintRecord(store)
@@ -292,9 +286,7 @@ def test_the_number_of_constraints_is_limited(fleet: Fleet, monkeypatch: pytest.
     store.close()
 
 
-def test_a_store_with_broken_pages_is_extracted(
-    whole: Path, fleet: Fleet, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_store_with_broken_pages_is_extracted(whole: Path, fleet: Fleet, capfd):
     """One line says what is wrong and what to do; what the line says works."""
     _, maps = truth(whole)
     size = fleet.path.stat().st_size
@@ -329,8 +321,8 @@ def extracted(fleet: Fleet, maps: Iterable[MapId]) -> dict[MapId, list[bytes]]:
 
 @pytest.mark.parametrize("table", ["refused", "result", "damaged"])
 def test_a_store_whose_description_of_a_table_is_damaged_is_extracted(
-    whole: Path, fleet: Fleet, capfd: pytest.CaptureFixture[str], table: str
-) -> None:
+    whole: Path, fleet: Fleet, capfd, table: str
+):
     """SQLite reads nothing of it by itself, also no other table."""
     _, maps = truth(whole)
     data = fleet.path.read_bytes()
@@ -341,9 +333,7 @@ def test_a_store_whose_description_of_a_table_is_damaged_is_extracted(
     assert extracted(fleet, maps) == maps
 
 
-def test_a_whole_store_is_extracted_whole(
-    whole: Path, fleet: Fleet, capfd: pytest.CaptureFixture[str]
-) -> None:
+def test_a_whole_store_is_extracted_whole(whole: Path, fleet: Fleet, capfd):
     _, maps = truth(whole)
     before = fleet.path.read_bytes()
     assert main(["map", "extract", str(fleet.path), "-o", str(fleet.folder / "out")]) == 0

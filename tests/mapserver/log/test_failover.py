@@ -1,7 +1,5 @@
 """A primary with a synchronous standby is lost: the standby has all that was acknowledged, and goes on."""
 
-from __future__ import annotations
-
 import tempfile
 import threading
 from collections.abc import Callable
@@ -28,8 +26,8 @@ from tests.waiting import eventually
     [(PostgresServer.kill, "Connection refused"), (PostgresServer.freeze, "connection timeout expired")],
 )
 def test_nothing_acknowledged_is_lost_with_the_primary(
-    loss: Callable[[PostgresServer], None], words: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    loss: Callable[[PostgresServer], None], words: str, monkeypatch
+):
     monkeypatch.setattr(postgres_watchdog, "LONG", 0.5)
     servers = started()
     primary = next(servers)

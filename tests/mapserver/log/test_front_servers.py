@@ -1,7 +1,5 @@
 """Several servers on one store: all have everything, exactly once and in order; one leads."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
@@ -85,8 +83,8 @@ def logs_of(journals: list[Journal]) -> dict[MapId, Log]:
     "poll", [1000.0, pytest.param(0.1, marks=pytest.mark.slow)], ids=["notified", "polled"]
 )
 def test_all_servers_pass_on_everything_once_and_in_order(
-    address: str, journals: list[Journal], monkeypatch: pytest.MonkeyPatch, poll: float
-) -> None:
+    address: str, journals: list[Journal], monkeypatch, poll: float
+):
     """Two hear the robots over bad links; a third hears nothing, and a fourth begins late."""
     monkeypatch.setattr(postgres_follower, "POLL", poll)
     if poll < 1.0:
@@ -118,9 +116,7 @@ def test_all_servers_pass_on_everything_once_and_in_order(
         server.close()
 
 
-def test_what_one_server_acknowledges_counts_for_all_with_its_store(
-    address: str, journals: list[Journal]
-) -> None:
+def test_what_one_server_acknowledges_counts_for_all_with_its_store(address: str, journals: list[Journal]):
     hub = MemoryHub()
     servers = [FrontServer(hub, address, name) for name in ("s0", "s1")]
     journal = journals[0]
@@ -138,8 +134,8 @@ def test_what_one_server_acknowledges_counts_for_all_with_its_store(
 
 
 def test_what_a_promoted_standby_lacks_comes_again_from_robots_that_are_idle(
-    address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    address: str, tmp_path, monkeypatch
+):
     """It was behind when it was promoted; the server has run on."""
     monkeypatch.setattr(postgres_follower, "POLL", 0.1)
     hub = MemoryHub()
@@ -176,7 +172,7 @@ def test_what_a_promoted_standby_lacks_comes_again_from_robots_that_are_idle(
         assert store.watermark(MAP) == 9 and store.unverified(MAP) is None
 
 
-def test_one_server_leads_and_another_when_it_is_gone(address: str, postgres: PostgresServer) -> None:
+def test_one_server_leads_and_another_when_it_is_gone(address: str, postgres: PostgresServer):
     stores = [PostgresStore(address, name) for name in ("s0", "s1")]
     assert not any(store.leads for store in stores)
     for store in stores:
@@ -199,9 +195,7 @@ def test_one_server_leads_and_another_when_it_is_gone(address: str, postgres: Po
 
 
 @pytest.mark.slow
-def test_decisions_on_one_server_reach_the_other(
-    address: str, journals: list[Journal], tmp_path: Path
-) -> None:
+def test_decisions_on_one_server_reach_the_other(address: str, journals: list[Journal], tmp_path):
     hub = MemoryHub()
     servers = [
         MapServer(MemoryBus(hub), KEYS, address, name, cache=tmp_path / name).__enter__()
@@ -232,7 +226,7 @@ def test_decisions_on_one_server_reach_the_other(
 @pytest.mark.slow
 def test_robots_keep_what_they_have_while_postgresql_is_away(
     journals: list[Journal], hub: MemoryHub, own_postgres: PostgresServer
-) -> None:
+):
     """Also a robot that the server has not known before."""
     server = FrontServer(hub, own_postgres.database(), "s0")
     rng = np.random.default_rng(3)
@@ -261,8 +255,8 @@ def test_robots_keep_what_they_have_while_postgresql_is_away(
 
 
 def test_a_commit_that_waits_for_a_standby_is_reported(
-    journals: list[Journal], postgres: PostgresServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    journals: list[Journal], postgres: PostgresServer, monkeypatch
+):
     """It neither fails nor ends, so that no error tells of it."""
     monkeypatch.setattr(group_commit, "LONG", 0.5)
     hub = MemoryHub()
@@ -282,9 +276,7 @@ def test_a_commit_that_waits_for_a_standby_is_reported(
     server.close()
 
 
-def test_a_server_that_freezes_while_it_writes_does_not_hold_up_others(
-    address: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_that_freezes_while_it_writes_does_not_hold_up_others(address: str, monkeypatch):
     monkeypatch.setattr(postgres_follower, "STUCK", "1s")
     monkeypatch.setattr(postgres_follower, "POLL", 0.2)
     frozen, other = PostgresStore(address, "s0"), PostgresStore(address, "s1")
@@ -299,7 +291,7 @@ def test_a_server_that_freezes_while_it_writes_does_not_hold_up_others(
     frozen.close()
 
 
-def test_a_frozen_server_does_not_lead_for_ever(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frozen_server_does_not_lead_for_ever(address: str, monkeypatch):
     monkeypatch.setattr(postgres_follower, "FROZEN", "1s")
     monkeypatch.setattr(postgres_follower, "BEAT", 1000.0)
     frozen = PostgresStore(address, "s0")
@@ -314,9 +306,7 @@ def test_a_frozen_server_does_not_lead_for_ever(address: str, monkeypatch: pytes
     frozen.close()
 
 
-def test_a_leader_that_was_frozen_writes_over_no_record_of_the_one_behind_it(
-    address: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_leader_that_was_frozen_writes_over_no_record_of_the_one_behind_it(address: str, monkeypatch):
     """It has just looked whether it leads, and goes on where it stood still."""
     monkeypatch.setattr(PostgresStore, "leads", True)
     with closing(PostgresStore(address, "s0")) as store, closing(PostgresStore(address, "s1")) as other:
@@ -330,7 +320,7 @@ def test_a_leader_that_was_frozen_writes_over_no_record_of_the_one_behind_it(
         assert [event.words for event in MapHistory(other).events] == ["first", "second", "fourth"]
 
 
-def test_what_a_leader_publishes_is_stored_whole(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_a_leader_publishes_is_stored_whole(address: str, monkeypatch):
     """Also if more is published while it is stored; and nothing of a server that does not lead."""
     leader, other = PostgresStore(address, "s0"), PostgresStore(address, "s1")
     leader.follow(lambda news: None)
@@ -364,9 +354,7 @@ def test_what_a_leader_publishes_is_stored_whole(address: str, monkeypatch: pyte
     leader.close()
 
 
-def test_no_commit_of_changes_waits_for_what_a_leader_publishes(
-    address: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_no_commit_of_changes_waits_for_what_a_leader_publishes(address: str, monkeypatch):
     """One is made while the other transaction is open, and is there before that is."""
     leader = PostgresStore(address, "s0")
     leader.follow(lambda news: None)

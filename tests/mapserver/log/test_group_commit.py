@@ -1,12 +1,9 @@
 """Changes of many logs that are committed together."""
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -57,7 +54,7 @@ runs_of_a_turn = st.lists(
 
 @settings(max_examples=15, deadline=None)
 @given(st.lists(runs_of_a_turn, max_size=4))
-def test_a_group_gives_what_its_runs_give_one_by_one(turns: list[list[tuple]]) -> None:  # type: ignore[type-arg]
+def test_a_group_gives_what_its_runs_give_one_by_one(turns: list[list[tuple]]):  # type: ignore[type-arg]
     with tempfile.TemporaryDirectory() as folder:
         paths = Path(folder) / "group.sqlite", Path(folder) / "single.sqlite"
         together, single = map(SqliteStore, paths)
@@ -76,9 +73,7 @@ def test_a_group_gives_what_its_runs_give_one_by_one(turns: list[list[tuple]]) -
         assert contents(paths[0]) == contents(paths[1])
 
 
-def test_a_run_that_cannot_be_stored_holds_up_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_run_that_cannot_be_stored_holds_up_no_other(tmp_path, monkeypatch):
     store = SqliteStore(tmp_path / "s.sqlite")
     put = store._put
 
@@ -95,9 +90,7 @@ def test_a_run_that_cannot_be_stored_holds_up_no_other(
     assert [store_map.agent for store_map in contents(tmp_path / "s.sqlite")] == ["r0", "r2", "r3"]
 
 
-def test_a_disk_that_is_full_in_the_middle_of_a_group_keeps_what_fits(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_disk_that_is_full_in_the_middle_of_a_group_keeps_what_fits(tmp_path, monkeypatch):
     """SQLite itself reports a full disk, by a limit on its pages."""
     path = tmp_path / "s.sqlite"
     store = SqliteStore(path)
@@ -112,9 +105,7 @@ def test_a_disk_that_is_full_in_the_middle_of_a_group_keeps_what_fits(
     assert {m.agent: kept[1] for m, kept in contents(path).items()} == {"r0": 1, "r1": 1, "r3": 1}  # type: ignore[index]
 
 
-def test_nothing_of_a_failed_group_is_acknowledged_and_all_of_it_comes_later(
-    hub: MemoryHub, server: Server
-) -> None:
+def test_nothing_of_a_failed_group_is_acknowledged_and_all_of_it_comes_later(hub: MemoryHub, server: Server):
     agents = [HandAgent(hub, map_id) for map_id in MAPS]
     for agent in agents:
         agent.serve(3)
@@ -135,7 +126,7 @@ def test_nothing_of_a_failed_group_is_acknowledged_and_all_of_it_comes_later(
     assert sorted((c.map, c.sequence) for c in server.seen) == [(m, k) for m in MAPS for k in (1, 2, 3)]
 
 
-def test_changes_that_wait_are_committed_together(hub: MemoryHub, server: Server) -> None:
+def test_changes_that_wait_are_committed_together(hub: MemoryHub, server: Server):
     agents = [HandAgent(hub, map_id) for map_id in MAPS]
     apply_all, groups = server.store.apply_all, list[int]()
 

@@ -1,14 +1,9 @@
 """The ingest against agents that are played by hand, so that each mishap can be made to happen."""
 
-from __future__ import annotations
-
 import threading
 import zlib
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from pathlib import Path
-
-import pytest
 
 from mapweave.hybridmap.change import Change
 from mapweave.hybridmap.errors import InvalidFile
@@ -26,14 +21,14 @@ from tests.mapserver.played import KEYS, LOG_ID, MAP, HandAgent, Server
 from tests.waiting import eventually
 
 
-def test_changes_are_applied_and_acknowledged(server: Server, agent: HandAgent) -> None:
+def test_changes_are_applied_and_acknowledged(server: Server, agent: HandAgent):
     agent.publish_each(1, 2, 3)
     eventually(lambda: agent.acks and agent.acks[-1] == Ack(MAP, LOG_ID, 3, (), server.store.id))
     eventually(lambda: server.sequences == [1, 2, 3])
     assert server.store.watermark(MAP) == 3
 
 
-def test_a_change_is_on_the_disk_before_it_is_acknowledged(server: Server, agent: HandAgent) -> None:
+def test_a_change_is_on_the_disk_before_it_is_acknowledged(server: Server, agent: HandAgent):
     stored: list[int] = []
     server.on_change = lambda change: stored.append(server.store.watermark(MAP) - change.sequence)
     agent.publish(1)
@@ -41,9 +36,7 @@ def test_a_change_is_on_the_disk_before_it_is_acknowledged(server: Server, agent
     assert stored == [0]
 
 
-def test_a_robot_that_is_reminded_hears_again_what_is_settled_of_that_log(
-    server: Server, agent: HandAgent
-) -> None:
+def test_a_robot_that_is_reminded_hears_again_what_is_settled_of_that_log(server: Server, agent: HandAgent):
     agent.publish_each(1, 2)
     eventually(lambda: agent.acks and agent.acks[-1].watermark == 2)
     heard = len(agent.acks)
@@ -62,7 +55,7 @@ def test_a_robot_that_is_reminded_hears_again_what_is_settled_of_that_log(
 
 def test_a_reordered_change_waits_for_its_turn_without_being_pulled(
     started: Callable[..., Server], agent: HandAgent
-) -> None:
+):
     # A busy machine may deliver the next one a good while later.
     server = started(settings=IngestSettings(PullSettings(grace=600.0)))
     agent.publish_each(1, 3, 2, 4)
@@ -70,7 +63,7 @@ def test_a_reordered_change_waits_for_its_turn_without_being_pulled(
     assert server.ingest.counters().pulls == 0
 
 
-def test_doubles_are_counted_and_dropped(server: Server, agent: HandAgent) -> None:
+def test_doubles_are_counted_and_dropped(server: Server, agent: HandAgent):
     agent.publish_each(1, 1, 2, 1, 2, 2)
     eventually(lambda: server.ingest.counters().messages == 6)
     eventually(lambda: server.sequences == [1, 2])
@@ -78,7 +71,7 @@ def test_doubles_are_counted_and_dropped(server: Server, agent: HandAgent) -> No
     eventually(lambda: server.ingest.counters().doubled == 4)
 
 
-def test_a_gap_is_pulled_and_only_the_gap(server: Server, agent: HandAgent) -> None:
+def test_a_gap_is_pulled_and_only_the_gap(server: Server, agent: HandAgent):
     agent.serve(9)
     agent.publish(1)
     agent.publish_each(5, 6)
@@ -88,7 +81,7 @@ def test_a_gap_is_pulled_and_only_the_gap(server: Server, agent: HandAgent) -> N
     assert agent.asked == [LogRequest(2, 4, StoredChange(1, before))]
 
 
-def test_a_beacon_alone_brings_everything_in_chunks(server: Server, agent: HandAgent) -> None:
+def test_a_beacon_alone_brings_everything_in_chunks(server: Server, agent: HandAgent):
     agent.serve(600)
     agent.beacon(600)
     eventually(lambda: server.sequences == list(range(1, 601)))
@@ -97,11 +90,8 @@ def test_a_beacon_alone_brings_everything_in_chunks(server: Server, agent: HandA
 
 
 def test_a_store_that_cannot_be_read_is_no_line_for_each_pull(
-    started: Callable[..., Server],
-    agent: HandAgent,
-    monkeypatch: pytest.MonkeyPatch,
-    caplog: pytest.LogCaptureFixture,
-) -> None:
+    started: Callable[..., Server], agent: HandAgent, monkeypatch, caplog
+):
     away, read = [True], SqliteStore.newest_change
 
     def newest_change(store: SqliteStore, map_id: MapId, watermark: int) -> StoredChange | None:
@@ -120,14 +110,14 @@ def test_a_store_that_cannot_be_read_is_no_line_for_each_pull(
     eventually(lambda: server.sequences == [1, 2, 3])
 
 
-def test_a_shorter_answer_than_asked_for_goes_on_where_it_ends(server: Server, agent: HandAgent) -> None:
+def test_a_shorter_answer_than_asked_for_goes_on_where_it_ends(server: Server, agent: HandAgent):
     agent.serve(10, lambda asked: agent.answer(LogRequest(asked.first, min(asked.last, asked.first + 2))))
     agent.beacon(10)
     eventually(lambda: server.sequences == list(range(1, 11)))
     assert [asked.first for asked in agent.asked] == [1, 4, 7, 10]
 
 
-def test_changes_that_the_agent_has_pruned_leave_holes(server: Server, agent: HandAgent) -> None:
+def test_changes_that_the_agent_has_pruned_leave_holes(server: Server, agent: HandAgent):
     agent.serve(8)
     for pruned in (1, 4, 5):
         del agent.log[pruned]
@@ -136,7 +126,7 @@ def test_changes_that_the_agent_has_pruned_leave_holes(server: Server, agent: Ha
     assert server.store.watermark(MAP) == 8
 
 
-def test_a_beacon_with_a_low_watermark_gets_another_acknowledgement(server: Server, agent: HandAgent) -> None:
+def test_a_beacon_with_a_low_watermark_gets_another_acknowledgement(server: Server, agent: HandAgent):
     agent.publish(1)
     eventually(lambda: len(agent.acks) == 1)
     agent.beacon(1, s0=1)
@@ -163,7 +153,7 @@ def held_up(server: Server, agent: HandAgent) -> Iterator[None]:
     go_on.set()
 
 
-def test_reminders_take_no_room_without_end(server: Server, agent: HandAgent) -> None:
+def test_reminders_take_no_room_without_end(server: Server, agent: HandAgent):
     """A robot that declares and takes back a liveliness token over and over has a reminder each time."""
     with held_up(server, agent):
         for _ in range(2 * MOST):
@@ -174,7 +164,7 @@ def test_reminders_take_no_room_without_end(server: Server, agent: HandAgent) ->
         assert server.ingest.waiting <= MOST
 
 
-def test_beacons_that_wait_become_one(server: Server, agent: HandAgent) -> None:
+def test_beacons_that_wait_become_one(server: Server, agent: HandAgent):
     """Each would be acknowledged, and hold up the changes of others."""
     with held_up(server, agent):
         agent.serve(2)
@@ -189,8 +179,8 @@ def test_beacons_that_wait_become_one(server: Server, agent: HandAgent) -> None:
 
 
 def test_a_refusal_is_behind_the_acknowledgement_that_a_beacon_asks_for(
-    server: Server, agent: HandAgent, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    server: Server, agent: HandAgent, monkeypatch
+):
     """An acknowledgement behind it would tell the robot that its log is taken again."""
     with held_up(server, agent):
         monkeypatch.setattr(server.ingest, "_objection", lambda body: "not this one")
@@ -202,7 +192,7 @@ def test_a_refusal_is_behind_the_acknowledgement_that_a_beacon_asks_for(
     assert [(ack.watermark, bool(ack.refusals)) for ack in agent.acks] == [(1, False), (1, False), (0, True)]
 
 
-def test_a_restarted_server_replays_and_goes_on(server: Server, agent: HandAgent) -> None:
+def test_a_restarted_server_replays_and_goes_on(server: Server, agent: HandAgent):
     agent.serve(5)
     agent.publish_each(1, 2)
     eventually(lambda: server.sequences == [1, 2])
@@ -215,9 +205,7 @@ def test_a_restarted_server_replays_and_goes_on(server: Server, agent: HandAgent
     eventually(lambda: server.sequences == [1, 2, 3, 4, 5])
 
 
-def test_two_servers_are_each_complete(
-    hub: MemoryHub, tmp_path: Path, server: Server, agent: HandAgent
-) -> None:
+def test_two_servers_are_each_complete(hub: MemoryHub, tmp_path, server: Server, agent: HandAgent):
     other = Server(hub, tmp_path / "s1.sqlite", "s1")
     agent.serve(5)
     agent.publish_each(1, 2, 3, 5)
@@ -225,7 +213,7 @@ def test_two_servers_are_each_complete(
     other.end()
 
 
-def test_a_fresh_epoch_is_another_map(hub: MemoryHub, server: Server, agent: HandAgent) -> None:
+def test_a_fresh_epoch_is_another_map(hub: MemoryHub, server: Server, agent: HandAgent):
     agent.publish(1)
     eventually(lambda: server.sequences == [1])
     fresh = HandAgent(hub, MapId("r0", 4), 78)
@@ -235,7 +223,7 @@ def test_a_fresh_epoch_is_another_map(hub: MemoryHub, server: Server, agent: Han
     assert server.store.watermark(MAP) == 1
 
 
-def test_the_pause_doubles_and_a_sign_of_life_ends_it() -> None:
+def test_the_pause_doubles_and_a_sign_of_life_ends_it():
     agent_log = AgentLog(MAP, 1, PullSettings(grace=0.5, first_pause=1.0, longest_pause=5.0), newest=9)
     assert agent_log.missing(0.0) is None
     assert agent_log.missing(0.4) is None
@@ -254,7 +242,7 @@ def test_the_pause_doubles_and_a_sign_of_life_ends_it() -> None:
     assert agent_log.pull_at - now == 1.0
 
 
-def test_memory_for_changes_ahead_is_bounded() -> None:
+def test_memory_for_changes_ahead_is_bounded():
     agent_log = AgentLog(MAP, 1, PullSettings(ahead=10))
     for sequence in range(2, 100):
         agent_log.offer(ReceivedChange(sequence, b"", "x"))
@@ -265,7 +253,7 @@ def test_memory_for_changes_ahead_is_bounded() -> None:
     assert min(agent_log.ahead) == 6
 
 
-def test_messages_while_closing_are_no_error(server: Server, agent: HandAgent) -> None:
+def test_messages_while_closing_are_no_error(server: Server, agent: HandAgent):
     agent.publish_each(*range(1, 50))
     server.ingest.close()
     server.ingest.close()

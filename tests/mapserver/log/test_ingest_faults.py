@@ -1,7 +1,5 @@
 """Agents and a server on a bus that drops, doubles, delays and reorders, restarted at random moments."""
 
-from __future__ import annotations
-
 import itertools
 import time
 from dataclasses import replace
@@ -93,9 +91,7 @@ shares = st.sampled_from([0.0, 0.2, 0.6])
 @pytest.mark.slow
 @settings(max_examples=15, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 @given(steps, st.builds(MessageFaults, shares, shares, shares, st.integers(1, 30)), st.integers(0, 2**32 - 1))
-def test_the_store_becomes_the_journals(
-    tmp_path_factory: pytest.TempPathFactory, steps: list[str], faults: MessageFaults, seed: int
-) -> None:
+def test_the_store_becomes_the_journals(tmp_path_factory, steps: list[str], faults: MessageFaults, seed: int):
     folder = tmp_path_factory.mktemp("faults")
     hub = MemoryHub()
     server = Server(hub, folder / "store")

@@ -1,7 +1,5 @@
 """Real processes over Zenoh that are really killed: the router with the server in it, and the agent."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys
@@ -106,7 +104,7 @@ class Life:
 
 
 @pytest.mark.slow
-def test_nothing_is_lost_when_processes_are_killed(tmp_path: Path) -> None:
+def test_nothing_is_lost_when_processes_are_killed(tmp_path):
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         endpoint = f"tcp/127.0.0.1:{probe.getsockname()[1]}"

@@ -1,7 +1,5 @@
 """The ingest against what goes wrong: damage, refusals, silence, full disks, strangers."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable
@@ -24,7 +22,7 @@ from tests.mapserver.played import KEYS, LOG_ID, MAP, QUICK, HandAgent, Server, 
 from tests.waiting import eventually
 
 
-def test_a_change_damaged_on_the_way_is_pulled(server: Server, agent: HandAgent) -> None:
+def test_a_change_damaged_on_the_way_is_pulled(server: Server, agent: HandAgent):
     agent.serve(2)
     agent.publish(1, b"\xc1" * 50)
     agent.publish(2)
@@ -33,9 +31,7 @@ def test_a_change_damaged_on_the_way_is_pulled(server: Server, agent: HandAgent)
     assert server.store.refused() == 0
 
 
-def test_a_change_bad_in_the_log_is_refused_once_and_the_log_goes_on(
-    server: Server, agent: HandAgent
-) -> None:
+def test_a_change_bad_in_the_log_is_refused_once_and_the_log_goes_on(server: Server, agent: HandAgent):
     agent.serve(4)
     agent.log[2] = b"\xc1" * 50
     agent.log[3] = message(99)
@@ -55,7 +51,7 @@ def test_a_change_bad_in_the_log_is_refused_once_and_the_log_goes_on(
     assert server.store.refused() == 2
 
 
-def test_a_change_that_cannot_even_be_carried_is_found_and_refused(server: Server, agent: HandAgent) -> None:
+def test_a_change_that_cannot_even_be_carried_is_found_and_refused(server: Server, agent: HandAgent):
     """It spoils every answer that it is in, so the pieces get smaller until it is alone."""
     agent.serve(20)
     agent.log[7] = b"x" * (MAX_CHANGE_BYTES + 1)
@@ -64,9 +60,7 @@ def test_a_change_that_cannot_even_be_carried_is_found_and_refused(server: Serve
     assert [refusal.sequence for refusal in server.store.refusals(MAP)] == [7]
 
 
-def test_a_question_that_fails_unforeseen_is_asked_again(
-    server: Server, agent: HandAgent, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_question_that_fails_unforeseen_is_asked_again(server: Server, agent: HandAgent, monkeypatch):
     """The robot counted as asked for ever."""
     failures = [MemoryError(), RuntimeError("unforeseen")]
     real = MemoryBus.ask
@@ -83,7 +77,7 @@ def test_a_question_that_fails_unforeseen_is_asked_again(
     assert not failures
 
 
-def test_answers_that_are_none_are_asked_again(server: Server, agent: HandAgent) -> None:
+def test_answers_that_are_none_are_asked_again(server: Server, agent: HandAgent):
     tries: list[int] = []
 
     def answer(asked: LogRequest) -> LogAnswer | bytes | str:
@@ -105,9 +99,9 @@ def test_answers_that_are_none_are_asked_again(server: Server, agent: HandAgent)
 
 @pytest.mark.parametrize("answer", [b"garbage", "no"])
 def test_answers_that_are_none_fill_neither_memory_nor_log(
-    server: Server, agent: HandAgent, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture,
-    answer: bytes | str,
-) -> None:  # fmt: skip
+    server: Server, agent: HandAgent, monkeypatch, caplog,
+    answer: bytes | str
+):  # fmt: skip
     """A robot over TLS wrote ten lines a second, by as many answers to each question as it liked."""
     real, taken = MemoryBus.ask, list[int]()
 
@@ -128,7 +122,7 @@ def test_answers_that_are_none_fill_neither_memory_nor_log(
     assert len([one for one in caplog.records if "r0.3 from" in one.getMessage()]) <= 1
 
 
-def test_an_agent_that_cannot_be_asked_is_asked_less_and_less(server: Server, agent: HandAgent) -> None:
+def test_an_agent_that_cannot_be_asked_is_asked_less_and_less(server: Server, agent: HandAgent):
     began = time.monotonic()
     agent.beacon(5)
     eventually(lambda: server.ingest.counters().pulls >= 5)
@@ -139,7 +133,7 @@ def test_an_agent_that_cannot_be_asked_is_asked_less_and_less(server: Server, ag
 
 def test_a_silent_agent_does_not_hold_up_another(
     hub: MemoryHub, agent: HandAgent, started: Callable[..., Server]
-) -> None:
+):
     # Its silence is longer than the test waits for the other.
     server = started(settings=replace(QUICK, ask_timeout=600.0))
     kept: list[Request] = []
@@ -153,7 +147,7 @@ def test_a_silent_agent_does_not_hold_up_another(
     kept[0].refuse("at last")
 
 
-def test_another_log_under_the_same_name_is_refused(hub: MemoryHub, server: Server, agent: HandAgent) -> None:
+def test_another_log_under_the_same_name_is_refused(hub: MemoryHub, server: Server, agent: HandAgent):
     agent.publish(1)
     eventually(lambda: server.sequences == [1])
     impostor = HandAgent(hub, MAP, LOG_ID + 1)
@@ -167,7 +161,7 @@ def test_another_log_under_the_same_name_is_refused(hub: MemoryHub, server: Serv
     assert server.sequences == [1]
 
 
-def test_messages_that_are_none_are_counted_and_change_nothing(server: Server, agent: HandAgent) -> None:
+def test_messages_that_are_none_are_counted_and_change_nothing(server: Server, agent: HandAgent):
     agent.bus.publish(KEYS.change(MAP), message(1), b"short")
     agent.bus.publish(KEYS.change(MAP), message(1))
     agent.bus.publish(f"{KEYS.root}/agent/R0/change/3", message(1), Mark(1, 1).encode())
@@ -178,9 +172,7 @@ def test_messages_that_are_none_are_counted_and_change_nothing(server: Server, a
     eventually(lambda: server.sequences == [1])
 
 
-def test_a_consumer_that_fails_on_a_change_gets_the_next(
-    server: Server, agent: HandAgent, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_consumer_that_fails_on_a_change_gets_the_next(server: Server, agent: HandAgent, caplog):
     def choke(change: Change) -> None:
         server.seen.append(change)
         if change.sequence == 1:
@@ -194,8 +186,8 @@ def test_a_consumer_that_fails_on_a_change_gets_the_next(
 
 
 def test_a_disk_that_is_full_for_long_takes_nothing_from_what_a_robot_may_send(
-    started: Callable[..., Server], agent: HandAgent, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    started: Callable[..., Server], agent: HandAgent, monkeypatch
+):
     # The clock stands: 1000 changes may come in all, those that are pulled and not stored included.
     quotas = Quotas(QuotaSettings(changes=1000.0 / BURST), lambda: 0.0)
     server = started(quotas=quotas)
@@ -208,9 +200,7 @@ def test_a_disk_that_is_full_for_long_takes_nothing_from_what_a_robot_may_send(
     assert quotas.totals() == {}
 
 
-def test_a_disk_that_is_full_for_a_while(
-    server: Server, agent: HandAgent, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_disk_that_is_full_for_a_while(server: Server, agent: HandAgent, monkeypatch, caplog):
     agent.serve(3)
 
     def full(runs: list[LogChanges]) -> list[MapweaveError]:

@@ -1,7 +1,5 @@
 """A robot that floods the ingest: others do not wait for it, and what is held back of it is not lost."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Iterator
@@ -48,9 +46,7 @@ def robot(hub: MemoryHub, tmp_path: Path) -> Iterator[Robot]:
     journal.close()
 
 
-def test_a_flood_of_one_robot_is_no_queue_for_another(
-    hub: MemoryHub, server: Server, agent: HandAgent
-) -> None:
+def test_a_flood_of_one_robot_is_no_queue_for_another(hub: MemoryHub, server: Server, agent: HandAgent):
     began, go = threading.Event(), threading.Event()
 
     def hold(change: Change) -> None:
@@ -71,9 +67,7 @@ def test_a_flood_of_one_robot_is_no_queue_for_another(
     assert place <= 1, f"{place} changes of the robot that floods went before"
 
 
-def test_a_pulled_log_is_no_queue_for_another_either(
-    hub: MemoryHub, server: Server, agent: HandAgent
-) -> None:
+def test_a_pulled_log_is_no_queue_for_another_either(hub: MemoryHub, server: Server, agent: HandAgent):
     other = HandAgent(hub, OTHER)
 
     def publish_once(change: Change) -> None:
@@ -89,7 +83,7 @@ def test_a_pulled_log_is_no_queue_for_another_either(
     assert [change.map for change in server.seen].index(OTHER) == pulled.AT_ONE_TURN
 
 
-def test_what_is_held_back_is_fetched_later_in_order(started: Start, hub: MemoryHub) -> None:
+def test_what_is_held_back_is_fetched_later_in_order(started: Start, hub: MemoryHub):
     clock = Clock()
     quotas = Quotas(QuotaSettings(changes=10.0), clock)
     server = started(quotas=quotas)
@@ -125,8 +119,8 @@ def test_beacons_beyond_the_quota_are_not_looked_at(server: Server):
 
 
 def test_a_robot_that_sends_more_than_its_quota_is_stored_at_the_rate_of_its_quota(
-    started: Start, hub: MemoryHub, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    started: Start, hub: MemoryHub, monkeypatch
+):
     """What it publishes behind a gap leaves room for the gap."""
     monkeypatch.setattr(quotas_module, "BURST", 1.0)
     clock = Clock()
@@ -151,7 +145,7 @@ def test_a_robot_that_sends_more_than_its_quota_is_stored_at_the_rate_of_its_quo
 
 def test_a_change_that_is_sent_again_and_again_is_shown_and_takes_nothing_from_new_ones(
     started: Start, hub: MemoryHub
-) -> None:
+):
     clock = Clock()
     quotas = Quotas(QuotaSettings(changes=10.0), clock)
     server = started(quotas=quotas)
@@ -172,9 +166,7 @@ def test_a_change_that_is_sent_again_and_again_is_shown_and_takes_nothing_from_n
     assert quotas.totals() == {"changes": 150}
 
 
-def test_one_map_too_many_is_refused_with_the_reason_until_there_is_room(
-    started: Start, hub: MemoryHub
-) -> None:
+def test_one_map_too_many_is_refused_with_the_reason_until_there_is_room(started: Start, hub: MemoryHub):
     server = started(quotas=Quotas(QuotaSettings(maps=3)))
     agents = [HandAgent(hub, MapId("r0", epoch)) for epoch in range(1, 6)]
     for agent in agents:
@@ -199,8 +191,8 @@ def test_one_map_too_many_is_refused_with_the_reason_until_there_is_room(
 
 
 def test_nodes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
-    started: Start, robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    started: Start, robot: Robot, monkeypatch
+):
     monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
     server = started(quotas=Quotas(QuotaSettings(nodes=10)))
     map_id, replicator = robot
@@ -219,8 +211,8 @@ def test_nodes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
 
 
 def test_edges_beyond_the_quota_stay_on_the_robot_until_there_is_room(
-    started: Start, robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    started: Start, robot: Robot, monkeypatch
+):
     """Two nodes may have as many edges as one likes, and each costs every merge: that of all robots."""
     monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
     monkeypatch.setattr(intake, "DRIVEN", 10)
@@ -240,9 +232,7 @@ def test_edges_beyond_the_quota_stay_on_the_robot_until_there_is_room(
     assert replicator.wait_acknowledged(60)
 
 
-def test_a_node_that_is_put_again_and_again_fills_no_disk(
-    started: Start, robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_node_that_is_put_again_and_again_fills_no_disk(started: Start, robot: Robot, monkeypatch):
     monkeypatch.setattr(kept_bytes, "LEAST_GROWN", 20_000)
     server = started()
     map_id, replicator = robot
@@ -263,8 +253,8 @@ def test_a_node_that_is_put_again_and_again_fills_no_disk(
 
 
 def test_bytes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
-    started: Start, robot: Robot, hub: MemoryHub, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    started: Start, robot: Robot, hub: MemoryHub, monkeypatch
+):
     monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
     monkeypatch.setattr(kept_bytes, "LEAST_GROWN", 10_000)
     server = started(quotas=Quotas(QuotaSettings(megabytes=0.2)))
@@ -290,9 +280,7 @@ def test_bytes_beyond_the_quota_stay_on_the_robot_until_there_is_room(
     assert replicator.wait_acknowledged(60)
 
 
-def test_what_was_pruned_makes_room_for_the_robot(
-    started: Start, robot: Robot, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_was_pruned_makes_room_for_the_robot(started: Start, robot: Robot, monkeypatch):
     """Also where its map grows no more, and where another server has pruned it."""
     monkeypatch.setattr(ingest, "QUOTA_PAUSE", 0.05)
     server = started(quotas=Quotas(QuotaSettings(megabytes=0.2)))
@@ -307,7 +295,7 @@ def test_what_was_pruned_makes_room_for_the_robot(
 
 def test_logs_that_never_answer_do_not_hold_up_one_that_does(
     started: Start, hub: MemoryHub, agent: HandAgent
-) -> None:
+):
     """They are waited for longer than this test takes, and more of them than are asked at once."""
     server = started(settings=replace(QUICK, ask_timeout=600.0))
     agent.publish(1)
@@ -325,7 +313,7 @@ def test_logs_that_never_answer_do_not_hold_up_one_that_does(
     assert len(kept) == pull_schedule.SILENT_AT_ONCE
 
 
-def test_names_alone_fill_no_memory(hub: MemoryHub, server: Server, agent: HandAgent) -> None:
+def test_names_alone_fill_no_memory(hub: MemoryHub, server: Server, agent: HandAgent):
     crowd = HandAgent(hub, OTHER)
     for number in range(3 * known_logs.MOST_UNKNOWN):
         crowd.map = MapId(f"x{number}", number % 7)
@@ -339,9 +327,7 @@ def test_names_alone_fill_no_memory(hub: MemoryHub, server: Server, agent: HandA
     assert len(server.ingest._logs) <= known_logs.MOST_UNKNOWN + 1
 
 
-def test_a_beacon_beyond_all_logs_moves_only_its_own(
-    hub: MemoryHub, server: Server, agent: HandAgent
-) -> None:
+def test_a_beacon_beyond_all_logs_moves_only_its_own(hub: MemoryHub, server: Server, agent: HandAgent):
     """It says 2^53 and answers with nothing, as if all that was pruned: that ends its own map alone."""
     agent.serve(2)
     agent.publish(1)
@@ -356,7 +342,7 @@ def test_a_beacon_beyond_all_logs_moves_only_its_own(
     assert server.store.watermark(MAP) <= 2, "it has given no more than two"
 
 
-def test_undecodable_changes_fill_no_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_undecodable_changes_fill_no_disk(tmp_path, monkeypatch):
     monkeypatch.setattr("mapweave.mapserver.log.store.MOST_REFUSED_KEPT", 5)
     store = SqliteStore(tmp_path / "s0.sqlite")
     entries = [ReceivedChange.read(MAP, sequence, b"\xc1" * 100_000) for sequence in range(1, 51)]
@@ -367,9 +353,7 @@ def test_undecodable_changes_fill_no_disk(tmp_path: Path, monkeypatch: pytest.Mo
     assert sum(file.stat().st_size for file in tmp_path.iterdir()) < 2_000_000
 
 
-def test_a_robot_whose_changes_are_all_refused_fills_no_log(
-    server: Server, agent: HandAgent, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_robot_whose_changes_are_all_refused_fills_no_log(server: Server, agent: HandAgent, caplog):
     caplog.set_level(logging.INFO, "mapweave.mapserver")
     agent.serve(1, lambda asked: agent.answer(asked))
     for sequence in range(1, 41):

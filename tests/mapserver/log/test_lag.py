@@ -1,7 +1,5 @@
 """How long a change is known of and missing, against all announcements kept by brute force."""
 
-from __future__ import annotations
-
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -16,7 +14,7 @@ STEPS = st.lists(
 
 
 @given(STEPS)
-def test_the_lag_is_never_too_small(steps: list[tuple[int, float, float]]) -> None:
+def test_the_lag_is_never_too_small(steps: list[tuple[int, float, float]]):
     log = AgentLog(MapId("r0", 1), 7, PullSettings())
     announced: list[tuple[int, float]] = []
     now, newest, watermark, began = 0.0, 0, 0, 0.0

@@ -1,7 +1,5 @@
 """A store that is deleted under the running server: it is said, and robots send everything again."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -31,7 +29,7 @@ def delete(path: Path) -> None:
 
 
 @pytest.mark.parametrize("again", [False, True], ids=["deleted", "replaced"])
-def test_a_store_that_is_deleted_takes_nothing_more(tmp_path: Path, again: bool) -> None:
+def test_a_store_that_is_deleted_takes_nothing_more(tmp_path, again: bool):
     path = tmp_path / "s0.sqlite"
     store = SqliteStore(path)
     store.put_result("x", b"1")
@@ -43,7 +41,7 @@ def test_a_store_that_is_deleted_takes_nothing_more(tmp_path: Path, again: bool)
     store.close()
 
 
-def test_a_store_that_was_moved_takes_changes_when_it_is_put_back(tmp_path: Path) -> None:
+def test_a_store_that_was_moved_takes_changes_when_it_is_put_back(tmp_path):
     path = tmp_path / "s0.sqlite"
     store = SqliteStore(path)
     path.rename(tmp_path / "elsewhere")
@@ -58,7 +56,7 @@ def test_a_store_that_was_moved_takes_changes_when_it_is_put_back(tmp_path: Path
     again.close()
 
 
-def test_a_server_with_a_deleted_store_reports_it_and_gets_everything_again(tmp_path: Path) -> None:
+def test_a_server_with_a_deleted_store_reports_it_and_gets_everything_again(tmp_path):
     hub, path = MemoryHub(), tmp_path / "s0.sqlite"
     bus, journal = MemoryBus(hub), Journal(tmp_path / "journal.sqlite", "r0")
     robot = Replicator(

@@ -1,7 +1,5 @@
 """A robot on an older copy of its journal: its new changes have numbers of others that the server has."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
@@ -60,7 +58,7 @@ def unchanged(hub: MemoryHub, folder: Path) -> Iterator[Ingest]:
 @pytest.mark.parametrize("away", [False, True], ids=["the server is there", "the network comes later"])
 def test_what_a_robot_maps_behind_an_older_journal_does_not_pass_for_what_the_server_has(
     put_back: Path, hub: MemoryHub, away: bool
-) -> None:
+):
     with unchanged(hub, put_back) as ingest:
         with closing(Robot(hub, put_back)) as robot:
             link = robot.replicator
@@ -91,7 +89,7 @@ def test_what_a_robot_maps_behind_an_older_journal_does_not_pass_for_what_the_se
 @pytest.mark.parametrize("count", [4, 10], ids=["as many as were lost", "more than were lost"])
 def test_so_is_what_was_mapped_without_a_network_before_the_last_start(
     put_back: Path, hub: MemoryHub, count: int
-) -> None:
+):
     """All that is on the disk may have left before the start: the server says which change it has."""
     with closing(Robot(MemoryHub(), put_back)) as robot:
         robot.replicator.submit([node_put(number) for number in range(20, 20 + count)], 1)
@@ -102,8 +100,8 @@ def test_so_is_what_was_mapped_without_a_network_before_the_last_start(
 
 
 def test_so_is_what_follows_while_acknowledgements_that_compare_are_lost(
-    put_back: Path, hub: MemoryHub, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    put_back: Path, hub: MemoryHub, monkeypatch
+):
     """As many changes are there as were lost: the next number is the server's next one, too."""
     acknowledge = Acknowledgements.acknowledge
 
@@ -121,9 +119,7 @@ def test_so_is_what_follows_while_acknowledgements_that_compare_are_lost(
         assert robot.replicator.status().unacknowledged == 5
 
 
-def test_a_robot_that_has_lost_nothing_is_acknowledged_what_it_did_not_know(
-    put_back: Path, hub: MemoryHub
-) -> None:
+def test_a_robot_that_has_lost_nothing_is_acknowledged_what_it_did_not_know(put_back: Path, hub: MemoryHub):
     """Acknowledgements were lost: its server has the same changes by their numbers."""
     with closing(Robot(MemoryHub(), put_back)) as robot:
         robot.replicator.submit([node_put(number) for number in range(6, 12)], 1)

@@ -1,7 +1,5 @@
 """A server on a copy of its store that was made before: it becomes as the robot's map is now."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Iterator
 from contextlib import ExitStack, closing, contextmanager
@@ -57,7 +55,7 @@ def contents(changes: object) -> list[bytes]:
 
 
 @pytest.mark.parametrize("restarted", [False, True], ids=["the robot runs on", "it starts again"])
-def test_what_was_retired_since_does_not_come_back(tmp_path: Path, restarted: bool) -> None:
+def test_what_was_retired_since_does_not_come_back(tmp_path, restarted: bool):
     """A snapshot of the disk, or a copy by hand: it has the store's own number, and no mark of a backup."""
     hub, path, before = MemoryHub(), tmp_path / "s0.sqlite", tmp_path / "before.sqlite"
     with ExitStack() as stack:

@@ -1,7 +1,5 @@
 """Servers behind pgbouncer: pooled sessions are like PostgreSQL's own, pooled transactions are refused."""
 
-from __future__ import annotations
-
 import pytest
 
 from mapweave.hybridmap.errors import InvalidFile
@@ -15,7 +13,7 @@ from tests.pgbouncer import pooled
 from tests.waiting import eventually
 
 
-def test_servers_share_a_store_by_pooled_sessions(postgres: PostgresServer) -> None:
+def test_servers_share_a_store_by_pooled_sessions(postgres: PostgresServer):
     with pooled(postgres, "session") as pooler:
         address = pooler.through(postgres.database())
         stores = [PostgresStore(address, name) for name in ("s0", "s1")]
@@ -39,7 +37,7 @@ def test_servers_share_a_store_by_pooled_sessions(postgres: PostgresServer) -> N
         ], "a server does not hear what it wrote itself"
 
 
-def test_settings_of_a_session_pass_a_pooler(postgres: PostgresServer) -> None:
+def test_settings_of_a_session_pass_a_pooler(postgres: PostgresServer):
     with pooled(postgres, "session") as pooler:
         address = PostgresAddress.read(pooler.through(postgres.database()))
         for _ in range(2):
@@ -53,7 +51,7 @@ def test_settings_of_a_session_pass_a_pooler(postgres: PostgresServer) -> None:
             session.close()
 
 
-def test_a_query_is_not_taken_for_that_of_another_session(postgres: PostgresServer) -> None:
+def test_a_query_is_not_taken_for_that_of_another_session(postgres: PostgresServer):
     with pooled(postgres, "session") as pooler:
         address = PostgresAddress.read(pooler.through(postgres.database()))
         sessions = [PostgresSession(address, name) for name in ("s0", "s1")]
@@ -73,7 +71,7 @@ def test_a_query_is_not_taken_for_that_of_another_session(postgres: PostgresServ
             session.close()
 
 
-def test_pooled_transactions_are_refused(postgres: PostgresServer) -> None:
+def test_pooled_transactions_are_refused(postgres: PostgresServer):
     with pooled(postgres, "transaction") as pooler:
         address = pooler.through(postgres.database())
         for name in ("s0", "s1"):
@@ -82,7 +80,7 @@ def test_pooled_transactions_are_refused(postgres: PostgresServer) -> None:
             assert "\n" not in str(refused.value)
 
 
-def test_a_pooler_that_begins_to_pool_transactions_is_noticed(postgres: PostgresServer) -> None:
+def test_a_pooler_that_begins_to_pool_transactions_is_noticed(postgres: PostgresServer):
     with pooled(postgres, "session") as pooler:
         address = postgres.database()
         stores = [PostgresStore(pooler.through(address), name) for name in ("s0", "s1")]

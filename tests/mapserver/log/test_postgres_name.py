@@ -1,7 +1,5 @@
 """One server at a time has a name on a store that servers share."""
 
-from __future__ import annotations
-
 import os
 import re
 import socket
@@ -85,7 +83,7 @@ def end_sessions(address: str, which: str) -> None:
     assert ended == [(True,)] * (2 if which == ALL else 1)
 
 
-def test_a_second_server_of_a_name_is_refused_with_what_is_known_of_the_first(address: str) -> None:
+def test_a_second_server_of_a_name_is_refused_with_what_is_known_of_the_first(address: str):
     first = PostgresStore(address, "s0")
     words = refusal(address)
     assert f"process {os.getpid()} on {socket.gethostname()}, connected since 20" in words
@@ -101,12 +99,12 @@ def test_a_second_server_of_a_name_is_refused_with_what_is_known_of_the_first(ad
         store.close()
 
 
-def test_a_name_is_that_of_one_database(postgres: PostgresServer) -> None:
+def test_a_name_is_that_of_one_database(postgres: PostgresServer):
     for store in [PostgresStore(postgres.database(), "s0") for _ in range(2)]:
         store.close()
 
 
-def test_a_refused_server_changes_nothing_for_the_first(address: str) -> None:
+def test_a_refused_server_changes_nothing_for_the_first(address: str):
     first = PostgresStore(address, "s0")
     assert first.apply(MAP, 5, [entry(1)]).watermark == 1
     refusal(address)
@@ -115,7 +113,7 @@ def test_a_refused_server_changes_nothing_for_the_first(address: str) -> None:
     first.close()
 
 
-def test_a_server_that_was_killed_is_followed_by_one_of_its_name(address: str, another: Start) -> None:
+def test_a_server_that_was_killed_is_followed_by_one_of_its_name(address: str, another: Start):
     process = another(address)
     assert f"process {process.pid} on " in refusal(address)
     end(process)
@@ -124,7 +122,7 @@ def test_a_server_that_was_killed_is_followed_by_one_of_its_name(address: str, a
 
 def test_the_name_of_a_killed_server_is_free_while_its_commit_waits_for_a_standby(
     postgres: PostgresServer, address: str, another: Start
-) -> None:
+):
     """Lost robots get answers meanwhile."""
     PostgresStore(address, "s0").close()
     waits = "SELECT 1 FROM pg_stat_activity WHERE wait_event = 'SyncRep'"
@@ -140,7 +138,7 @@ def test_the_name_of_a_killed_server_is_free_while_its_commit_waits_for_a_standb
 
 
 @pytest.mark.parametrize("which", [ALL, WITH_NAME, WITHOUT], ids=["all", "with-name", "without"])
-def test_a_name_that_was_lost_with_its_session_is_taken_again(address: str, which: str) -> None:
+def test_a_name_that_was_lost_with_its_session_is_taken_again(address: str, which: str):
     store = PostgresStore(address, "s0")
     store.apply(MAP, 5, [entry(1)])
     end_sessions(address, which)
@@ -169,8 +167,8 @@ def first_applied(store: PostgresStore, sequence: int) -> int:
     ("which", "writes"), [(ALL, True), (ALL, False), (WITH_NAME, False)], ids=["writes", "reads", "with-name"]
 )
 def test_a_server_whose_name_another_has_taken_meanwhile_acknowledges_nothing_more(
-    address: str, which: str, writes: bool, another: Start, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    address: str, which: str, writes: bool, another: Start, monkeypatch
+):
     displaced = PostgresStore(address, "s0")
     assert displaced.apply(MAP, 5, [entry(1)]).watermark == 1
     end_sessions(address, which)
@@ -248,7 +246,7 @@ def network(postgres: PostgresServer) -> Iterator[tuple[Cut, Path]]:
 
 def test_a_server_whose_network_was_cut_does_not_wait_for_its_own_former_session(
     address: str, network: tuple[Cut, Path]
-) -> None:
+):
     cut, folder = network
     database = psycopg.conninfo.conninfo_to_dict(address)["dbname"]
     store = PostgresStore(f"postgresql://{ROLE}@/{database}?host={folder}", "s0")
@@ -262,7 +260,7 @@ def test_a_server_whose_network_was_cut_does_not_wait_for_its_own_former_session
     store.close()
 
 
-def test_names_pass_a_pooler_of_sessions(postgres: PostgresServer) -> None:
+def test_names_pass_a_pooler_of_sessions(postgres: PostgresServer):
     with pooled(postgres, "session") as pooler:
         address = pooler.through(postgres.database())
         for _ in range(3):
@@ -275,7 +273,7 @@ def test_names_pass_a_pooler_of_sessions(postgres: PostgresServer) -> None:
             other.close()
 
 
-def test_pooled_transactions_leave_no_name_behind(postgres: PostgresServer) -> None:
+def test_pooled_transactions_leave_no_name_behind(postgres: PostgresServer):
     address = postgres.database()
     with pooled(postgres, "transaction") as pooler:
         with pytest.raises(InvalidFile, match="in pgbouncer set pool_mode = session"):

@@ -1,7 +1,5 @@
 """What only a PostgreSQL store does: it comes back, keeps its secrets, and agrees with the SQLite one."""
 
-from __future__ import annotations
-
 import tempfile
 import threading
 from dataclasses import astuple
@@ -77,7 +75,7 @@ def content(store: Store) -> list[object]:
 
 
 @pytest.mark.parametrize("examples", [4, pytest.param(30, marks=pytest.mark.slow)])
-def test_both_stores_give_the_same_for_the_same(address: str, tmp_path: Path, examples: int) -> None:
+def test_both_stores_give_the_same_for_the_same(address: str, tmp_path, examples: int):
 
     class Both(RuleBasedStateMachine):
         def __init__(self) -> None:
@@ -154,7 +152,7 @@ def test_both_stores_give_the_same_for_the_same(address: str, tmp_path: Path, ex
     )
 
 
-def test_two_servers_share_a_store(address: str) -> None:
+def test_two_servers_share_a_store(address: str):
     one, other = PostgresStore(address, "s0"), PostgresStore(address, "s1")
     assert one.id == other.id
     assert one.apply(MAP, 5, [entry(1), entry(2)]).before == 0
@@ -185,7 +183,7 @@ def test_two_servers_share_a_store(address: str) -> None:
 
 
 @pytest.mark.slow
-def test_it_goes_on_when_postgresql_is_back(own_postgres: PostgresServer) -> None:
+def test_it_goes_on_when_postgresql_is_back(own_postgres: PostgresServer):
     store = PostgresStore(own_postgres.database())
     store.apply(MAP, 5, [entry(1)])
     own_postgres.kill()
@@ -208,7 +206,7 @@ def test_it_goes_on_when_postgresql_is_back(own_postgres: PostgresServer) -> Non
         store.watermark(MAP)
 
 
-def test_a_commit_that_no_standby_confirms_is_none(postgres: PostgresServer) -> None:
+def test_a_commit_that_no_standby_confirms_is_none(postgres: PostgresServer):
     """The wait for a standby may be cancelled; PostgreSQL then commits, with a warning."""
     store = PostgresStore(postgres.database(), "waits")
     store.apply(MAP, 5, [entry(1)])
@@ -242,9 +240,7 @@ def test_a_commit_that_no_standby_confirms_is_none(postgres: PostgresServer) -> 
         "postgresql://anna:s3/cret@host/maps",
     ],
 )
-def test_a_password_in_the_address_is_refused_and_not_repeated(
-    address: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_password_in_the_address_is_refused_and_not_repeated(address: str, capsys):
     with pytest.raises(InvalidValue, match="the store's address"):
         PostgresStore(address)
     assert main(["map", "show", address]) == 1
@@ -253,7 +249,7 @@ def test_a_password_in_the_address_is_refused_and_not_repeated(
     assert not any(part in out + err for part in ("s3cret", "anna", "s3", "cret"))
 
 
-def test_a_store_of_another_format_is_refused(address: str) -> None:
+def test_a_store_of_another_format_is_refused(address: str):
     with pytest.raises(InvalidFile, match=r"has no map store: a map server makes one at its first start"):
         PostgresStore(address, read_only=True)
     PostgresStore(address).close()
@@ -263,7 +259,7 @@ def test_a_store_of_another_format_is_refused(address: str) -> None:
         PostgresStore(address)
 
 
-def test_a_server_whose_role_may_only_read_is_refused_at_its_start(address: str) -> None:
+def test_a_server_whose_role_may_only_read_is_refused_at_its_start(address: str):
     """It would serve, and acknowledge nothing; a command that only reads needs no more."""
     reader = address.replace(f"{ROLE}@", "reader@")
     store = PostgresStore(address, "s0")
@@ -289,7 +285,7 @@ def test_a_server_whose_role_may_only_read_is_refused_at_its_start(address: str)
 
 
 @pytest.mark.parametrize("part", ["tables", "rows", "cut-off", "no-version"])
-def test_a_store_that_was_restored_in_part_is_refused(postgres: PostgresServer, part: str) -> None:
+def test_a_store_that_was_restored_in_part_is_refused(postgres: PostgresServer, part: str):
     """Neither a server nor a reader takes it for a store, and it stays as it is."""
     folder = binaries()
     if folder is None or not all((folder / name).exists() for name in ("pg_dump", "pg_restore")):
@@ -327,7 +323,7 @@ def test_a_store_that_was_restored_in_part_is_refused(postgres: PostgresServer, 
     ]
 
 
-def test_texts_that_postgresql_does_not_take(postgres: PostgresServer) -> None:
+def test_texts_that_postgresql_does_not_take(postgres: PostgresServer):
     store = PostgresStore(postgres.database())
     refused = ReceivedChange(1, b"", "a reason with \0 and \udcff")
     assert store.apply(MAP, 5, [refused, broken(2)]).watermark == 2
@@ -335,7 +331,7 @@ def test_texts_that_postgresql_does_not_take(postgres: PostgresServer) -> None:
     store.close()
 
 
-def test_a_database_without_an_encoding_keeps_texts_as_they_are(postgres: PostgresServer) -> None:
+def test_a_database_without_an_encoding_keeps_texts_as_they_are(postgres: PostgresServer):
     """As `initdb` makes one where no locale is set: psycopg then gave bytes for texts."""
     with psycopg.connect(postgres.address(), autocommit=True) as people:
         people.execute("DROP DATABASE IF EXISTS ascii")

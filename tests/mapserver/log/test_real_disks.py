@@ -1,7 +1,5 @@
 """Disks that are really full or read-only: small file systems in memory, which only this test sees."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
@@ -117,19 +115,19 @@ def said(tmp_path_factory: pytest.TempPathFactory) -> dict[str, object]:
     return dict(json.loads(ran.stdout))
 
 
-def test_on_a_full_disk_a_robot_keeps_its_changes_in_memory_and_goes_on(said: dict[str, object]) -> None:
+def test_on_a_full_disk_a_robot_keeps_its_changes_in_memory_and_goes_on(said: dict[str, object]):
     assert "agent journal: the disk is full" in str(said["agent full"])
     assert int(str(said["waiting"])) > 0
     assert said["agent after"] == ""
 
 
-def test_on_a_full_disk_a_server_acknowledges_nothing_more_and_loses_nothing(said: dict[str, object]) -> None:
+def test_on_a_full_disk_a_server_acknowledges_nothing_more_and_loses_nothing(said: dict[str, object]):
     assert "map store: the disk is full" in str(said["server full"])
     assert int(str(said["unacknowledged"])) > 0
     assert (said["kept"], said["server after"], said["same"]) == (True, "", True)
 
 
-def test_a_full_disk_is_one_line_and_so_is_that_it_has_room(said: dict[str, object]) -> None:
+def test_a_full_disk_is_one_line_and_so_is_that_it_has_room(said: dict[str, object]):
     for kind in ("lines", "room again"):
         lines = said[kind]
         assert isinstance(lines, list)
@@ -138,14 +136,14 @@ def test_a_full_disk_is_one_line_and_so_is_that_it_has_room(said: dict[str, obje
 
 
 @pytest.mark.parametrize("name", ["journal", "store", "new store"])
-def test_a_read_only_disk_is_named(said: dict[str, object], name: str) -> None:
+def test_a_read_only_disk_is_named(said: dict[str, object], name: str):
     assert "the disk is read-only" in str(said[name])
     assert "\n" not in str(said[name])
 
 
-def test_a_map_on_a_read_only_disk_can_be_read(said: dict[str, object]) -> None:
+def test_a_map_on_a_read_only_disk_can_be_read(said: dict[str, object]):
     assert said["read"] is True
 
 
-def test_a_disk_that_is_full_at_the_start_is_named(said: dict[str, object]) -> None:
+def test_a_disk_that_is_full_at_the_start_is_named(said: dict[str, object]):
     assert "the disk is full" in str(said["begun full"])

@@ -1,7 +1,5 @@
 """Both stores: exactly once, in order, and nothing that is half done."""
 
-from __future__ import annotations
-
 import sqlite3
 import zlib
 from collections.abc import Callable, Iterable, Iterator
@@ -87,7 +85,7 @@ def sequences(store: Store, map_id: MapId = MAP) -> list[int]:
 
 
 @pytest.mark.parametrize("acknowledged", [4, 5, 6])
-def test_a_log_is_compared_where_the_store_once_had_more_of_it(store: Store, acknowledged: int) -> None:
+def test_a_log_is_compared_where_the_store_once_had_more_of_it(store: Store, acknowledged: int):
     store.doubt(MAP, acknowledged)
     assert store.unverified(MAP) is None, "there is nothing of this log"
     store.apply(MAP, 5, entries(node_put(k) for k in range(1, 6)))
@@ -95,7 +93,7 @@ def test_a_log_is_compared_where_the_store_once_had_more_of_it(store: Store, ack
     assert store.unverified(MAP) == ((MAP, 1, 5) if acknowledged > 5 else None)
 
 
-def test_the_newest_change_is_known_by_its_body(store: Store) -> None:
+def test_the_newest_change_is_known_by_its_body(store: Store):
     store.apply(MAP, 5, [entry(1), entry(2), broken(3)])
     second = StoredChange(2, zlib.crc32(encode_body(NodeRetired(NodeId(*MAP, 2)))))
     assert store.newest_change(MAP, 3) == store.newest_change(MAP, 2) == second, (
@@ -104,7 +102,7 @@ def test_the_newest_change_is_known_by_its_body(store: Store) -> None:
     assert store.newest_change(MAP, 1) != second and store.newest_change(MAP, 0) is None
 
 
-def test_a_change_that_the_disk_damages_later_contradicts_no_robot(tmp_path: Path) -> None:
+def test_a_change_that_the_disk_damages_later_contradicts_no_robot(tmp_path):
     with closing(SqliteStore(tmp_path / "s0.sqlite")) as store:
         store.apply(MAP, 5, [entry(1), entry(2)])
         assert store.newest_change(MAP, 2) is not None
@@ -113,11 +111,11 @@ def test_a_change_that_the_disk_damages_later_contradicts_no_robot(tmp_path: Pat
         assert store.newest_change(MAP, 2) is None and store.newest_change(MAP, 1) is not None
 
 
-def test_an_unknown_map_is_empty(store: Store) -> None:
+def test_an_unknown_map_is_empty(store: Store):
     assert (store.maps(), store.watermark(MAP), store.positions(), sequences(store)) == ([], 0, {}, [])
 
 
-def test_doubles_are_left_out_and_gaps_stop(store: Store) -> None:
+def test_doubles_are_left_out_and_gaps_stop(store: Store):
     assert store.apply(MAP, 5, [entry(1), entry(1), entry(2)]).watermark == 2
     applied = store.apply(MAP, 5, [entry(1), entry(2), entry(3), entry(5)])
     assert ([c.sequence for c in applied.changes], applied.watermark) == ([3], 3)
@@ -125,14 +123,14 @@ def test_doubles_are_left_out_and_gaps_stop(store: Store) -> None:
     assert sequences(store) == [1, 2, 3]
 
 
-def test_an_answer_for_a_range_may_have_holes(store: Store) -> None:
+def test_an_answer_for_a_range_may_have_holes(store: Store):
     applied = store.apply(MAP, 5, [entry(2), entry(5)], covered=7)
     assert ([c.sequence for c in applied.changes], applied.watermark) == ([2, 5], 7)
     assert store.apply(MAP, 5, [], covered=3).watermark == 7
     assert sequences(store) == [2, 5]
 
 
-def test_all_is_there_after_a_restart(place: Path | str) -> None:
+def test_all_is_there_after_a_restart(place: Path | str):
     store = open_store(place)
     store_id = store.id
     store.apply(MAP, 2**64 - 1, [entry(1, node_put(1, 3)), broken(2), entry(3)])
@@ -150,7 +148,7 @@ def test_all_is_there_after_a_restart(place: Path | str) -> None:
     store.close()
 
 
-def test_a_bad_change_is_kept_aside_and_the_log_goes_on(store: Store) -> None:
+def test_a_bad_change_is_kept_aside_and_the_log_goes_on(store: Store):
     applied = store.apply(MAP, 5, [entry(1), broken(2), entry(3)])
     assert [c.sequence for c in applied.changes] == [1, 3]
     assert applied.watermark == 3
@@ -161,7 +159,7 @@ def test_a_bad_change_is_kept_aside_and_the_log_goes_on(store: Store) -> None:
     assert store.apply(MAP, 5, [entry(2)]).changes == (), "it was settled"
 
 
-def test_only_the_newest_refusals_are_given(store: Store) -> None:
+def test_only_the_newest_refusals_are_given(store: Store):
     store.apply(MAP, 5, [broken(k) for k in range(1, 31)])
     assert [refusal.sequence for refusal in store.refusals(MAP, newest=3)] == [28, 29, 30]
     assert store.refused() == 30
@@ -170,21 +168,21 @@ def test_only_the_newest_refusals_are_given(store: Store) -> None:
 @pytest.mark.parametrize(
     ("claimed", "sequence"), [(MapId("r1", 1), 1), (MapId("r0", 2), 1), (MapId("r0", 1), 2)]
 )
-def test_a_change_must_match_its_log(claimed: MapId, sequence: int) -> None:
+def test_a_change_must_match_its_log(claimed: MapId, sequence: int):
     message = encode_change(Change(MAP, 1, 0, NodeRetired(NodeId(*MAP, 1))))
     read = ReceivedChange.read(claimed, sequence, message)
     assert isinstance(read.change, str)
     assert "came as" in read.change
 
 
-def test_another_log_of_the_same_name_is_refused(store: Store) -> None:
+def test_another_log_of_the_same_name_is_refused(store: Store):
     store.apply(MAP, 5, [entry(1)])
     with pytest.raises(InvalidValue, match=r"another log goes by the name r0\.1"):
         store.apply(MAP, 6, [entry(2)])
     assert sequences(store) == [1]
 
 
-def test_many_logs_in_one_transaction(store: Store) -> None:
+def test_many_logs_in_one_transaction(store: Store):
     store.apply(MAP, 5, [entry(1)])
     foreign = entry(1, node_put(1, 10, OTHER), OTHER)
     taken, other, mine, again = store.apply_all(
@@ -203,7 +201,7 @@ def test_many_logs_in_one_transaction(store: Store) -> None:
     assert store.apply_all([]) == []
 
 
-def test_edges_to_landmarks_that_are_not_there_are_refused(store: Store) -> None:
+def test_edges_to_landmarks_that_are_not_there_are_refused(store: Store):
     bodies: list[ChangeBody] = [
         node_put(1, landmarks=3), edge_put(11, 1, 2, [(2, 500)]),
         node_put(2, landmarks=5), edge_put(12, 1, 2, [(2, 4), (0, 0)]),
@@ -219,7 +217,7 @@ def test_edges_to_landmarks_that_are_not_there_are_refused(store: Store) -> None
 
 @settings(max_examples=25, deadline=None)
 @given(st.lists(st.lists(st.integers(1, 12), max_size=8), max_size=12))
-def test_any_input_makes_a_log(tmp_path_factory: pytest.TempPathFactory, batches: list[list[int]]) -> None:
+def test_any_input_makes_a_log(tmp_path_factory, batches: list[list[int]]):
     """Against the plain meaning: a set of what came, and the longest run from one."""
     store = SqliteStore(tmp_path_factory.mktemp("store") / "s")
     expected = 0
@@ -256,7 +254,7 @@ def fill_the_disk(store: Store) -> Callable[[], None]:
     return lambda: rows.execute("DROP TRIGGER room ON change")
 
 
-def test_a_transaction_that_fails_leaves_nothing(store: Store) -> None:
+def test_a_transaction_that_fails_leaves_nothing(store: Store):
     store.apply(MAP, 5, [entry(1)])
     make_room = fill_the_disk(store)
     with pytest.raises(InvalidFile, match="disk is full"):
@@ -273,9 +271,7 @@ def test_a_transaction_that_fails_leaves_nothing(store: Store) -> None:
     assert store.apply(MAP, 5, [entry(2), broken(3), entry(4)]).watermark == 4
 
 
-def test_what_is_pruned_is_gone_and_is_not_taken_again(
-    place: Path | str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_pruned_is_gone_and_is_not_taken_again(place: Path | str, monkeypatch):
     def refuse(*_: object) -> None:
         raise InvalidFile("the disk is full")
 
@@ -300,7 +296,7 @@ def test_what_is_pruned_is_gone_and_is_not_taken_again(
     store.close()
 
 
-def test_what_comes_while_nodes_are_pruned_stays(store: Store) -> None:
+def test_what_comes_while_nodes_are_pruned_stays(store: Store):
     """A node that is put again behind what was known then is there again, by its new change alone."""
     store.apply(MAP, 5, entries([node_put(1, 3), node_put(2, 5), edge_put(11, 1, 2)]))
     store.apply(MAP, 5, entries([node_put(2, 4), edge_put(11, 1, 2)], 4))
@@ -312,7 +308,7 @@ def test_what_comes_while_nodes_are_pruned_stays(store: Store) -> None:
     assert [store.landmarks(node) for node in nodes] == [None, 4]
 
 
-def test_what_another_server_has_pruned_by_then_is_not_written_over(store: Store) -> None:
+def test_what_another_server_has_pruned_by_then_is_not_written_over(store: Store):
     store.apply(MAP, 5, [entry(1, node_put(1, 3)), entry(2, node_put(2, 5))])
     nodes = [NodeId(*MAP, 1)]
     assert store.prune(nodes, [], {"mark": b"1", "pruned 0": b"one"}, None, {"mark": None})
@@ -325,7 +321,7 @@ def test_what_another_server_has_pruned_by_then_is_not_written_over(store: Store
     assert sequences(store) == [] and store.result("mark") == b"2"
 
 
-def test_what_a_lost_retirement_undid_goes_when_the_robot_has_dropped_it(place: Path | str) -> None:
+def test_what_a_lost_retirement_undid_goes_when_the_robot_has_dropped_it(place: Path | str):
     store = open_store(place)
     before = [node_put(1, 3), node_put(2, 5), edge_put(11, 1, 2), node_put(2, 4)]
     store.apply(MAP, 5, entries([*before, node_put(3, 2), edge_put(11, 1, 3)]), 8)
@@ -347,7 +343,7 @@ def test_what_a_lost_retirement_undid_goes_when_the_robot_has_dropped_it(place: 
     store.close()
 
 
-def test_the_wire_bytes_of_the_maps(store: Store) -> None:
+def test_the_wire_bytes_of_the_maps(store: Store):
     assert store.traffic().node_puts == 0
     log = entries([node_put(1, 100), node_put(1, 120), node_put(2, 50), edge_put(11, 1, 2)])
     store.apply(MAP, 5, log)
@@ -364,14 +360,14 @@ def test_the_wire_bytes_of_the_maps(store: Store) -> None:
     assert store.traffic().payload_bytes == sum(sizes) + len(second.message)
 
 
-def test_results_are_kept_by_name(store: Store) -> None:
+def test_results_are_kept_by_name(store: Store):
     assert store.result("poses") is None
     store.put_result("poses", b"1")
     store.put_result("poses", b"2")
     assert store.result("poses") == b"2"
 
 
-def test_a_secret_is_drawn_once_for_all_servers_of_a_store(place: Path | str) -> None:
+def test_a_secret_is_drawn_once_for_all_servers_of_a_store(place: Path | str):
     first = open_store(place)
     drawn = first.secret("choice")
     assert len(drawn) == 16
@@ -384,9 +380,7 @@ def test_a_secret_is_drawn_once_for_all_servers_of_a_store(place: Path | str) ->
         assert again.secret("choice") == drawn
 
 
-def test_a_secret_that_the_disk_does_not_take_is_used_all_the_same(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_secret_that_the_disk_does_not_take_is_used_all_the_same(tmp_path, monkeypatch):
     with closing(SqliteStore(tmp_path / "s0.sqlite")) as store:
 
         def full(*_: object) -> None:
@@ -397,7 +391,7 @@ def test_a_secret_that_the_disk_does_not_take_is_used_all_the_same(
         assert store.result("choice") is None
 
 
-def test_a_journal_is_no_store(tmp_path: Path) -> None:
+def test_a_journal_is_no_store(tmp_path):
     from mapweave.agent.replication.journal import Journal
 
     Journal(tmp_path / "j", "r0").close()
@@ -410,7 +404,7 @@ def contents(store: Store) -> set[bytes]:
     return {encode_body(body) for body in HybridMap(change.body for change in store.replay(MAP)).contents()}
 
 
-def test_what_later_changes_supersede_is_compacted(place: Path | str) -> None:
+def test_what_later_changes_supersede_is_compacted(place: Path | str):
     gone = NodeRetired(NodeId(*MAP, 3))
     bodies: list[ChangeBody] = [
         node_put(1, 3), node_put(2, 5), edge_put(11, 1, 2), node_put(1, 4), node_put(3, 1), gone,
@@ -443,9 +437,7 @@ def test_what_later_changes_supersede_is_compacted(place: Path | str) -> None:
 @pytest.mark.slow
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 3), st.integers(1, 4), st.integers(5, 6)), max_size=30))
-def test_a_compacted_map_is_the_same(
-    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[int, int, int]]
-) -> None:
+def test_a_compacted_map_is_the_same(tmp_path_factory, steps: list[tuple[int, int, int]]):
     """Also for a server that has read a part of the log before, and reads the rest of it afterwards."""
     bodies: list[ChangeBody] = []
     for kind, number, other in steps:
@@ -466,7 +458,7 @@ def test_a_compacted_map_is_the_same(
     store.close()
 
 
-def test_reasons_of_refusals_are_bounded(store: Store, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_reasons_of_refusals_are_bounded(store: Store, monkeypatch):
     monkeypatch.setattr("mapweave.mapserver.log.store.MOST_REFUSED_KEPT", 3)
     monkeypatch.setattr("mapweave.mapserver.log.store.MOST_REFUSALS", 10)
     store.apply(MAP, 5, [broken(k) for k in range(1, 41)])
@@ -478,8 +470,8 @@ def test_reasons_of_refusals_are_bounded(store: Store, monkeypatch: pytest.Monke
 @settings(max_examples=60, deadline=None)
 @given(st.lists(st.tuples(st.integers(0, 5), st.sampled_from([MAP, OTHER]), st.integers(1, 4)), max_size=20))
 def test_what_is_remembered_of_nodes_is_what_the_rows_say(
-    tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[int, MapId, int]]
-) -> None:
+    tmp_path_factory, steps: list[tuple[int, MapId, int]]
+):
     store = SqliteStore(tmp_path_factory.mktemp("store") / "s")
     nodes = [NodeId(*map_id, number) for map_id in (MAP, OTHER) for number in range(1, 5)]
     log_ids = {MAP: 5, OTHER: 6}

@@ -1,7 +1,5 @@
 """Who has copied landmarks of another robot, and who has not."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -26,7 +24,7 @@ from tests.mapserver.false_maps import FIRST, LAST, copies, driven
 from tests.mapserver.test_set_apart import TOUR, WORLD, sound_logs
 
 
-def test_who_shares_landmarks_with_most_has_copied_them_if_nothing_else_tells() -> None:
+def test_who_shares_landmarks_with_most_has_copied_them_if_nothing_else_tells():
     """A server that has lost its disk may hear the one that lies first."""
     nodes = [body.node for body in copies(LAST) if isinstance(body, NodePut)]
     logs = [[decode_change(message).body for message in log] for log in sound_logs().values()]
@@ -44,7 +42,7 @@ def test_who_shares_landmarks_with_most_has_copied_them_if_nothing_else_tells() 
     assert all(copied_landmarks(a, b) == 0 for a in other for b in sound)
 
 
-def test_a_person_links_two_maps_of_one_recording() -> None:
+def test_a_person_links_two_maps_of_one_recording():
     """They are copies of each other until then, and again when the link is taken back."""
     merger = Merger()
     log = [decode_change(message) for message in next(iter(sound_logs().values()))]
@@ -82,7 +80,7 @@ def test_a_person_links_two_maps_of_one_recording() -> None:
     assert merged.disbelieved.keys() == {LAST} and not merged.implausible
 
 
-def test_a_robot_that_parks_where_another_one_has_mapped_has_copied_nothing() -> None:
+def test_a_robot_that_parks_where_another_one_has_mapped_has_copied_nothing():
     """Within a millimetre many descriptors are the same bit by bit; what it measured of them is not."""
     node = take_map(WORLD, FIRST, TOUR[:1], np.random.default_rng(4))[0][0]
     noise = np.random.default_rng(5)
@@ -98,7 +96,7 @@ def test_a_robot_that_parks_where_another_one_has_mapped_has_copied_nothing() ->
 
 
 @pytest.mark.parametrize("many", [LEAST_SAME - 1, LEAST_SAME])
-def test_nodes_with_the_landmarks_of_others_one_for_one_are_copies(many: int) -> None:
+def test_nodes_with_the_landmarks_of_others_one_for_one_are_copies(many: int):
     """Noise of the pixels, the descriptors and the depths makes no other view: it has other landmarks."""
     true = take_map(WORLD, FIRST, TOUR, np.random.default_rng(4))[0][:many]
     assert len(true) == many
@@ -118,7 +116,7 @@ def test_nodes_with_the_landmarks_of_others_one_for_one_are_copies(many: int) ->
     assert not found.maps(frozenset())
 
 
-def test_views_from_the_very_same_places_are_no_copies() -> None:
+def test_views_from_the_very_same_places_are_no_copies():
     """As of robots that start at one mark, one after the other: each finds and keeps other features."""
     first, second = (
         take_map(WORLD, who, TOUR, np.random.default_rng(n))[0] for n, who in enumerate((FIRST, LAST))

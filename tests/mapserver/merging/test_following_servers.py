@@ -1,7 +1,5 @@
 """Servers on one PostgreSQL: one merges, the others adopt its merges; any of them may be killed or frozen."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -187,7 +185,7 @@ def views_of(changes: list[Change]) -> list[View]:
 
 
 @pytest.mark.parametrize("seed", first_quick(range(1, 5), 1, 2))
-def test_followers_have_the_leaders_map_and_give_its_answers(servers: Servers, seed: int) -> None:
+def test_followers_have_the_leaders_map_and_give_its_answers(servers: Servers, seed: int):
     changes = numbered(drives(seed))
     servers.start("s0", "s1")
     servers.send(changes[:30], 0.01)
@@ -207,7 +205,7 @@ def test_followers_have_the_leaders_map_and_give_its_answers(servers: Servers, s
 
 
 @pytest.mark.parametrize("seed", first_quick(range(1, 4), 0))
-def test_a_follower_takes_over_and_compares_nothing_again(servers: Servers, seed: int) -> None:
+def test_a_follower_takes_over_and_compares_nothing_again(servers: Servers, seed: int):
     changes = numbered(drives(seed))
     servers.start("s0", "s1", "s2")
     servers.send(changes[:40], 0.02)
@@ -237,8 +235,8 @@ DAMAGE: dict[str, Any] = {
 @pytest.mark.parametrize("name", first_quick([PART.format(0), MERGE, MERGE_MARK], 1))
 @pytest.mark.parametrize("how", first_quick(DAMAGE, 1))
 def test_a_follower_whose_merge_is_damaged_merges_itself_and_says_so(
-    servers: Servers, address: str, name: str, how: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    servers: Servers, address: str, name: str, how: str, monkeypatch
+):
     changes = numbered(drives(1))
     begun(servers, changes[:24])
     # The leader writes no more: what lies there is all that one that comes late has.
@@ -272,9 +270,7 @@ def test_a_follower_whose_merge_is_damaged_merges_itself_and_says_so(
     assert_follows(servers, unmerged=False)
 
 
-def test_a_server_with_other_settings_merges_itself(
-    servers: Servers, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_with_other_settings_merges_itself(servers: Servers, monkeypatch):
     monkeypatch.setattr(merge_adoption, "PATIENCE", 0.1)
     servers.start("s0")
     servers.start("s1", merging=MergeSettings(exclusion=ExclusionSettings(doubt=0.01)))
@@ -285,7 +281,7 @@ def test_a_server_with_other_settings_merges_itself(
     assert len(servers["s1"]._worker.answers.merged.poses) == len(servers["s0"]._worker.answers.merged.poses)
 
 
-def test_one_server_alone_hands_nothing_over(servers: Servers) -> None:
+def test_one_server_alone_hands_nothing_over(servers: Servers):
     servers.start("s0")
     servers.send(numbered(drives(1))[:24])
     servers.settle()
@@ -296,9 +292,7 @@ def failing(merger: Merger, use: object) -> None:
     raise ZeroDivisionError
 
 
-def test_a_follower_says_that_its_leader_cannot_merge_and_how_old_its_map_is(
-    servers: Servers, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_follower_says_that_its_leader_cannot_merge_and_how_old_its_map_is(servers: Servers, monkeypatch):
     changes = numbered(drives(1))
     begun(servers, changes[:24])
     (follower,) = servers.followers
@@ -330,9 +324,7 @@ def test_a_follower_says_that_its_leader_cannot_merge_and_how_old_its_map_is(
         assert server.status()["delay"] == ""
 
 
-def test_a_follower_says_that_its_leader_stands_still(
-    servers: Servers, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_follower_says_that_its_leader_stands_still(servers: Servers, monkeypatch):
     monkeypatch.setattr(merge_adoption, "SILENT", 3.0)
     changes = numbered(drives(1))
     begun(servers, changes[:24])
@@ -463,9 +455,7 @@ def assert_same_places(said: dict[str, Any], alone: MergedMap) -> None:
 @pytest.mark.slow
 @pytest.mark.timeout(600)
 @pytest.mark.parametrize("seed", range(1, 4))
-def test_a_leader_killed_while_it_merges_is_replaced(
-    processes: list[Process], address: str, seed: int
-) -> None:
+def test_a_leader_killed_while_it_merges_is_replaced(processes: list[Process], address: str, seed: int):
     changes = numbered(drives(seed))
     leader, *others = processes
     with closing(PostgresStore(address, "robots")) as store:
@@ -495,9 +485,7 @@ def test_a_leader_killed_while_it_merges_is_replaced(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_frozen_leader_is_replaced_and_follows_when_it_continues(
-    processes: list[Process], address: str
-) -> None:
+def test_a_frozen_leader_is_replaced_and_follows_when_it_continues(processes: list[Process], address: str):
     changes = numbered(drives(2))
     leader, *others = processes
     with closing(PostgresStore(address, "robots")) as store:

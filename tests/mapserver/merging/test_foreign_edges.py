@@ -1,7 +1,5 @@
 """A robot's edges between nodes of others do not change how these are merged."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -53,7 +51,7 @@ def claims(log: Log, kind: EdgeKind, landmarks: int) -> Log:
 
 @pytest.mark.parametrize("kind", list(EdgeKind))
 @pytest.mark.parametrize("when", ["before", "after", "taken back"])
-def test_edges_between_the_nodes_of_others_change_nothing(sound: Log, kind: EdgeKind, when: str) -> None:
+def test_edges_between_the_nodes_of_others_change_nothing(sound: Log, kind: EdgeKind, when: str):
     merger = Merger()
     merger.read(sound)
     alone = merger.merged()

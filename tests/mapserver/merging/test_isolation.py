@@ -1,7 +1,5 @@
 """A map with which the merge fails is set apart, and all others are merged as if it were not there."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Collection, Iterable
 from dataclasses import replace
@@ -37,7 +35,7 @@ pairs = st.lists(st.lists(st.integers(0, 9), min_size=1, max_size=3, unique=True
 
 
 @given(pairs, st.permutations(range(10)))
-def test_the_good_rows_are_kept_and_usable(bad: list[list[int]], order: list[int]) -> None:
+def test_the_good_rows_are_kept_and_usable(bad: list[list[int]], order: list[int]):
     """Against all sets that fail: no number that was left out could be added."""
 
     def attempt(some: Collection[int]) -> set[int]:
@@ -52,7 +50,7 @@ def test_the_good_rows_are_kept_and_usable(bad: list[list[int]], order: list[int
             attempt(kept | {node_id})
 
 
-def test_one_bad_map_of_many_is_found_in_few_attempts() -> None:
+def test_one_bad_map_of_many_is_found_in_few_attempts():
     attempts = 0
 
     def attempt(some: Collection[int]) -> None:
@@ -65,7 +63,7 @@ def test_one_bad_map_of_many_is_found_in_few_attempts() -> None:
     assert attempts <= 2 * 10 + 1
 
 
-def test_a_failure_without_any_map_sets_no_map_apart() -> None:
+def test_a_failure_without_any_map_sets_no_map_apart():
     def attempt(some: Collection[int]) -> None:
         raise KeyError("always")
 
@@ -127,9 +125,7 @@ def said(merged: MergedMap, *maps: MapId) -> tuple[object, ...]:
     )
 
 
-def test_a_map_with_which_it_fails_is_set_apart_and_the_others_are_as_without_it(
-    logs: Logs, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_map_with_which_it_fails_is_set_apart_and_the_others_are_as_without_it(logs: Logs, monkeypatch):
     alone = merger_of(logs, R0, R1).merged()
     assert len(alone.links) > 2
     alone_fails(monkeypatch, BAD)
@@ -143,9 +139,7 @@ def test_a_map_with_which_it_fails_is_set_apart_and_the_others_are_as_without_it
             merged.check(BAD)
 
 
-def test_a_server_that_runs_goes_on_when_a_map_comes_with_which_it_fails(
-    logs: Logs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_server_that_runs_goes_on_when_a_map_comes_with_which_it_fails(logs: Logs, monkeypatch, caplog):
     alone_fails(monkeypatch, BAD)
     merger = merger_of(logs, R0)
     merger.merged()
@@ -158,9 +152,7 @@ def test_a_server_that_runs_goes_on_when_a_map_comes_with_which_it_fails(
     assert merged.set_apart.keys() == {BAD} and not caplog.records
 
 
-def test_two_maps_that_fail_only_together_cost_the_smaller_one_alone(
-    logs: Logs, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_two_maps_that_fail_only_together_cost_the_smaller_one_alone(logs: Logs, monkeypatch):
     together_fail(monkeypatch, R1, WORSE)
     small = {**logs, WORSE: logs[WORSE][:3]}
     alone = merger_of(logs, R0, R1).merged()
@@ -174,9 +166,7 @@ def test_two_maps_that_fail_only_together_cost_the_smaller_one_alone(
     assert merger.merged().set_apart.keys() == {R1}
 
 
-def test_a_map_set_apart_is_tried_again_after_a_change(
-    logs: Logs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_map_set_apart_is_tried_again_after_a_change(logs: Logs, monkeypatch, caplog):
     merger = merger_of(logs, R0, R1, WORSE)
     node = logs[WORSE][0][1]
     assert isinstance(node, NodePut)
@@ -198,7 +188,7 @@ def test_a_map_set_apart_is_tried_again_after_a_change(
     assert said(merged, R0, R1, WORSE) == said(merger_of(logs, R0, R1, WORSE).merged(), R0, R1, WORSE)
 
 
-def test_a_merged_map_that_breaks_its_users_is_set_apart(logs: Logs) -> None:
+def test_a_merged_map_that_breaks_its_users_is_set_apart(logs: Logs):
     merger = merger_of(logs, R0, R1, BAD)
 
     def use(merged: MergedMap) -> None:
@@ -208,9 +198,7 @@ def test_a_merged_map_that_breaks_its_users_is_set_apart(logs: Logs) -> None:
     assert merger.merged(use).maps.keys() == {R0, R1}
 
 
-def test_a_retired_map_breaks_nothing_and_is_not_set_apart(
-    logs: Logs, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_retired_map_breaks_nothing_and_is_not_set_apart(logs: Logs, monkeypatch):
     alone_fails(monkeypatch, BAD)
     merger = merger_of(logs, R0, R1, BAD)
     assert merger.merged().set_apart
@@ -223,16 +211,14 @@ def test_a_retired_map_breaks_nothing_and_is_not_set_apart(
     assert merger.merged().set_apart.keys() == {BAD}
 
 
-def test_a_bad_map_is_left_out_before_comparing(logs: Logs, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bad_map_is_left_out_before_comparing(logs: Logs, monkeypatch):
     alone_fails(monkeypatch, BAD)
     merger = merger_of(logs, BAD, R0, R1)
     apart = merger.apart()
     assert apart.maps.keys() == {R0, R1} and len(apart.components) == 2
 
 
-def test_nodes_that_cannot_be_compared_are_not_linked(
-    logs: Logs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_nodes_that_cannot_be_compared_are_not_linked(logs: Logs, monkeypatch, caplog):
     import mapweave.mapserver.merging.node_comparisons as module
 
     real = module.verify
@@ -250,7 +236,7 @@ def test_nodes_that_cannot_be_compared_are_not_linked(
     assert "cannot be compared" in caplog.text and caplog.records[0].levelno == logging.ERROR
 
 
-def test_a_node_whose_search_fails_holds_up_no_other(logs: Logs, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_node_whose_search_fails_holds_up_no_other(logs: Logs, monkeypatch):
     merger = merger_of(logs, BAD, R0, R1)
     real = merger.places.overlaps
 
@@ -265,7 +251,7 @@ def test_a_node_whose_search_fails_holds_up_no_other(logs: Logs, monkeypatch: py
     assert said(merged, R0, R1) == said(merger_of(logs, R0, R1).merged(), R0, R1)
 
 
-def test_a_map_of_which_nodes_lie_beyond_all_messages_is_set_apart(logs: Logs) -> None:
+def test_a_map_of_which_nodes_lie_beyond_all_messages_is_set_apart(logs: Logs):
     """Each edge is within its bounds, and all together they are not."""
     far = PoseGaussian.from_sigmas(Pose2(9.9e4), 0.1, 0.01)
     node, edge = (
@@ -282,7 +268,7 @@ def test_a_map_of_which_nodes_lie_beyond_all_messages_is_set_apart(logs: Logs) -
     assert said(merged, R0, R1) == said(merger_of(logs, R0, R1).merged(), R0, R1)
 
 
-def test_files_are_merged_with_all_maps_or_not_at_all(logs: Logs, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_are_merged_with_all_maps_or_not_at_all(logs: Logs, monkeypatch):
     """Else the map would be missing in what is written."""
     alone_fails(monkeypatch, BAD)
     maps = {item: HybridMap(body for _, body in logs[item]) for item in (R0, BAD)}

@@ -1,12 +1,9 @@
 """Servers that are really killed, and go on over the files next to their stores."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
@@ -120,7 +117,7 @@ def reported_and_killed(program: str, *arguments: object, until: Callable[[], ob
 
 
 @pytest.mark.slow
-def test_a_killed_server_supersedes_and_links_what_one_that_goes_on_does(tmp_path: Path) -> None:
+def test_a_killed_server_supersedes_and_links_what_one_that_goes_on_does(tmp_path):
     _, whole = reported_and_killed(MAPPING, tmp_path / "on", 0, 6)
     assert len(whole[0]) > 15 and len(whole[1]) > 20
     before: Any = None
@@ -132,7 +129,7 @@ def test_a_killed_server_supersedes_and_links_what_one_that_goes_on_does(tmp_pat
 
 
 @pytest.mark.slow
-def test_a_server_that_is_killed_goes_on_where_it_was(tmp_path: Path) -> None:
+def test_a_server_that_is_killed_goes_on_where_it_was(tmp_path):
     store = tmp_path / "store"
     cache = store.with_name(store.name + SUFFIX)
     first, second = (reported_and_killed(STARTING, store, until=cache.exists) for _ in range(2))

@@ -1,7 +1,5 @@
 """When a server that leads hands its merges over, and how long what has come waits for a merge."""
 
-from __future__ import annotations
-
 import random
 from types import SimpleNamespace
 from typing import Any, cast
@@ -63,9 +61,7 @@ def hand_over(
     return handover.write(merger, {}, None, outdated, trouble)
 
 
-def test_a_slow_disk_takes_a_share_of_the_time(
-    handover: MergeHandover, followed: Followed, clock: Clock
-) -> None:
+def test_a_slow_disk_takes_a_share_of_the_time(handover: MergeHandover, followed: Followed, clock: Clock):
     for merges in range(1, 200):
         wait = hand_over(handover, merges)
         clock.now += 0.5
@@ -76,7 +72,7 @@ def test_a_slow_disk_takes_a_share_of_the_time(
 
 def test_a_merge_is_handed_over_once_and_not_while_it_is_outdated(
     handover: MergeHandover, followed: Followed
-) -> None:
+):
     assert hand_over(handover, 1, outdated=True) is None and not followed.written
     for _ in range(3):
         assert hand_over(handover, 1) is None
@@ -85,7 +81,7 @@ def test_a_merge_is_handed_over_once_and_not_while_it_is_outdated(
 
 def test_an_older_merge_that_is_handed_over_withdraws_no_trouble_of_a_newer_one(
     handover: MergeHandover, followed: Followed, clock: Clock
-) -> None:
+):
     hand_over(handover, 1)
     assert hand_over(handover, 2) is not None, "it waits for its time"
     clock.now += 100.0
@@ -95,9 +91,7 @@ def test_an_older_merge_that_is_handed_over_withdraws_no_trouble_of_a_newer_one(
     assert followed.said[-1] == ""
 
 
-def test_a_merge_that_cannot_be_written_is_said_until_one_can(
-    handover: MergeHandover, followed: Followed
-) -> None:
+def test_a_merge_that_cannot_be_written_is_said_until_one_can(handover: MergeHandover, followed: Followed):
     followed.fails = True
     hand_over(handover, 1)
     assert "no room" in followed.said[-1]
@@ -106,7 +100,7 @@ def test_a_merge_that_cannot_be_written_is_said_until_one_can(
     assert followed.said[-1] == ""
 
 
-def test_the_oldest_that_is_not_merged_counts_to_a_second() -> None:
+def test_the_oldest_that_is_not_merged_counts_to_a_second():
     draw, clock = random.Random(5), Clock()
     unmerged, came, merged = Unmerged(clock), list[float](), 0
     for _ in range(2000):
@@ -121,7 +115,7 @@ def test_the_oldest_that_is_not_merged_counts_to_a_second() -> None:
         assert wanted <= unmerged.seconds <= wanted + (STEP if wanted else 0.0)
 
 
-def test_what_is_kept_is_bounded_and_the_oldest_is_right() -> None:
+def test_what_is_kept_is_bounded_and_the_oldest_is_right():
     clock = Clock()
     unmerged = Unmerged(clock)
     for number in range(1, 3 * MOST):

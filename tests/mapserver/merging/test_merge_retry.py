@@ -1,7 +1,5 @@
 """A merge for which the memory does not suffice: the last map stays, and it is tried again."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
@@ -89,7 +87,7 @@ with MergeRetry(Path(sys.argv[1])).attempt():
 """
 
 
-def test_the_last_map_stays_and_no_map_is_blamed_where_memory_is_short() -> None:
+def test_the_last_map_stays_and_no_map_is_blamed_where_memory_is_short():
     """With a real limit of the process: maps were set apart one by one, until they changed."""
     done = subprocess.run(
         [sys.executable, "-c", SHORT_OF_MEMORY], capture_output=True, text=True, timeout=120, check=False
@@ -104,7 +102,7 @@ def test_the_last_map_stays_and_no_map_is_blamed_where_memory_is_short() -> None
     assert all(line.startswith(f"{merge_retry.SHORT}: merging begins again after") for line in lines)
 
 
-def test_it_is_tried_less_and_less_often() -> None:
+def test_it_is_tried_less_and_less_often():
     clock = Clock()
     retry = MergeRetry(None, clock)
     pauses = []
@@ -122,9 +120,7 @@ def killed(path: Path) -> None:
     subprocess.run([sys.executable, "-c", KILLED, str(path)], timeout=60, check=False)
 
 
-def test_a_process_that_is_killed_while_it_merges_is_noticed(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_process_that_is_killed_while_it_merges_is_noticed(tmp_path, caplog):
     path = tmp_path / "s0.sqlite"
     assert not MergeRetry(path).pause and not caplog.records
     killed(path)
@@ -149,9 +145,7 @@ def test_a_process_that_is_killed_while_it_merges_is_noticed(
     assert not MergeRetry(path).pause
 
 
-def test_a_server_that_was_killed_twice_answers_before_it_merges(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_that_was_killed_twice_answers_before_it_merges(tmp_path, monkeypatch):
     monkeypatch.setattr(merge_retry, "FIRST", 3.0)
     monkeypatch.setattr("mapweave.mapserver.merge_worker.RETRY", 0.1)
     path = tmp_path / "s0.sqlite"
@@ -176,9 +170,7 @@ def test_a_server_that_was_killed_twice_answers_before_it_merges(
     assert not MergeRetry(path).pause
 
 
-def test_a_server_that_ends_in_order_before_it_has_merged_was_not_killed(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_server_that_ends_in_order_before_it_has_merged_was_not_killed(tmp_path, caplog):
     path = tmp_path / "s0.sqlite"
     killed(path)
     killed(path)
@@ -191,7 +183,7 @@ def test_a_server_that_ends_in_order_before_it_has_merged_was_not_killed(
     assert not MergeRetry(path).pause and not caplog.records
 
 
-def test_an_intake_that_has_no_memory_ends_the_server_and_loses_nothing(tmp_path: Path) -> None:
+def test_an_intake_that_has_no_memory_ends_the_server_and_loses_nothing(tmp_path):
     """Its thread ended without a word, and the server went on without it."""
     hub = MemoryHub()
     logs = looked_around([R0], 3)

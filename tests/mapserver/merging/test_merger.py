@@ -71,7 +71,7 @@ def same(first: MergedMap, second: MergedMap) -> bool:
     )
 
 
-def test_two_maps_become_one(scene: Scene, merger: Merger) -> None:
+def test_two_maps_become_one(scene: Scene, merger: Merger):
     merged = merger.merged()
     assert len(merged.components) == 1 and merged.joined(A, B)
     anchor = min(scene.truth)
@@ -81,13 +81,13 @@ def test_two_maps_become_one(scene: Scene, merger: Merger) -> None:
     assert merger.merged().summary().startswith("28 nodes, 2 maps, 1 component, ")
 
 
-def test_order_of_arrival_does_not_matter(scene: Scene, merger: Merger) -> None:
+def test_order_of_arrival_does_not_matter(scene: Scene, merger: Merger):
     both = [change for pair in zip(scene.logs[B], scene.logs[A], strict=True) for change in pair]
     other = scene.merger(both)
     assert same(merger.merged(), other.merged())
 
 
-def test_each_pair_is_compared_once_and_nothing_is_done_twice(scene: Scene) -> None:
+def test_each_pair_is_compared_once_and_nothing_is_done_twice(scene: Scene):
     merger = scene.merger(scene.logs[A])
     first = merger.merged()
     compared = merger.counters.verified
@@ -97,7 +97,7 @@ def test_each_pair_is_compared_once_and_nothing_is_done_twice(scene: Scene) -> N
     assert merger.counters.verified == compared and merger.counters.merges == 2
 
 
-def test_a_node_that_is_known_better_is_compared_again(scene: Scene) -> None:
+def test_a_node_that_is_known_better_is_compared_again(scene: Scene):
     merger = scene.merger(scene.logs[A] + scene.logs[B])
     before = merger.merged()
     compared = merger.counters.verified
@@ -109,7 +109,7 @@ def test_a_node_that_is_known_better_is_compared_again(scene: Scene) -> None:
     assert merger.counters.verified > compared
 
 
-def test_retired_nodes_take_their_links_along(scene: Scene) -> None:
+def test_retired_nodes_take_their_links_along(scene: Scene):
     merger = scene.merger(scene.logs[A] + scene.logs[B][:3])
     assert any(not link.within for link in merger.merged().links)
     gone = [node for node in scene.truth if node.map == B]
@@ -121,14 +121,14 @@ def test_retired_nodes_take_their_links_along(scene: Scene) -> None:
     assert same(merged, scene.merger([*scene.logs[A], (B, NodeRetired(gone[0]))]).merged())
 
 
-def test_a_merged_map_stays_as_it_was(scene: Scene) -> None:
+def test_a_merged_map_stays_as_it_was(scene: Scene):
     merger = scene.merger(scene.logs[A])
     merged = merger.merged()
     merger.on_change(Change(A, 300, 0, NodeRetired(min(scene.truth))))
     assert min(scene.truth) in merged.maps[A].nodes
 
 
-def test_a_map_that_only_others_are_compared_with_is_not_copied(scene: Scene) -> None:
+def test_a_map_that_only_others_are_compared_with_is_not_copied(scene: Scene):
     """What is remembered of a map is remembered of its very copy: pieces, and links that were sorted."""
     merger = scene.merger(scene.logs[A])
     before = merger.merged()
@@ -141,7 +141,7 @@ def test_a_map_that_only_others_are_compared_with_is_not_copied(scene: Scene) ->
     assert merger.merged().maps[B] is not after.maps[B]
 
 
-def test_reading_a_store_gives_the_same_as_merging_live(scene: Scene, merger: Merger) -> None:
+def test_reading_a_store_gives_the_same_as_merging_live(scene: Scene, merger: Merger):
     other = Merger()
     for map_id, body in scene.logs[B] + scene.logs[A]:
         other.apply(map_id, body)
@@ -150,7 +150,7 @@ def test_reading_a_store_gives_the_same_as_merging_live(scene: Scene, merger: Me
 
 
 @pytest.mark.parametrize(("clock", "joined"), [("net", False), ("", True)])
-def test_robots_that_would_walk_through_each_other_are_not_joined(clock: str, joined: bool) -> None:
+def test_robots_that_would_walk_through_each_other_are_not_joined(clock: str, joined: bool):
     """Two robots do the same at the same time in two rooms that look the same: only the clock differs."""
     rng = np.random.default_rng(4)
     one = room(0, 0, 5, 4, 600, rng)
@@ -169,7 +169,7 @@ def relocalizer(merger: Merger) -> Relocalizer:
     return Relocalizer(merger.places, merger.node, merger.merged())
 
 
-def test_lost_robots_are_found_with_honest_poses(scene: Scene, merger: Merger) -> None:
+def test_lost_robots_are_found_with_honest_poses(scene: Scene, merger: Merger):
     rng, service = np.random.default_rng(5), relocalizer(merger)
     count, distances, errors = 0, [], []
     for node, stop in list(scene.truth.items())[::2]:
@@ -192,9 +192,7 @@ def test_lost_robots_are_found_with_honest_poses(scene: Scene, merger: Merger) -
     assert max(distances) < 20 and np.median(errors) < 0.06
 
 
-def test_nodes_that_cannot_change_the_answer_are_not_examined(
-    scene: Scene, merger: Merger, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_nodes_that_cannot_change_the_answer_are_not_examined(scene: Scene, merger: Merger, monkeypatch):
     """The answer is that of a relocalizer which examines all of them; most of the work is saved."""
     examined: list[NodeId] = []
 
@@ -223,7 +221,7 @@ def test_nodes_that_cannot_change_the_answer_are_not_examined(
     assert counts[0] > 3 and counts[0] < 0.5 * counts[1]
 
 
-def test_elsewhere_is_unknown_with_a_reason(scene: Scene, merger: Merger) -> None:
+def test_elsewhere_is_unknown_with_a_reason(scene: Scene, merger: Merger):
     rng, service = np.random.default_rng(6), relocalizer(merger)
     other = room(0, 0, 5, 4, 500, rng)
     for k in range(10):
@@ -234,7 +232,7 @@ def test_elsewhere_is_unknown_with_a_reason(scene: Scene, merger: Merger) -> Non
     assert "3 features" in service.answer(nothing).reason
 
 
-def test_two_similar_rooms_are_ambiguous() -> None:
+def test_two_similar_rooms_are_ambiguous():
     rng = np.random.default_rng(7)
     one = room(0, 0, 5, 4, 500, rng)
     # Walls of points hide nothing: what lies far enough off is not seen from the room between.
@@ -254,7 +252,7 @@ def test_two_similar_rooms_are_ambiguous() -> None:
     assert service.answer(view).certainty is Certainty.FOUND
 
 
-def test_maps_that_nothing_joins_are_not_silently_confused(scene: Scene) -> None:
+def test_maps_that_nothing_joins_are_not_silently_confused(scene: Scene):
     """Two robots mapped the same room, and no merged map says so yet."""
     rng = np.random.default_rng(8)
     merger = Merger()
@@ -269,9 +267,7 @@ def test_maps_that_nothing_joins_are_not_silently_confused(scene: Scene) -> None
     assert all(c.merged_from_robot is None and c.component == -1 for c in answer.candidates)
 
 
-def test_fusing_never_claims_more_than_the_better_estimate_and_both_allow(
-    scene: Scene, merger: Merger
-) -> None:
+def test_fusing_never_claims_more_than_the_better_estimate_and_both_allow(scene: Scene, merger: Merger):
     rng = np.random.default_rng(9)
     view, _ = take_view(scene.world, min(scene.truth.items())[1], rng)
     first = relocalizer(merger).answer(view).candidates[0].node_from_robot
@@ -280,7 +276,7 @@ def test_fusing_never_claims_more_than_the_better_estimate_and_both_allow(
     assert again.mean.distance(first.mean) < 1e-9
 
 
-def test_probability_grows_with_support_and_falls_with_rivals() -> None:
+def test_probability_grows_with_support_and_falls_with_rivals():
     def probability(**changes: float) -> float:
         known = {"inliers": 20, "share": 0.7, "seen": 0.4, "matches": 1, "others": 0.0}
         return probabilities([HypothesisSupport(**{**known, **changes})])[0]  # type: ignore[arg-type]
@@ -294,7 +290,7 @@ def test_probability_grows_with_support_and_falls_with_rivals() -> None:
     assert probabilities([twin, twin]) == pytest.approx([0.5, 0.5], abs=0.1), "one of two that look the same"
 
 
-def test_routes_lead_from_map_to_map_by_measured_edges(scene: Scene, merger: Merger) -> None:
+def test_routes_lead_from_map_to_map_by_measured_edges(scene: Scene, merger: Merger):
     merged = merger.merged()
     router = Router(merged)
     start, goal = min(scene.truth), max(scene.truth)
@@ -318,7 +314,7 @@ def test_routes_lead_from_map_to_map_by_measured_edges(scene: Scene, merger: Mer
     )
 
 
-def test_a_route_begins_near_the_robot(scene: Scene, merger: Merger) -> None:
+def test_a_route_begins_near_the_robot(scene: Scene, merger: Merger):
     """A robot that knows itself by a node seen from afar does not first drive there."""
     router = Router(merger.merged())
     start, goal = min(scene.truth), max(scene.truth)
@@ -331,7 +327,7 @@ def test_a_route_begins_near_the_robot(scene: Scene, merger: Merger) -> None:
     assert legs[0].previous_from_node.mean.distance(scene.truth[start].inverse() @ first) < 0.2
 
 
-def test_long_undriven_links_are_avoided(scene: Scene, merger: Merger) -> None:
+def test_long_undriven_links_are_avoided(scene: Scene, merger: Merger):
     merged = merger.merged()
     start, goal = min(scene.truth), max(scene.truth)
     bold = RouteSettings(per_undriven=0.0)
@@ -347,7 +343,7 @@ def test_long_undriven_links_are_avoided(scene: Scene, merger: Merger) -> None:
     assert longest(Router(merged)) <= longest(Router(merged, bold))
 
 
-def test_missing_routes_have_a_reason(scene: Scene) -> None:
+def test_missing_routes_have_a_reason(scene: Scene):
     merger = scene.merger(scene.logs[A])
     merger.apply(B, scene.logs[B][13][1])
     router = Router(merger.merged())

@@ -1,7 +1,5 @@
 """The merged map depends on the record alone, not on the order and the steps in which its changes came."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any
@@ -112,8 +110,8 @@ WAYS = ["altered copies that tear", "places seen from aside", "altered copied pl
 # With shuffled maps, the last merge takes nodes in again that were never compared with newer ones.
 @example(order=[0, 13, 0, 14, 0, 0, 0, 0, 17, 2, 11, 0, 11, 0], steps=[42])
 def test_a_merge_in_steps_is_the_merge_of_the_record(
-    way: str, order: list[int], steps: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
+    way: str, order: list[int], steps: list[int], monkeypatch
+):
     # Few links are tested of many, as in a large map.
     monkeypatch.setattr(wrong_geometry, "MOST_LINKS", 12)
     expected, fresh = fresh_merge(way)

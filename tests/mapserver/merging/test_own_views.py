@@ -1,11 +1,8 @@
 """A map whose views contradict its own way is named and makes no answer ambiguous; an honest one is not."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -71,7 +68,7 @@ def without_odd(seed: int) -> set[tuple[NodeId, NodeId]]:
 
 @pytest.mark.parametrize("seed", first_quick([33001, 33002], 1, 1))
 @pytest.mark.parametrize("lie", [too_deep, other_lens])
-def test_a_map_whose_views_contradict_its_own_way_is_named(lie: Lie, seed: int) -> None:
+def test_a_map_whose_views_contradict_its_own_way_is_named(lie: Lie, seed: int):
     fleet = draw_fleet(seed, SCENES["room"], OdometryFault.NONE, stops=2)
     found = merged(fleet, lie)
     assert found.implausible.keys() == {ODD}
@@ -85,12 +82,12 @@ def test_a_map_whose_views_contradict_its_own_way_is_named(lie: Lie, seed: int) 
 @pytest.mark.parametrize(
     "fault", first_quick([OdometryFault.SLIP, OdometryFault.CARRIED, OdometryFault.NONE], 2)
 )
-def test_views_do_not_contradict_a_way_that_slipped_once(fault: OdometryFault, seed: int) -> None:
+def test_views_do_not_contradict_a_way_that_slipped_once(fault: OdometryFault, seed: int):
     """Wrong geometry has rules of its own: one slip is no share by which all is too long."""
     assert not merged(draw_fleet(seed, SCENES["room"], fault, stops=2)).implausible
 
 
-def test_a_robot_that_never_returns_is_judged_by_its_neighbours() -> None:
+def test_a_robot_that_never_returns_is_judged_by_its_neighbours():
     """The merge compares no nodes that an edge joins: it would learn nothing about other maps."""
     rng = np.random.default_rng(5)
     map_id, tour = MapId("r0", 1), [Pose2(0.7 + 0.5 * k, 2.0, 0.05 * k) for k in range(8)]
@@ -132,7 +129,7 @@ LYING, TRUE = 48, 24
 """Nodes of a robot that chooses its ids: those whose depths are wrong, and others."""
 
 
-def test_a_robot_that_chooses_its_ids_does_not_choose_what_is_looked_at() -> None:
+def test_a_robot_that_chooses_its_ids_does_not_choose_what_is_looked_at():
     """It knows the code, and numbers its nodes so that by an unkeyed choice its true nodes are looked at."""
     one = _with_chosen_ids()
     assert not _reason(one, b""), "else the ids are not chosen well enough to show anything"
@@ -140,7 +137,7 @@ def test_a_robot_that_chooses_its_ids_does_not_choose_what_is_looked_at() -> Non
         assert "times as long" in _reason(one, key)
 
 
-def test_each_store_has_a_choice_of_its_own_which_servers_keep(tmp_path: Path) -> None:
+def test_each_store_has_a_choice_of_its_own_which_servers_keep(tmp_path):
     keys = list[bytes]()
     live, repeatable = MergeSurroundings.live, MergeSurroundings.repeatable
     for name, surroundings in (("a", live), ("a", live), ("b", live), ("c", repeatable)):

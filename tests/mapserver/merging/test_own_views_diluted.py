@@ -1,7 +1,5 @@
 """A robot that hides wrong depths among nodes that show next to nothing, as many as it likes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import product
 
@@ -29,14 +27,14 @@ DRIVE, DECOYS, EDGES = 24, 100, 13
 @pytest.mark.parametrize(
     ("seed", "landmarks"), first_quick(product([5, 6, 7, 11, 12, 13], [LEAST_LANDMARKS - 1, 1]), 1)
 )
-def test_nodes_with_few_landmarks_hide_no_wrong_depths(seed: int, landmarks: int) -> None:
+def test_nodes_with_few_landmarks_hide_no_wrong_depths(seed: int, landmarks: int):
     """With two of three keys of a store the map was not named any more."""
     for key in (b"", b"a", b"b"):
         assert "times as long" in _reason(_diluted(seed, landmarks, too_deep=1.3), key)
         assert not _reason(_diluted(seed, landmarks, too_deep=1.0), key)
 
 
-def test_a_map_of_such_nodes_alone_is_not_judged() -> None:
+def test_a_map_of_such_nodes_alone_is_not_judged():
     assert not _reason(_diluted(5, 1, too_deep=1.3, drive=1), b"")
 
 

@@ -1,7 +1,5 @@
 """Superseded nodes leave the map after a time: what stays is where it was, also after a restart."""
 
-from __future__ import annotations
-
 import gc
 import math
 from collections.abc import Iterator
@@ -102,7 +100,7 @@ def poses_apart(a: MergedMap, b: MergedMap) -> float:
 
 
 @pytest.mark.slow
-def test_what_is_superseded_for_long_leaves_and_the_rest_stays(logs: Logs, tmp_path: Path) -> None:
+def test_what_is_superseded_for_long_leaves_and_the_rest_stays(logs: Logs, tmp_path):
     path = tmp_path / "s0.sqlite"
     with serving(path) as server:
         for map_id in MAPS:
@@ -149,7 +147,7 @@ def pruned(
         yield before, server.merged(), server
 
 
-def test_words_name_what_replaces_it(pruned: tuple[MergedMap, MergedMap, Server]) -> None:
+def test_words_name_what_replaces_it(pruned: tuple[MergedMap, MergedMap, Server]):
     before, after, _ = pruned
     node = min(after.pruned.nodes)
     by = before.superseded[node].by
@@ -159,7 +157,7 @@ def test_words_name_what_replaces_it(pruned: tuple[MergedMap, MergedMap, Server]
     assert found.node == by and str(node) in found.note
 
 
-def test_routes_from_and_to_it_hold(pruned: tuple[MergedMap, MergedMap, Server]) -> None:
+def test_routes_from_and_to_it_hold(pruned: tuple[MergedMap, MergedMap, Server]):
     before, after, _ = pruned
     nodes = sorted(after.pruned.nodes)
     for start, goal in ((nodes[0], nodes[-1]), (nodes[-1], nodes[0])):
@@ -176,9 +174,7 @@ def test_routes_from_and_to_it_hold(pruned: tuple[MergedMap, MergedMap, Server])
         assert near[-1].node.id == legs[-1].node.id
 
 
-def test_a_node_that_is_sent_again_is_there_again(
-    logs: Logs, pruned: tuple[MergedMap, MergedMap, Server]
-) -> None:
+def test_a_node_that_is_sent_again_is_there_again(logs: Logs, pruned: tuple[MergedMap, MergedMap, Server]):
     _, after, server = pruned
     node = min(after.pruned.nodes)
     body = next(
@@ -194,7 +190,7 @@ def test_a_node_that_is_sent_again_is_there_again(
     merged.check(node)
 
 
-def test_a_line_of_successors_is_followed() -> None:
+def test_a_line_of_successors_is_followed():
     a, b, c, d = (NodeId("r0", k, 1) for k in range(1, 5))
     step = Pose2(1.0, 0.0, math.pi / 2)
     nodes = PrunedNodes(
@@ -207,7 +203,7 @@ def test_a_line_of_successors_is_followed() -> None:
     assert nodes.successor(d, set()) is None, "it was sent again, and pruned again"
 
 
-def test_nothing_is_remembered_of_a_node_that_has_left(logs: Logs, tmp_path: Path) -> None:
+def test_nothing_is_remembered_of_a_node_that_has_left(logs: Logs, tmp_path):
     with serving(tmp_path / "s0.sqlite") as server:
         for map_id in MAPS:
             server.take(logs.changes[map_id])
@@ -240,7 +236,7 @@ def reachable(root: object) -> Iterator[object]:
 
 
 @pytest.mark.parametrize("years", [-50.0, 50.0], ids=["behind", "ahead"])
-def test_a_clock_that_is_set_makes_nothing_older(logs: Logs, tmp_path: Path, years: float) -> None:
+def test_a_clock_that_is_set_makes_nothing_older(logs: Logs, tmp_path, years: float):
     """A machine without a clock of its own begins in another year, until it has heard what time it is."""
     day, off = 0.0, years * 365.0
     with serving(tmp_path / "s0.sqlite") as server:
@@ -261,8 +257,8 @@ def test_a_clock_that_is_set_makes_nothing_older(logs: Logs, tmp_path: Path, yea
 
 @pytest.mark.parametrize("years", [-50.0, 0.1], ids=["behind", "ahead"])
 def test_no_clock_of_a_server_that_takes_over_is_enough_for_nodes_to_leave(
-    logs: Logs, tmp_path: Path, years: float
-) -> None:
+    logs: Logs, tmp_path, years: float
+):
     path, off = tmp_path / "s0.sqlite", years * 365.0
     with serving(path) as server:
         for map_id in MAPS:
@@ -278,7 +274,7 @@ def test_no_clock_of_a_server_that_takes_over_is_enough_for_nodes_to_leave(
         assert server.prune(4.0 + DAYS), "it leaves all the same"
 
 
-def test_what_is_left_of_many_nodes_takes_few_records(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_left_of_many_nodes_takes_few_records(monkeypatch):
     monkeypatch.setattr("mapweave.mapserver.merging.pruning.PART_NODES", 4)
     results: dict[str, bytes] = {}
     pruning = Pruning()

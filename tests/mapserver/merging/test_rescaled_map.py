@@ -1,7 +1,5 @@
 """A robot sends its map again with other lengths, while others use what has come of it so far."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -66,9 +64,7 @@ def sent_again(fleet: FaultyFleet) -> list[ChangeBody]:
 
 
 @pytest.mark.slow
-def test_a_map_that_comes_again_with_other_lengths_is_whole_and_links_nothing_wrongly(
-    fleet: FaultyFleet,
-) -> None:
+def test_a_map_that_comes_again_with_other_lengths_is_whole_and_links_nothing_wrongly(fleet: FaultyFleet):
     merger = Merger()
     for change in fleet.changes():
         merger.on_change(change)

@@ -143,7 +143,7 @@ def retired(map_id: MapId) -> ManualConstraints:
     return ManualConstraints([ManualConstraint(RetiredMap(map_id), True, "anna", 1, "moved")])
 
 
-def test_a_restarted_server_supersedes_what_it_had(before: Server, tmp_path: Path) -> None:
+def test_a_restarted_server_supersedes_what_it_had(before: Server, tmp_path):
     assert len(before.merger.merged().superseded) > 10
     assert decisions(Server(tmp_path / "store", drives())) == decisions(before)
     # Without the record it would have been another table.
@@ -161,7 +161,7 @@ def test_a_restarted_server_supersedes_what_it_had(before: Server, tmp_path: Pat
 )
 def test_a_killed_server_ends_as_one_that_goes_on(
     seed: int, kills: list[int], step: int, saved: float, gone: tuple[int, int, int] | None
-) -> None:
+):
     """Also if its verification cache is older than its last merge, and a person retires a map meanwhile."""
     log = drives(seed)
     bounds = [0, *sorted(kills), len(log)]
@@ -186,7 +186,7 @@ def test_a_killed_server_ends_as_one_that_goes_on(
 
 
 @pytest.mark.parametrize("amount", first_quick([5, 1, 9], 1))
-def test_changes_that_no_merge_has_seen_are_taken_in_afterwards(tmp_path: Path, amount: int) -> None:
+def test_changes_that_no_merge_has_seen_are_taken_in_afterwards(tmp_path, amount: int):
     log = drives()
     server = by_drive(tmp_path / "store", log[:-amount])
     for k, (map_id, body) in enumerate(log[-amount:]):
@@ -233,7 +233,7 @@ def random_log(rng: np.random.Generator, nodes: Sequence[NodeId]) -> Superseding
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_loading_returns_what_was_saved(seed: int, tmp_path: Path) -> None:
+def test_loading_returns_what_was_saved(seed: int, tmp_path):
     record = random_record(np.random.default_rng(seed))
     save(tmp_path / "x", record, "me")
     assert load(tmp_path / "x", "me") == record
@@ -292,7 +292,7 @@ BAD: dict[str, Any] = {
 
 
 @pytest.mark.parametrize("bad", BAD)
-def test_what_cannot_be_is_refused(bad: str, tmp_path: Path) -> None:
+def test_what_cannot_be_is_refused(bad: str, tmp_path):
     """A whole file with a valid checksum."""
     record = random_record(np.random.default_rng(1))
     save(tmp_path / "x", replace(record, **BAD[bad](record)), "me")
@@ -302,9 +302,7 @@ def test_what_cannot_be_is_refused(bad: str, tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("damage", first_quick(["flipped", "version", "merging", "cut", "empty", "other"], 3))
 @pytest.mark.usefixtures("before")
-def test_a_damaged_record_is_thrown_away(
-    tmp_path: Path, damage: str, caplog: pytest.LogCaptureFixture, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_damaged_record_is_thrown_away(tmp_path, damage: str, caplog, monkeypatch):
     log = drives()
     path = tmp_path / f"store{RECORD_SUFFIX}"
     data = bytearray(path.read_bytes())
@@ -339,7 +337,7 @@ def test_a_damaged_record_is_thrown_away(
 
 
 @pytest.mark.slow
-def test_a_table_of_other_nodes_does_no_harm(tmp_path: Path) -> None:
+def test_a_table_of_other_nodes_does_no_harm(tmp_path):
     """The store of another fleet was put in the place of this one."""
     by_drive(tmp_path / "store", drives(2))
     other = [
@@ -365,7 +363,7 @@ def _moved(map_id: MapId, put: NodePut) -> NodePut:
     return NodePut(replace(put.node, id=NodeId(*map_id, put.node.id.number)))
 
 
-def test_a_record_without_a_verification_cache_is_used(before: Server, tmp_path: Path) -> None:
+def test_a_record_without_a_verification_cache_is_used(before: Server, tmp_path):
     (tmp_path / f"store{SUFFIX}").unlink()
     again = Server(tmp_path / "store", drives())
     assert again.merger.counters.verified > 50
@@ -373,7 +371,7 @@ def test_a_record_without_a_verification_cache_is_used(before: Server, tmp_path:
     assert len(same) > 0.8 * len(before.merger.merged().superseded)
 
 
-def test_a_slow_disk_is_used_a_twentieth_of_the_time(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_slow_disk_is_used_a_twentieth_of_the_time(tmp_path, monkeypatch):
     now, written = [0.0], list[float]()
 
     def slowly(path: Path, record: RestartRecord, made_by: str) -> None:
@@ -393,7 +391,7 @@ def test_a_slow_disk_is_used_a_twentieth_of_the_time(tmp_path: Path, monkeypatch
     assert len(written) == 4 and load(tmp_path / f"x{RECORD_SUFFIX}", made_by(merger)) == merger.record()
 
 
-def test_a_full_disk_is_reported_once(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_full_disk_is_reported_once(tmp_path, caplog):
     now = [0.0]
     (tmp_path / "later").mkdir()
     merger = Merger()

@@ -1,7 +1,5 @@
 """A server that adopts the merges of another has the same map, and goes on from it when it must."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -176,7 +174,7 @@ def constrained(seed: int) -> ManualConstraints:
 )
 def test_a_follower_has_the_leaders_map_and_goes_on_from_it(
     seed: int, steps: list[int], seen: list[bool], late: list[int], full: int, said: int
-) -> None:
+):
     """It misses merges, hears changes early, and takes over at last; beside it a leader that goes on."""
     results, changes = Results(), numbered(drives(seed))
     with pytest.MonkeyPatch.context() as patch, TemporaryDirectory() as folder:
@@ -232,7 +230,7 @@ def follower_of(handed_over: HandedOver) -> Follower:
     return Follower(results)
 
 
-def test_time_without_a_store_is_no_time_without_a_leader(handed_over: HandedOver) -> None:
+def test_time_without_a_store_is_no_time_without_a_leader(handed_over: HandedOver):
     follower = follower_of(handed_over)
     follower.results.values[MERGE] = b""
     assert not follower.look() and follower.adoption.reason.endswith("is incomplete or damaged")
@@ -244,9 +242,7 @@ def test_time_without_a_store_is_no_time_without_a_leader(handed_over: HandedOve
     assert not follower.look() and follower.adoption.overdue
 
 
-def test_a_follower_that_has_not_all_waits_longer_than_one_with_other_maps(
-    handed_over: HandedOver,
-) -> None:
+def test_a_follower_that_has_not_all_waits_longer_than_one_with_other_maps(handed_over: HandedOver):
     changes, lacking, other = handed_over[1], follower_of(handed_over), follower_of(handed_over)
     lacking.take(changes[:-1])
     assert not lacking.look() and "has not merged" in lacking.adoption.reason
@@ -262,7 +258,7 @@ def test_a_follower_that_has_not_all_waits_longer_than_one_with_other_maps(
 
 
 @pytest.mark.parametrize("taken", [0, 5, 24])
-def test_changes_that_could_not_be_taken_in_are_not_lost(handed_over: HandedOver, taken: int) -> None:
+def test_changes_that_could_not_be_taken_in_are_not_lost(handed_over: HandedOver, taken: int):
     """Those of a merge, of which some are in the map, and those behind it."""
     changes = handed_over[1]
     later = numbered(drives(1))[24:30]
@@ -283,9 +279,7 @@ def test_changes_that_could_not_be_taken_in_are_not_lost(handed_over: HandedOver
     assert leading.merger.maps.keys() == {change.map for change in [*changes, *later]}
 
 
-def test_a_follower_gives_up_at_once_and_tries_the_next_merge_later(
-    handed_over: HandedOver, tmp_path: Path
-) -> None:
+def test_a_follower_gives_up_at_once_and_tries_the_next_merge_later(handed_over: HandedOver, tmp_path):
     changes, follower = handed_over[1], follower_of(handed_over)
     follower.take(changes)
     assert follower.look() and follower.adoption.in_step(follower.merger)
@@ -308,7 +302,7 @@ def test_a_follower_gives_up_at_once_and_tries_the_next_merge_later(
 
 @pytest.mark.parametrize("name", [MERGE, MERGE_MARK, PART.format(0)])
 @pytest.mark.parametrize("how", ["missing", "empty", "cut", "flipped"])
-def test_what_is_damaged_is_not_adopted(handed_over: HandedOver, name: str, how: str) -> None:
+def test_what_is_damaged_is_not_adopted(handed_over: HandedOver, name: str, how: str):
     follower = follower_of(handed_over)
     value, values = follower.results.values.pop(name), follower.results.values
     if how != "missing":
@@ -323,8 +317,8 @@ def test_what_is_damaged_is_not_adopted(handed_over: HandedOver, name: str, how:
 
 
 def test_merges_with_other_settings_or_of_another_version_are_not_adopted(
-    handed_over: HandedOver, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    handed_over: HandedOver, monkeypatch
+):
     follower = Follower(handed_over[0], MergeSettings(exclusion=ExclusionSettings(doubt=0.01)))
     follower.take(handed_over[1])
     assert not follower.look() and "with other settings" in follower.adoption.reason

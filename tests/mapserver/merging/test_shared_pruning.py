@@ -1,14 +1,11 @@
 """Servers that share a store: one prunes, all have the same map, and nothing is lost when one is killed."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
@@ -102,7 +99,7 @@ def servers(logs: Logs, stores: Callable[[str], Store]) -> list[Front]:
 
 def test_what_the_leader_prunes_the_others_let_go(
     servers: list[Front], stores: Callable[[str], Store], address: str
-) -> None:
+):
     leader, other = servers
     news: list[News] = []
     other.store.follow(news.append)
@@ -126,9 +123,7 @@ def test_what_the_leader_prunes_the_others_let_go(
     assert marginals(opened) == marginals(merged)
 
 
-def test_a_leader_of_before_writes_over_nothing(
-    servers: list[Front], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_leader_of_before_writes_over_nothing(servers: list[Front], monkeypatch):
     """One that stood still believes that it leads."""
     monkeypatch.setattr(PostgresStore, "leads", True)
     old, new = servers
@@ -151,7 +146,7 @@ def test_a_leader_of_before_writes_over_nothing(
 
 def test_what_a_robot_sends_while_it_is_pruned_is_kept_by_all(
     servers: list[Front], logs: Logs, stores: Callable[[str], Store]
-) -> None:
+):
     leader, other = servers
     node = min(set(other.merged().superseded) - {leader.merged().graphs[0].nodes[0]})
     log = logs.changes[node.map]
@@ -175,9 +170,7 @@ def test_what_a_robot_sends_while_it_is_pruned_is_kept_by_all(
         assert_same(leader.merged(), server.merged())
 
 
-def test_what_postgresql_has_lost_again_returns(
-    servers: list[Front], logs: Logs, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_postgresql_has_lost_again_returns(servers: list[Front], logs: Logs, monkeypatch):
     """Commits that no standby confirmed, seen before the primary was lost."""
     leader, other = servers
     names = (PRUNING, PRUNING_MARK)
@@ -209,9 +202,7 @@ def test_what_postgresql_has_lost_again_returns(
         assert len(merged.components) == 1 and poses_apart(before, merged) < 0.05
 
 
-def test_a_record_that_is_written_while_it_is_read_is_read_again(
-    servers: list[Front], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_record_that_is_written_while_it_is_read_is_read_again(servers: list[Front], monkeypatch):
     leader, other = servers
     merged, result = other.merged(), type(other.store).result
     pruned: list[bool] = []
@@ -229,9 +220,7 @@ def test_a_record_that_is_written_while_it_is_read_is_read_again(
     assert_same(leader.merged(), other.merged())
 
 
-def test_a_change_that_waited_while_its_node_was_pruned_brings_nothing_back(
-    logs: Logs, tmp_path: Path
-) -> None:
+def test_a_change_that_waited_while_its_node_was_pruned_brings_nothing_back(logs: Logs, tmp_path):
     with serving(tmp_path / "s0.sqlite") as server:
         for map_id in MAPS:
             server.take(logs.changes[map_id])
@@ -264,8 +253,8 @@ def hash_of(server: MapServer) -> str:
 
 
 def test_a_server_that_follows_has_the_pruned_map_and_the_merges_after_it(
-    logs: Logs, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+    logs: Logs, address: str, tmp_path, monkeypatch
+):
     """Just the leader's, without a merge of its own."""
     for patience in ("PATIENCE", "FIRST"):
         monkeypatch.setattr(merge_adoption, patience, 1000.0)
@@ -344,9 +333,7 @@ with MapServer(MemoryBus(MemoryHub()), Keys("fleet"), address, "s0", cache=Path(
 
 @pytest.mark.slow
 @pytest.mark.timeout(600)
-def test_a_leader_that_is_killed_while_it_prunes(
-    logs: Logs, address: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_leader_that_is_killed_while_it_prunes(logs: Logs, address: str, tmp_path, monkeypatch):
     """Another one does it, once; a third follows; robots of both hear which nodes they may retire."""
     monkeypatch.setattr(pruning, "DAY_NS", 1)
     hub = MemoryHub()

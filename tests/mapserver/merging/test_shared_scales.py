@@ -1,9 +1,5 @@
 """A server that adopts a merge in which lengths were corrected has it bit by bit, and says the same of it."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from mapweave.mapserver.map_files import map_file_of, merged_of
@@ -19,7 +15,7 @@ SEED, FACTOR = 9413, 1.04
 
 
 @pytest.mark.slow
-def test_a_corrected_map_is_adopted_bit_by_bit_and_named(tmp_path: Path) -> None:
+def test_a_corrected_map_is_adopted_bit_by_bit_and_named(tmp_path):
     fleet = draw_fleet(SEED, SCENES["room"], OdometryFault.NONE)
     maps = {**fleet.maps, ODD: longer(fleet.maps[ODD], FACTOR, FACTOR)}
     log = numbered([(which, body) for which, content in maps.items() for body in changes_of(*content)])
@@ -56,7 +52,7 @@ def test_a_corrected_map_is_adopted_bit_by_bit_and_named(tmp_path: Path) -> None
 
 
 @pytest.mark.slow
-def test_a_map_file_of_a_corrected_map_has_its_poses(tmp_path: Path) -> None:
+def test_a_map_file_of_a_corrected_map_has_its_poses(tmp_path):
     fleet = draw_fleet(SEED, SCENES["room"], OdometryFault.NONE, stops=2)
     maps = {**fleet.maps, ODD: longer(fleet.maps[ODD], FACTOR, FACTOR)}
     merged = merger_of({which: changes_of(*content) for which, content in maps.items()}).merged()

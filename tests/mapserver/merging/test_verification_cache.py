@@ -1,7 +1,5 @@
 """The verification cache outlives the process, and is used for unchanged nodes only."""
 
-from __future__ import annotations
-
 import logging
 import os
 import resource
@@ -93,7 +91,7 @@ def random_findings(rng: np.random.Generator) -> VerificationCache:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_loading_returns_what_was_saved(seed: int, tmp_path: Path) -> None:
+def test_loading_returns_what_was_saved(seed: int, tmp_path):
     one = random_findings(np.random.default_rng(seed))
     save(tmp_path / "x", one, "me")
     two = load(tmp_path / "x", "me")
@@ -113,7 +111,7 @@ def test_loading_returns_what_was_saved(seed: int, tmp_path: Path) -> None:
         load(tmp_path / "x", "another version")
 
 
-def test_a_restarted_server_compares_nothing_and_merges_the_same(logged: Log, tmp_path: Path) -> None:
+def test_a_restarted_server_compares_nothing_and_merges_the_same(logged: Log, tmp_path):
     first = read(logged)
     merged = first.merged()
     assert first.counters.verified > 50 and len(merged.components) == 1
@@ -126,7 +124,7 @@ def test_a_restarted_server_compares_nothing_and_merges_the_same(logged: Log, tm
     assert same(merged, read(logged, tmp_path / "store").merged())
 
 
-def test_later_nodes_are_compared_with_all(logged: Log, tmp_path: Path) -> None:
+def test_later_nodes_are_compared_with_all(logged: Log, tmp_path):
     first = read(logged[:-20])
     first.merged()
     saved(first, tmp_path / "store")
@@ -135,7 +133,7 @@ def test_later_nodes_are_compared_with_all(logged: Log, tmp_path: Path) -> None:
     assert 0 < again.counters.verified < 0.8 * whole.counters.verified
 
 
-def test_a_node_that_is_no_longer_just_so_is_compared_again(logged: Log, tmp_path: Path) -> None:
+def test_a_node_that_is_no_longer_just_so_is_compared_again(logged: Log, tmp_path):
     first = read(logged)
     before = first.merged()
     saved(first, tmp_path / "store")
@@ -152,13 +150,7 @@ def test_a_node_that_is_no_longer_just_so_is_compared_again(logged: Log, tmp_pat
 
 
 @pytest.mark.parametrize("damage", first_quick(["flipped", "version", "merging", "cut", "empty", "other"], 3))
-def test_a_damaged_index_is_built_again(
-    logged: Log,
-    tmp_path: Path,
-    damage: str,
-    caplog: pytest.LogCaptureFixture,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_damaged_index_is_built_again(logged: Log, tmp_path, damage: str, caplog, monkeypatch):
     path = saved_once(logged, tmp_path)
     data = bytearray(path.read_bytes())
     if damage == "cut":
@@ -187,9 +179,7 @@ def test_a_damaged_index_is_built_again(
 
 
 @pytest.mark.parametrize("fresh", [False, True])
-def test_a_new_store_is_not_reported_as_unknown(
-    tmp_path: Path, fresh: bool, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_new_store_is_not_reported_as_unknown(tmp_path, fresh: bool, caplog):
     with caplog.at_level(logging.INFO):
         VerificationCacheKeeper(tmp_path / "store", fresh).restore(Merger())
     assert len(caplog.records) == (not fresh)
@@ -201,16 +191,14 @@ def saved_once(logged: Log, tmp_path: Path) -> Path:
     return saved(merger, tmp_path / "store")
 
 
-def test_a_server_that_ends_before_it_has_merged_leaves_the_file_as_it_is(
-    logged: Log, tmp_path: Path
-) -> None:
+def test_a_server_that_ends_before_it_has_merged_leaves_the_file_as_it_is(logged: Log, tmp_path):
     path = saved_once(logged, tmp_path)
     before = path.read_bytes()
     saved(read(logged[:10], tmp_path / "store"), tmp_path / "store")
     assert path.read_bytes() == before
 
 
-def test_a_merge_before_the_store_is_read_keeps_earlier_results(logged: Log, tmp_path: Path) -> None:
+def test_a_merge_before_the_store_is_read_keeps_earlier_results(logged: Log, tmp_path):
     """Manual constraints come first: on a busy machine they were merged alone, and all was compared again."""
     path = saved_once(logged, tmp_path)
     before = path.read_bytes()
@@ -224,7 +212,7 @@ def test_a_merge_before_the_store_is_read_keeps_earlier_results(logged: Log, tmp
     assert len(merger.merged().components) == 1 and merger.counters.verified == 0
 
 
-def test_a_full_disk_is_reported(logged: Log, tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_full_disk_is_reported(logged: Log, tmp_path, caplog):
     merger = read(logged)
     merger.merged()
     now = [0.0]
@@ -240,9 +228,7 @@ def test_a_full_disk_is_reported(logged: Log, tmp_path: Path, caplog: pytest.Log
     assert (tmp_path / "later" / f"store{SUFFIX}").exists()
 
 
-def test_a_process_that_can_open_no_more_files_says_so_once(
-    logged: Log, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_process_that_can_open_no_more_files_says_so_once(logged: Log, tmp_path, caplog):
     merger = read(logged)
     merger.merged()
     now = [0.0]

@@ -1,7 +1,5 @@
 """A map with wrong geometry and true views changes no answers, and two similar rooms stay two."""
 
-from __future__ import annotations
-
 from collections import Counter
 
 import pytest
@@ -35,7 +33,7 @@ def answer_outcomes(merger: Merger, fleet: FaultyFleet, scene: str) -> Counter[A
 
 
 @pytest.mark.slow
-def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
+def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer():
     fleet = draw_fleet(SEED, SCENES["room"], OdometryFault.SLIP, stops=2)
     alone = answer_outcomes(merged_fleet(fleet, frozenset({ODD})), fleet, "room")
     merger, history = merged_fleet(fleet), MapHistory()
@@ -64,7 +62,7 @@ def test_a_map_with_wrong_geometry_is_named_and_changes_no_answer() -> None:
 
 
 @pytest.mark.slow
-def test_a_correct_map_of_a_similar_room_is_not_wrong() -> None:
+def test_a_correct_map_of_a_similar_room_is_not_wrong():
     """The fourth robot knows the twin of a room that the others know, and it is sound."""
     fleet = draw_fleet(SEED, SCENES["twins"], OdometryFault.NONE, stops=2)
     merger = merged_fleet(fleet)

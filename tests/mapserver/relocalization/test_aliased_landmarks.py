@@ -1,7 +1,5 @@
 """What looks alike on the map, and what rests on one thing, in small synthetic worlds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np
@@ -26,7 +24,7 @@ def node(number: int, at: Pose2, seed: int):
     return take_node(WORLD, NodeId("r0", 1, number), at, HERE, np.random.default_rng(seed))
 
 
-def test_a_comparison_of_nodes_is_cached(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_comparison_of_nodes_is_cached(monkeypatch):
     first, twin = node(1, AT, 2), node(2, AT @ Pose2(0.1, -0.05, 0.1), 3)
     doubles = AliasedLandmarks(RecognitionSettings())
     likeness = doubles.compare(twin, first)
@@ -42,7 +40,7 @@ def test_a_comparison_of_nodes_is_cached(monkeypatch: pytest.MonkeyPatch) -> Non
             doubles.compare(twin, replace(first, stamp_ns=first.stamp_ns + 1))  # changed
 
 
-def test_matches_that_a_pose_explains() -> None:
+def test_matches_that_a_pose_explains():
     one = node(1, AT, 2)
     known = np.flatnonzero(one.landmarks.has_depth)[:20]
     pixels = one.landmarks.pixels[known].copy()
@@ -51,7 +49,7 @@ def test_matches_that_a_pose_explains() -> None:
     assert unexplained(one, pairs, pixels, one.camera, Pose2(), 12.0) == 5
 
 
-def test_matches_on_one_thing_count_as_isolated_only_if_the_rest_is_missing() -> None:
+def test_matches_on_one_thing_count_as_isolated_only_if_the_rest_is_missing():
     one = node(1, AT, 2)
     points = one.landmarks.points_in_robot(one.camera)
     known = np.flatnonzero(one.landmarks.has_depth)
@@ -85,7 +83,7 @@ def test_matches_on_one_thing_count_as_isolated_only_if_the_rest_is_missing() ->
     assert resting_on(near, one.camera, clutter)
 
 
-def test_a_person_occludes_one_strip() -> None:
+def test_a_person_occludes_one_strip():
     """Against all strips that begin at a missing landmark, feature by feature."""
     rng, counts = np.random.default_rng(6), set()
     recognition = recognise(node(1, AT, 2), take_view(WORLD, AT, np.random.default_rng(4))[0], None, rng)

@@ -1,7 +1,5 @@
 """Two rooms that look the same, one of them not mapped from where the view was taken."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -92,7 +90,7 @@ def asked(nodes: Sequence[Node], merged: MergedMap, **regions: float) -> Relocal
     return Relocalizer(OnlyTheFirst(nodes, VIEW), by_id.get, merged, settings)
 
 
-def test_neighbours_show_that_a_room_occurs_twice() -> None:
+def test_neighbours_show_that_a_room_occurs_twice():
     nodes = here_and_there()
     merged = joined(nodes)
     assert asked(nodes, merged, least_nodes=0).answer(VIEW).certainty is Certainty.FOUND
@@ -111,7 +109,7 @@ AROUND = (Pose2(0.0, 0.05, 1.55), Pose2(0.05, 0.0, -0.95), Pose2(0.0, 0.0, 2.8),
 """From the stop: what shows nothing of what the view shows."""
 
 
-def test_unobserved_places_are_no_evidence() -> None:
+def test_unobserved_places_are_no_evidence():
     """The nodes around have doubles, all in one direction; where the view's own would be there is none."""
     here = [taken(1 + k, STOP @ look, Pose2(), 10 + k) for k, look in enumerate([SEEN, *AROUND])]
     there = [
@@ -139,12 +137,12 @@ def test_unobserved_places_are_no_evidence() -> None:
     assert asked(few, joined(few), least_nodes=1).answer(VIEW).certainty is Certainty.FOUND
 
 
-def test_unique_landmarks_are_distinct() -> None:
+def test_unique_landmarks_are_distinct():
     for nodes in (here_and_there(OTHER), here_and_there()[:3]):
         assert asked(nodes, joined(nodes)).answer(VIEW).certainty is Certainty.FOUND
 
 
-def test_the_needed_share_of_nodes_is_a_setting() -> None:
+def test_the_needed_share_of_nodes_is_a_setting():
     nodes = here_and_there()[:4]
     merged = joined(nodes)
     # The node that was recognised and one neighbour have a double, the same one.
@@ -156,7 +154,7 @@ def test_the_needed_share_of_nodes_is_a_setting() -> None:
     assert result.certainty is Certainty.AMBIGUOUS
 
 
-def test_aliases_that_cannot_matter_are_not_searched() -> None:
+def test_aliases_that_cannot_matter_are_not_searched():
     """No node has any, and one is left: a party needs two. Each search took 10 ms in a large fleet."""
     for nodes, searched in ((here_and_there()[:1], 0), (here_and_there()[:3], 2), (here_and_there(), 3)):
         service = asked(nodes, joined(nodes))
@@ -174,7 +172,7 @@ def test_aliases_that_cannot_matter_are_not_searched() -> None:
     assert later.answer(VIEW).certainty is Certainty.FOUND and index.asked == 0
 
 
-def test_the_same_room_mapped_twice_is_one_place() -> None:
+def test_the_same_room_mapped_twice_is_one_place():
     nodes = here_and_there()
     twice = [
         replace(one, map_from_robot=PoseGaussian(AWAY.inverse() @ one.map_from_robot.mean, np.eye(3) * 1e-4))
@@ -192,7 +190,7 @@ def concluded(
     return service.conclude(Registration(RetrievedNodes(VIEW, ranked), matches))
 
 
-def test_maps_that_are_not_merged_have_their_own_frames() -> None:
+def test_maps_that_are_not_merged_have_their_own_frames():
     nodes = here_and_there(agent="r1")
     recognition = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
     assert recognition is not None
@@ -203,7 +201,7 @@ def test_maps_that_are_not_merged_have_their_own_frames() -> None:
     assert answer.candidates[1].node.agent == "r1" and answer.candidates[1].merged_from_robot is None
 
 
-def test_aliasing_is_cached_and_kept_up_to_date() -> None:
+def test_aliasing_is_cached_and_kept_up_to_date():
     nodes = here_and_there()
     merged, by_id = joined(nodes), {one.id: one for one in nodes}
     index, alike = OnlyTheFirst(nodes, VIEW), AliasCache(RecognitionSettings())
@@ -231,7 +229,7 @@ def test_aliasing_is_cached_and_kept_up_to_date() -> None:
     assert of(replace(one, stamp_ns=7)) == {twin.id} and index.asked == 3
 
 
-def test_a_merge_that_is_undone_is_noticed() -> None:
+def test_a_merge_that_is_undone_is_noticed():
     nodes = here_and_there()
     again = taken(8, STOP @ ASIDE[0], Pose2(), 40)
     merged = joined([*nodes, again])
@@ -243,7 +241,7 @@ def test_a_merge_that_is_undone_is_noticed() -> None:
         assert (again.id in {one.other.id for one in result}) == (again.id in expected)
 
 
-def test_prepared_results_are_not_computed_again() -> None:
+def test_prepared_results_are_not_computed_again():
     nodes = here_and_there()
     service = asked(nodes, joined(nodes))
     index = service._index
@@ -256,9 +254,7 @@ def test_prepared_results_are_not_computed_again() -> None:
 
 
 @pytest.mark.parametrize("schedule", [LiveSchedule, LockstepSchedule])
-def test_a_server_evaluates_the_aliasing_of_nodes_in_advance(
-    schedule: type[Schedule], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_server_evaluates_the_aliasing_of_nodes_in_advance(schedule: type[Schedule], monkeypatch):
     nodes, looked = here_and_there(), list[int]()
 
     def noted(service: Relocalizer, most: int) -> int:
@@ -277,7 +273,7 @@ def test_a_server_evaluates_the_aliasing_of_nodes_in_advance(
     assert max(looked) == PREPARED_AT_ONCE
 
 
-def test_landmarks_without_depths_are_in_no_region() -> None:
+def test_landmarks_without_depths_are_in_no_region():
     nodes = here_and_there()
     recognition = recognise(nodes[0], VIEW, None, np.random.default_rng(0))
     assert recognition is not None

@@ -1,7 +1,5 @@
 """Hand-held photographs: recognised, answered as a place and not as a pose, also on the wire."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -46,7 +44,7 @@ def answered(nodes: list[Node], view: View) -> RelocalizeAnswer:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_photograph_is_a_place_of_unknown_distance(seed: int) -> None:
+def test_a_photograph_is_a_place_of_unknown_distance(seed: int):
     world, nodes = places(seed)
     off = Pose2(-0.4, 0.1, 0.05)
     view, _ = take_view(world, AT @ off, np.random.default_rng(seed + 100), SHARP)
@@ -65,7 +63,7 @@ def test_a_photograph_is_a_place_of_unknown_distance(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_elsewhere_is_no_place(seed: int) -> None:
+def test_elsewhere_is_no_place(seed: int):
     world, nodes = places(seed)
     held = [photograph(node, scale=0.9, roll=0.02) for node in nodes]
     for heading in (1.7, 3.1, -1.6):

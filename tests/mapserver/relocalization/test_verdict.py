@@ -71,8 +71,8 @@ def test_each_outcome(
     alone: int,
     outcome: Outcome,
     words: str,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    monkeypatch,
+):
     monkeypatch.setattr(verdict, "ALONE", alone)
     service = Relocalizer(index, nodes.get, MergedMap.empty())
     candidates = retrieve(view, index, LEAST)
@@ -85,13 +85,13 @@ def test_each_outcome(
     assert bool(answer.candidates) == (outcome in (Outcome.FOUND, Outcome.ONE_WEAK_NODE))
 
 
-def test_retrieval_is_not_asked_about_a_view_that_cannot_be_registered() -> None:
+def test_retrieval_is_not_asked_about_a_view_that_cannot_be_registered():
     index = Retrieved((NODE.id, 2.0))
     assert not retrieve(few(LEAST - 1), index, LEAST).ranked and not index.asked
     assert retrieve(VIEW, index, LEAST).ranked == [(NODE.id, 2.0)] and index.asked == 1
 
 
-def test_an_unknown_view_looks_like_places_with_a_turn_to_each(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_an_unknown_view_looks_like_places_with_a_turn_to_each(monkeypatch):
     monkeypatch.setattr(verdict, "ALONE", 1000)
     # Turned away by so much that some of the node's landmarks are still in the image.
     aside = take_view(WORLD, AT @ Pose2(0.05, 0.0, -0.35), np.random.default_rng(4))[0]
@@ -107,7 +107,7 @@ def test_an_unknown_view_looks_like_places_with_a_turn_to_each(monkeypatch: pyte
     assert not service.answer(VIEW).similar, "it is found"
 
 
-def test_the_reason_names_the_place_that_is_listed_first() -> None:
+def test_the_reason_names_the_place_that_is_listed_first():
     twin = replace(NODE, id=NodeId("r0", 1, 3))
     nodes = {node.id: node for node in (NODE, twin)}
     found = Retrieved(*((node, 2.0) for node in nodes))

@@ -28,7 +28,7 @@ def squared(vectors: NDArray[np.float32], centres: Codes) -> NDArray[np.float32]
 
 
 @pytest.mark.parametrize("number", [0, 1, 2])
-def test_a_landmark_belongs_to_the_nearest_of_the_nearest_family(number: int) -> None:
+def test_a_landmark_belongs_to_the_nearest_of_the_nearest_family(number: int):
     quantizer = coarse_quantizers()[number]
     vectors = codes_of(3000, 2).astype(np.float32)
     family = squared(vectors, quantizer.heads).argmin(axis=1)
@@ -44,7 +44,7 @@ def test_a_landmark_belongs_to_the_nearest_of_the_nearest_family(number: int) ->
 
 
 @pytest.mark.parametrize("number", [0, 1, 2, 3])
-def test_a_question_finds_nearly_all_of_the_nearest_centres(number: int) -> None:
+def test_a_question_finds_nearly_all_of_the_nearest_centres(number: int):
     quantizer = coarse_quantizers()[number]
     vectors = codes_of(200, 4).astype(np.float32)
     nearest = np.argsort(squared(vectors, quantizer.centres), axis=1)[:, :8]
@@ -53,7 +53,7 @@ def test_a_question_finds_nearly_all_of_the_nearest_centres(number: int) -> None
     assert found > 0.9, found
 
 
-def test_what_are_no_cells_of_codes_is_refused() -> None:
+def test_what_are_no_cells_of_codes_is_refused():
     heads, centres = codes_of(4, 5), codes_of(16, 6)
     assert len(CoarseQuantizer(heads, centres)) == 16
     for wrong in ((heads[:0], centres[:0]), (heads, centres[:15]), (heads, centres.astype(np.float32))):

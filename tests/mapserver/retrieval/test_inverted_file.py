@@ -44,7 +44,7 @@ def asked(codes: Codes, n: int, seed: int) -> Codes:
     return quantise(vectors + rng.normal(0, 0.04, vectors.shape))
 
 
-def test_all_cells_are_brute_force(landmarks: tuple[Codes, Ids]) -> None:
+def test_all_cells_are_brute_force(landmarks: tuple[Codes, Ids]):
     codes, ids = landmarks
     cells, questions = filled(codes, ids), asked(codes, 50, 2)
     every = squared_distances(decode(questions), decode(codes))
@@ -56,7 +56,7 @@ def test_all_cells_are_brute_force(landmarks: tuple[Codes, Ids]) -> None:
     assert np.allclose(again, squared, atol=1e-4)
 
 
-def test_hidden_landmarks_are_as_if_they_were_not_there(landmarks: tuple[Codes, Ids]) -> None:
+def test_hidden_landmarks_are_as_if_they_were_not_there(landmarks: tuple[Codes, Ids]):
     codes, ids = landmarks
     questions, quantizer = asked(codes, 50, 2), coarse_quantizers()[0]
     # Of each landmark that is wanted there are forty that are not.
@@ -71,7 +71,7 @@ def test_hidden_landmarks_are_as_if_they_were_not_there(landmarks: tuple[Codes, 
     assert np.array_equal(squared[there], expected_squared[there]) and np.isinf(squared[~there]).all()
 
 
-def test_a_few_cells_find_nearly_all_that_was_seen_before(landmarks: tuple[Codes, Ids]) -> None:
+def test_a_few_cells_find_nearly_all_that_was_seen_before(landmarks: tuple[Codes, Ids]):
     codes, ids = landmarks
     cells, questions = filled(codes, ids), asked(codes, 300, 3)
     every = squared_distances(decode(questions), decode(codes))
@@ -79,7 +79,7 @@ def test_a_few_cells_find_nearly_all_that_was_seen_before(landmarks: tuple[Codes
     assert np.mean(squared[:, 0] < every.min(axis=1) + 1e-4) > 0.9
 
 
-def test_removed_entries_are_gone_and_the_rest_is_kept(landmarks: tuple[Codes, Ids]) -> None:
+def test_removed_entries_are_gone_and_the_rest_is_kept(landmarks: tuple[Codes, Ids]):
     codes, ids = landmarks
     cells = filled(codes[:2000], ids[:2000])
     cells.add(codes[2000:], ids[2000:])
@@ -91,14 +91,14 @@ def test_removed_entries_are_gone_and_the_rest_is_kept(landmarks: tuple[Codes, I
     assert len(cells) == left.sum()
 
 
-def test_the_same_landmarks_make_the_same_cells(landmarks: tuple[Codes, Ids]) -> None:
+def test_the_same_landmarks_make_the_same_cells(landmarks: tuple[Codes, Ids]):
     codes, ids = landmarks
     questions = asked(codes, 100, 4)
     a, b = (filled(codes, ids).nearest(questions, 5, probes=2) for _ in range(2))
     assert np.array_equal(a[1], b[1]) and np.array_equal(a[0], b[0])
 
 
-def test_fewer_landmarks_than_cells() -> None:
+def test_fewer_landmarks_than_cells():
     codes = quantise(random_vectors(3, np.random.default_rng(5)))
     cells = filled(codes, np.arange(3))
     squared, ids = cells.nearest(codes, 4, probes=256)
@@ -106,7 +106,7 @@ def test_fewer_landmarks_than_cells() -> None:
 
 
 @pytest.mark.parametrize("named", ["all", "others"])
-def test_forgetting_a_row_equals_forgetting_its_node(landmarks: tuple[Codes, Ids], named: str) -> None:
+def test_forgetting_a_row_equals_forgetting_its_node(landmarks: tuple[Codes, Ids], named: str):
     codes, ids = landmarks
     ids = np.argsort(np.argsort(ids))
     cells, searched = filled(codes, ids), filled(codes, ids)

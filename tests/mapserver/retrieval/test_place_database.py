@@ -27,7 +27,7 @@ def filled(*nodes: Node) -> PlaceDatabase:
     return places
 
 
-def test_an_announced_node_is_found_at_once() -> None:
+def test_an_announced_node_is_found_at_once():
     places = PlaceDatabase()
     places.announce(BASE)
     assert BASE.id in places and [node for node, _ in places.query(VIEW)] == [BASE.id]
@@ -39,7 +39,7 @@ def test_an_announced_node_is_found_at_once() -> None:
     [(1, 60.0, False), (1, SETTLED + 1.0, True), (2, 60.0, True)],
     ids=["today", "an hour later", "another epoch"],
 )
-def test_superseded_nodes_of_earlier_drives_are_left_out(epoch: int, later_s: float, left_out: bool) -> None:
+def test_superseded_nodes_of_earlier_drives_are_left_out(epoch: int, later_s: float, left_out: bool):
     newer = replace(BASE, id=NodeId("a", epoch, 2), stamp_ns=BASE.stamp_ns + int(later_s * SECOND))
     nodes = {node.id: node for node in (BASE, newer)}
     places = filled(*nodes.values())
@@ -54,7 +54,7 @@ def test_superseded_nodes_of_earlier_drives_are_left_out(epoch: int, later_s: fl
         assert overlaps == places.overlaps(BASE, nodes.get) and newer.id in overlaps
 
 
-def test_a_node_that_comes_again_is_found_again_and_a_removed_one_is_not() -> None:
+def test_a_node_that_comes_again_is_found_again_and_a_removed_one_is_not():
     newer = replace(BASE, id=NodeId("a", 2, 1))
     nodes = {node.id: node for node in (BASE, newer)}
     places = filled(*nodes.values())

@@ -58,7 +58,7 @@ def brute_force(nodes: list[Node], view: View, s: PlaceIndexSettings) -> dict[No
     return scores
 
 
-def test_scores_against_brute_force(building: Building) -> None:
+def test_scores_against_brute_force(building: Building):
     world, nodes, tour = building
     few, s = nodes[:8], PlaceIndexSettings(votes=6)
     view, _ = take_view(world, tour[2], np.random.default_rng(2))
@@ -73,7 +73,7 @@ def test_scores_against_brute_force(building: Building) -> None:
     )
 
 
-def test_the_right_place_comes_first(building: Building) -> None:
+def test_the_right_place_comes_first(building: Building):
     world, nodes, tour = building
     index, rng = filled(nodes), np.random.default_rng(3)
     first = 0
@@ -83,7 +83,7 @@ def test_the_right_place_comes_first(building: Building) -> None:
     assert first >= 22
 
 
-def test_overlaps_are_those_of_the_exhaustive_table(building: Building) -> None:
+def test_overlaps_are_those_of_the_exhaustive_table(building: Building):
     _, nodes, _ = building
     table = overlaps(nodes)
     index = filled(nodes)
@@ -96,7 +96,7 @@ def test_overlaps_are_those_of_the_exhaustive_table(building: Building) -> None:
             assert value == pytest.approx(expected[other], rel=1e-3)
 
 
-def test_nodes_with_equal_landmarks_cost_no_more_than_others() -> None:
+def test_nodes_with_equal_landmarks_cost_no_more_than_others():
     """Pairs of them would grow by the square: 12 million for the third such node."""
     rng, index = np.random.default_rng(5), PlaceIndex()
     nodes = []
@@ -117,7 +117,7 @@ def test_nodes_with_equal_landmarks_cost_no_more_than_others() -> None:
     assert len(index.landmarks) == 2 * MOST_LANDMARKS
 
 
-def test_overlaps_of_compared_nodes_are_exact_in_a_large_fleet(building: Building) -> None:
+def test_overlaps_of_compared_nodes_are_exact_in_a_large_fleet(building: Building):
     _, nodes, _ = building
     table, known = overlaps(nodes), {node.id: node for node in nodes}
     landmarks = LandmarkIndexSettings(exact=600)
@@ -137,7 +137,7 @@ def test_overlaps_of_compared_nodes_are_exact_in_a_large_fleet(building: Buildin
     assert few.overlaps(nodes[0], {}.get) == {}
 
 
-def test_added_is_found_at_once_and_removed_never(building: Building) -> None:
+def test_added_is_found_at_once_and_removed_never(building: Building):
     world, nodes, tour = building
     index = filled(nodes[:-1])
     view, _ = take_view(world, tour[-1], np.random.default_rng(4))
@@ -153,7 +153,7 @@ def test_added_is_found_at_once_and_removed_never(building: Building) -> None:
 
 
 @pytest.mark.parametrize("exact", [100_000, 600], ids=["all are compared", "cells are searched"])
-def test_what_another_robot_adds_changes_nothing_once_it_is_hidden(building: Building, exact: int) -> None:
+def test_what_another_robot_adds_changes_nothing_once_it_is_hidden(building: Building, exact: int):
     """However many copies of a place it adds: all nearest landmarks are copies then."""
     world, nodes, tour = building
     index = filled(nodes, PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=exact)))
@@ -167,7 +167,7 @@ def test_what_another_robot_adds_changes_nothing_once_it_is_hidden(building: Bui
     assert [index.query(view, 16, hidden) for view in views] == before
 
 
-def test_adding_again_replaces(building: Building) -> None:
+def test_adding_again_replaces(building: Building):
     _, nodes, _ = building
     index = filled(nodes)
     before = len(index.landmarks)
@@ -175,7 +175,7 @@ def test_adding_again_replaces(building: Building) -> None:
     assert len(index.landmarks) == before and len(index) == len(nodes)
 
 
-def test_large_indexes_search_cells_and_still_find(building: Building) -> None:
+def test_large_indexes_search_cells_and_still_find(building: Building):
     world, nodes, tour = building
     index = filled(nodes, PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=1500)))
     assert index.landmarks.cells(len(index.landmarks)) > 0
@@ -191,7 +191,7 @@ def test_large_indexes_search_cells_and_still_find(building: Building) -> None:
 
 
 @pytest.mark.parametrize("named", ["its own", "some of them", "another's", "none"])
-def test_a_removed_node_stays_removed_despite_its_landmarks(building: Building, named: str) -> None:
+def test_a_removed_node_stays_removed_despite_its_landmarks(building: Building, named: str):
     nodes = building[1]
     index = PlaceIndex(PlaceIndexSettings(landmarks=LandmarkIndexSettings(exact=100)))
     index.extend(nodes)
@@ -203,7 +203,7 @@ def test_a_removed_node_stays_removed_despite_its_landmarks(building: Building, 
     assert len(set(left.tolist())) == len(index)
 
 
-def test_nothing_is_found_in_nothing(building: Building) -> None:
+def test_nothing_is_found_in_nothing(building: Building):
     world, nodes, tour = building
     view, _ = take_view(world, tour[0], np.random.default_rng(6))
     empty = View(np.zeros((0, 2), np.float32), np.zeros((0, 32), np.uint8), CAMERA)
@@ -221,7 +221,7 @@ def everywhere() -> PlaceIndexSettings:
     return PlaceIndexSettings(landmarks=landmarks)
 
 
-def test_cells_of_which_all_are_searched_answer_like_no_cells(building: Building) -> None:
+def test_cells_of_which_all_are_searched_answer_like_no_cells(building: Building):
     world, nodes, tour = building
     plain, cells = filled(nodes), filled(nodes, everywhere())
     for index in (plain, cells):
@@ -235,7 +235,7 @@ def test_cells_of_which_all_are_searched_answer_like_no_cells(building: Building
         assert {node for node, _ in one[:3]} == {node for node, _ in two[:3]}
 
 
-def test_many_at_once_equal_one_by_one(building: Building) -> None:
+def test_many_at_once_equal_one_by_one(building: Building):
     world, nodes, tour = building
     one, many = filled(nodes), PlaceIndex()
     many.extend([*nodes, nodes[2]])
@@ -266,7 +266,7 @@ def altered(nodes: list[Node], count: int) -> list[Node]:
 )
 def test_what_is_hidden_does_not_decide_which_cells_are_searched(
     building: Building, settings: PlaceIndexSettings
-) -> None:
+):
     world, nodes, tour = building
     index = filled(nodes, settings)
     own = len(index.landmarks)
@@ -283,7 +283,7 @@ def test_what_is_hidden_does_not_decide_which_cells_are_searched(
     assert [index.query(view, 16, hidden) for view in views] == before
 
 
-def test_the_order_of_growth_and_questions_make_no_difference(building: Building) -> None:
+def test_the_order_of_growth_and_questions_make_no_difference(building: Building):
     world, nodes, tour = building
     at_once, grown = PlaceIndex(small_cells()), PlaceIndex(small_cells())
     at_once.extend(nodes)
@@ -302,7 +302,7 @@ def test_the_order_of_growth_and_questions_make_no_difference(building: Building
         assert dict(grown.query(view, 6)) == pytest.approx(dict(at_once.query(view, 6)), rel=1e-3)
 
 
-def test_all_landmarks_are_in_cells_of_another_size(building: Building) -> None:
+def test_all_landmarks_are_in_cells_of_another_size(building: Building):
     """What comes and goes is in cells of all sizes that are kept; unused ones are dropped."""
     world, nodes, tour = building
     index = filled(nodes, small_cells(probes=20_000))
@@ -321,9 +321,7 @@ def test_all_landmarks_are_in_cells_of_another_size(building: Building) -> None:
     assert len(index.landmarks._kept) == 1
 
 
-def test_a_question_waits_while_cells_are_filled_for_another_one_and_finds_the_same(
-    building: Building,
-) -> None:
+def test_a_question_waits_while_cells_are_filled_for_another_one_and_finds_the_same(building: Building):
     world, nodes, tour = building
     index = filled(nodes, small_cells())
     liar = altered(nodes, 4 * len(nodes))
@@ -336,14 +334,14 @@ def test_a_question_waits_while_cells_are_filled_for_another_one_and_finds_the_s
     assert found == [before] * 8
 
 
-def test_fewer_cells_are_searched_when_the_smallest_are_full() -> None:
+def test_fewer_cells_are_searched_when_the_smallest_are_full():
     index = PlaceIndex().landmarks
     smallest = InvertedFile(coarse_quantizers()[-1])
     assert [index.cells(n) for n in (30_000, 30_001, 102_401, 10**6, 10**7)] == [0, 256, 1024, 4096, 16384]
     assert [index._probes(n, smallest) for n in (10**6, 6_553_600, 13_107_200, 10**8)] == [10, 10, 5, 2]
 
 
-def test_who_announces_a_node_does_not_wait_for_a_search(building: Building) -> None:
+def test_who_announces_a_node_does_not_wait_for_a_search(building: Building):
     _, nodes, _ = building
     index = filled(nodes[:5])
     with index.landmarks.lock.reading():
@@ -355,7 +353,7 @@ def test_who_announces_a_node_does_not_wait_for_a_search(building: Building) -> 
     assert index.overlaps(nodes[0], {}.get) == filled(nodes).overlaps(nodes[0], {}.get)
 
 
-def test_a_search_waits_for_no_other(building: Building) -> None:
+def test_a_search_waits_for_no_other(building: Building):
     world, nodes, tour = building
     index, (view, _) = filled(nodes[:5]), take_view(world, tour[0], np.random.default_rng(4))
     index.announce(nodes[5])
@@ -365,9 +363,7 @@ def test_a_search_waits_for_no_other(building: Building) -> None:
     assert nodes[5].id in index
 
 
-def test_a_node_that_cannot_be_taken_in_spoils_no_search(
-    building: Building, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_a_node_that_cannot_be_taken_in_spoils_no_search(building: Building, caplog):
     _, nodes, _ = building
     index = filled(nodes[:5])
     bad = replace(nodes[5], landmarks=None)  # type: ignore[arg-type]

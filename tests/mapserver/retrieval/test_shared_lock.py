@@ -1,7 +1,5 @@
 """A lock that readers share."""
 
-from __future__ import annotations
-
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
@@ -13,7 +11,7 @@ from mapweave.mapserver.retrieval.shared_lock import SharedLock
 from tests.waiting import eventually
 
 
-def test_readers_share_it_and_a_writer_has_it_alone() -> None:
+def test_readers_share_it_and_a_writer_has_it_alone():
     lock, inside, most = SharedLock(), {"read": 0, "write": 0}, {"read": 0, "write": 0}
     counting = threading.Lock()
 
@@ -55,7 +53,7 @@ def test_readers_share_it_and_a_writer_has_it_alone() -> None:
         assert alone, "it is free at the end"
 
 
-def test_a_waiting_writer_goes_before_later_readers() -> None:
+def test_a_waiting_writer_goes_before_later_readers():
     lock, order = SharedLock(), list[str]()
 
     def write() -> None:
@@ -80,7 +78,7 @@ def test_a_waiting_writer_goes_before_later_readers() -> None:
     assert order == ["write", "read"]
 
 
-def test_a_reader_cannot_have_it_alone() -> None:
+def test_a_reader_cannot_have_it_alone():
     lock = SharedLock()
     with lock.reading(), pytest.raises(RuntimeError, match="wait for itself"), lock.writing():
         pass

@@ -11,7 +11,7 @@ from synthetic.world import random_vectors
 
 @pytest.mark.parametrize("count", [0, 3, GROUPS + 1, SEARCHED, 2 * SEARCHED + 77])
 @pytest.mark.parametrize("hides", [False, True])
-def test_nearest_is_brute_force_and_of_equals_the_first(count: int, hides: bool) -> None:
+def test_nearest_is_brute_force_and_of_equals_the_first(count: int, hides: bool):
     rng = np.random.default_rng(count)
     # Each several times, so that there are equals at the end of what is returned.
     codes = quantise(random_vectors(count // 5 + 1, rng))[rng.integers(0, count // 5 + 1, count)]

@@ -8,7 +8,7 @@ from mapweave.mapserver.retrieval import voting
 from mapweave.merge.pose_graph.candidates import overlap
 
 
-def test_votes_against_plain_loops() -> None:
+def test_votes_against_plain_loops():
     rng = np.random.default_rng(1)
     squared = np.sort(rng.uniform(0, 0.6, (40, 7)), axis=1).astype(np.float32)
     slots = rng.integers(-1, 9, (40, 7))
@@ -26,13 +26,13 @@ def test_votes_against_plain_loops() -> None:
     )
 
 
-def test_distant_descriptors_get_no_votes() -> None:
+def test_distant_descriptors_get_no_votes():
     votes, scores = voting.votes(np.full((3, 2), 1.0, np.float32), np.array([[1, 2]] * 3), 0.5)
     assert len(votes) == len(scores) == 0
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_overlaps_agree_with_one_node_at_a_time(seed: int) -> None:
+def test_overlaps_agree_with_one_node_at_a_time(seed: int):
     rng = np.random.default_rng(seed)
     n = int(rng.integers(0, 400))
     rows, columns = rng.integers(0, 30, n), rng.integers(0, 150, n)
@@ -48,7 +48,7 @@ def test_overlaps_agree_with_one_node_at_a_time(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(5))
-def test_overlaps_of_pairs_do_not_depend_on_what_is_compared_at_once(seed: int) -> None:
+def test_overlaps_of_pairs_do_not_depend_on_what_is_compared_at_once(seed: int):
     rng = np.random.default_rng(seed)
     codes = rng.integers(24, 40, (60, 32)).astype(np.uint8)
     others = [

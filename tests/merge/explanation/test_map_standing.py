@@ -1,7 +1,5 @@
 """Why maps are not merged, in a line each, of merges that were really made."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np
@@ -28,7 +26,7 @@ def worlds(*seeds: int) -> Sequence[World]:
     return [room(0, 0, 5, 4, 700, np.random.default_rng(seed)) for seed in seeds]
 
 
-def test_links_and_the_newest_node_are_those_of_the_map() -> None:
+def test_links_and_the_newest_node_are_those_of_the_map():
     here, elsewhere = worlds(1, 2)
     merged = mapping((FIRST, here), (SECOND, here), (THIRD, elsewhere)).merged()
     standings = map_standings(merged)
@@ -43,12 +41,12 @@ def test_links_and_the_newest_node_are_those_of_the_map() -> None:
     )
 
 
-def test_a_map_alone_lacks_nothing() -> None:
+def test_a_map_alone_lacks_nothing():
     (here,) = worlds(1)
     assert map_standings(mapping((FIRST, here)).merged())[FIRST].apart == ""
 
 
-def test_the_reason_is_that_of_people_or_of_the_merge() -> None:
+def test_the_reason_is_that_of_people_or_of_the_merge():
     (here,) = worlds(1)
     merger = mapping((FIRST, here), (SECOND, here), (THIRD, here))
     merger.constrain(

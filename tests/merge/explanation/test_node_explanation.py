@@ -1,7 +1,5 @@
 """Every number of an explanation, computed a second time in another way."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -62,7 +60,7 @@ def between(merged: MergedMap) -> list[Link]:
     return [link for link in merged.links if not link.within]
 
 
-def test_residuals_are_those_of_the_pinhole(merged: MergedMap) -> None:
+def test_residuals_are_those_of_the_pinhole(merged: MergedMap):
     link = between(merged)[0]
     explanation = explain_nodes(merged, link.b, link.a)
     assert explanation.standing is Standing.LINKED and (explanation.a.id, explanation.b.id) == link.pair
@@ -86,7 +84,7 @@ def test_residuals_are_those_of_the_pinhole(merged: MergedMap) -> None:
     assert {tuple(pair) for pair in explanation.shared} <= {tuple(pair) for pair in explanation.matches}
 
 
-def test_the_misfit_is_the_difference_to_the_merged_poses(merged: MergedMap) -> None:
+def test_the_misfit_is_the_difference_to_the_merged_poses(merged: MergedMap):
     for link in between(merged)[:5]:
         misfit = explain_nodes(merged, *link.pair).misfit
         assert misfit is not None
@@ -110,7 +108,7 @@ def without(merged: MergedMap, left_out: Link | None) -> PoseGaussian:
     return PoseGaussian(Pose2.from_vector(result.means[0]), result.covariances[0])
 
 
-def test_leaving_a_link_out_is_as_good_as_solving_without_it(merged: MergedMap) -> None:
+def test_leaving_a_link_out_is_as_good_as_solving_without_it(merged: MergedMap):
     links = between(merged)
     graph = merged.graphs[0]
     result = standpoints(links, graph, kept=True)
@@ -126,7 +124,7 @@ def test_leaving_a_link_out_is_as_good_as_solving_without_it(merged: MergedMap) 
         assert one.log_factor == pytest.approx(math.log(density * area * 2 * np.pi), abs=0.1)
 
 
-def test_what_is_left_of_a_residual_is_foretold_without_solving(merged: MergedMap) -> None:
+def test_what_is_left_of_a_residual_is_foretold_without_solving(merged: MergedMap):
     own = [m for fragment in fragments_of(merged.maps) for m in fragment.measurements]
     links = between(merged)
     rng = np.random.default_rng(5)
@@ -145,7 +143,7 @@ def test_what_is_left_of_a_residual_is_foretold_without_solving(merged: MergedMa
         assert foretold.residual2 == pytest.approx(off @ np.linalg.solve(floored, off), rel=0.02, abs=0.05)
 
 
-def test_a_link_that_alone_joins_has_the_odds_of_all_links(merged: MergedMap) -> None:
+def test_a_link_that_alone_joins_has_the_odds_of_all_links(merged: MergedMap):
     link = between(merged)[0]
     graph = solve_graph(
         link.a,
@@ -157,7 +155,7 @@ def test_a_link_that_alone_joins_has_the_odds_of_all_links(merged: MergedMap) ->
     assert result.alone and result.log_factor == 0.0
 
 
-def test_false_links_are_improbable_and_true_ones_are_not(merged: MergedMap) -> None:
+def test_false_links_are_improbable_and_true_ones_are_not(merged: MergedMap):
     rng = np.random.default_rng(1)
     true = link_probabilities(merged)
     assert len(true) == len(merged.links) and min(true.values()) > 0.9
@@ -173,7 +171,7 @@ def test_false_links_are_improbable_and_true_ones_are_not(merged: MergedMap) -> 
     assert prior_odds(merged) > 1
 
 
-def test_other_links_close_loops_as_composed_poses(merged: MergedMap) -> None:
+def test_other_links_close_loops_as_composed_poses(merged: MergedMap):
     link = between(merged)[1]
     explanation = explain_nodes(merged, *link.pair)
     s = ConsistencySettings()
@@ -195,14 +193,14 @@ def test_other_links_close_loops_as_composed_poses(merged: MergedMap) -> None:
         assert other_link.agrees == (distance2 < s.gate) and other_link.kept
 
 
-def test_refused_pairs_say_what_they_lack(merged: MergedMap) -> None:
+def test_refused_pairs_say_what_they_lack(merged: MergedMap):
     refused = next(r for r in merged.refused if r.link is None and r.edge is None)
     explanation = explain_nodes(merged, refused.a, refused.b)
     assert (explanation.standing, explanation.reason) == (Standing.REFUSED, refused.reason)
     assert explanation.probability is None and len(explanation.matches) > 0
 
 
-def test_too_few_inliers_are_reported_with_their_pose(merged: MergedMap) -> None:
+def test_too_few_inliers_are_reported_with_their_pose(merged: MergedMap):
     link = between(merged)[0]
     strict = RecognitionSettings(least_inliers=12)
     # One of the two nodes has kept eleven landmarks, all of which agree.
@@ -222,12 +220,12 @@ def test_too_few_inliers_are_reported_with_their_pose(merged: MergedMap) -> None
     assert explanation.other_links == () and explanation.probability is None
 
 
-def test_pairs_that_were_not_compared_are_compared_now(merged: MergedMap) -> None:
+def test_pairs_that_were_not_compared_are_compared_now(merged: MergedMap):
     explanation = explain_nodes(merged, sorted(merged.maps[A].nodes)[0], sorted(merged.maps[C].nodes)[0])
     assert explanation.standing is Standing.UNCOMPARED and "compared now: " in explanation.reason
 
 
-def test_a_robots_own_edge_is_explained_with_its_pose(merged: MergedMap) -> None:
+def test_a_robots_own_edge_is_explained_with_its_pose(merged: MergedMap):
     edge = min(merged.maps[A].edges.values(), key=lambda edge: edge.id)
     explanation = explain_nodes(merged, edge.b, edge.a)
     assert explanation.standing is Standing.OWN and explanation.reason.endswith(f" (edge {edge.id})")
@@ -240,7 +238,7 @@ def test_a_robots_own_edge_is_explained_with_its_pose(merged: MergedMap) -> None
     assert np.allclose(explanation.misfit.off, off, atol=1e-9)
 
 
-def test_a_robots_own_loop_closure_is_explained_with_its_constraints() -> None:
+def test_a_robots_own_loop_closure_is_explained_with_its_constraints():
     merger = fleet()
     first, *_, last = sorted(merger.merged().maps[A].nodes)
     true = merger.merged().relative(first, last)
@@ -262,7 +260,7 @@ def test_a_robots_own_loop_closure_is_explained_with_its_constraints() -> None:
     assert explanation.misfit is not None and explanation.misfit.strain2 > 100.0
 
 
-def test_landmarks_that_have_faded_hold_no_servo(merged: MergedMap) -> None:
+def test_landmarks_that_have_faded_hold_no_servo(merged: MergedMap):
     link = next(item for item in between(merged) if "can be driven" in reach_words(merged, item.edge()))
     count = len(merged.maps[link.a.map].nodes[link.a].landmarks)
     faded = replace(merged, faded={link.a: np.ones(count, np.bool_)})
@@ -272,7 +270,7 @@ def test_landmarks_that_have_faded_hold_no_servo(merged: MergedMap) -> None:
     assert words.endswith(f"({len(link.shared)} more have faded)")
 
 
-def test_two_maps(merged: MergedMap) -> None:
+def test_two_maps(merged: MergedMap):
     one = explain_maps(merged, B, A)
     assert one.joined and one.links == len(between(merged)) and "are one map" in one.reason
     assert one.landmarks == sum(int(link.evidence["inliers"]) for link in between(merged))
@@ -286,7 +284,7 @@ def test_two_maps(merged: MergedMap) -> None:
     assert every == tuple(explain_maps(merged, one.second, one.first) for one in every)
 
 
-def test_manual_constraints_are_listed() -> None:
+def test_manual_constraints_are_listed():
     merger = fleet()
     link = between(merger.merged())[0]
     constraint = ManualConstraint(Apart(link.pair), True, "anna", 0, "no")
@@ -301,7 +299,7 @@ def test_manual_constraints_are_listed() -> None:
     assert not apart.joined and "undone" in apart.reason and len(apart.nearest) == 5
 
 
-def test_a_merge_that_loses_its_support_is_reported() -> None:
+def test_a_merge_that_loses_its_support_is_reported():
     merger = fleet()
     alone = MergedMap.empty()
     before = merger.merged()
@@ -320,7 +318,7 @@ def test_a_merge_that_loses_its_support_is_reported() -> None:
     assert partings(parts, before.links, merger.merged()) == ()  # a map without nodes is part of nothing
 
 
-def test_a_split_by_a_link_that_is_taken_back_names_the_person() -> None:
+def test_a_split_by_a_link_that_is_taken_back_names_the_person():
     merger = fleet()
     linked = Linked.of(NodeId("a", 1, 1), NodeId("c", 1, 1), PoseGaussian.from_sigmas(Pose2(9.0), 0.1, 0.1))
     by_hand = ManualConstraint(linked, True, "anna", 0, "through the yard")
@@ -336,7 +334,7 @@ def test_a_split_by_a_link_that_is_taken_back_names_the_person() -> None:
     )
 
 
-def test_joint_merges_are_listed_map_by_map_and_each_link_once() -> None:
+def test_joint_merges_are_listed_map_by_map_and_each_link_once():
     """A server that starts again joins all maps with one merge; it listed some links twice."""
     rng = np.random.default_rng(5)
     world = room(0, 0, 5, 4, 900, rng)
@@ -350,7 +348,7 @@ def test_joint_merges_are_listed_map_by_map_and_each_link_once() -> None:
     assert count == sum(not link.within for link in merged.links)
 
 
-def test_the_number_of_many_separated_maps_is_given() -> None:
+def test_the_number_of_many_separated_maps_is_given():
     one = MapId("a", 1)
     node = NodeId(*one, 1)
     sides = [[MapId(f"{side}{k}", 1) for k in range(count)] for side, count in (("x", 300), ("y", 2))]
@@ -361,7 +359,7 @@ def test_the_number_of_many_separated_maps_is_given() -> None:
     assert words.startswith("300 maps with x0.1 and y0.1+y1.1 are no longer one map: ")
 
 
-def test_a_split_by_a_retired_map_names_the_person() -> None:
+def test_a_split_by_a_retired_map_names_the_person():
     """Two robots in two rooms, and one that has been in both."""
     rng = np.random.default_rng(5)
     world = room(0, 0, 5, 4, 600, rng) + room(5, 0, 5, 4, 800, rng)
@@ -383,7 +381,7 @@ def test_a_split_by_a_retired_map_names_the_person() -> None:
         (NodeId("a", 1, 99), NodeId("a", 1, 1), "of its 12 nodes the nearest are 17, 19, 21, 23"),
     ],
 )
-def test_missing_nodes_cannot_be_explained(merged: MergedMap, a: NodeId, b: NodeId, words: str) -> None:
+def test_missing_nodes_cannot_be_explained(merged: MergedMap, a: NodeId, b: NodeId, words: str):
     with pytest.raises(InvalidValue, match=words):
         explain_nodes(merged, a, b)
     with pytest.raises(InvalidValue, match="two maps"):

@@ -1,7 +1,5 @@
 """Two maps that show the same places and cannot be one: both are named, in one line, wherever people look."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 
@@ -48,7 +46,7 @@ def across(merged: MergedMap) -> list[Link]:
 
 
 @pytest.mark.parametrize("reason", [COLLISION, ALIASED])
-def test_twins_are_named_in_explanation_status_and_history(one: MergedMap, reason: str) -> None:
+def test_twins_are_named_in_explanation_status_and_history(one: MergedMap, reason: str):
     two = parted(one, reason, across(one))
     explanation = explain_maps(two, A, B)
     assert "a.1 and b.1 are not one map" in explanation.reason and TWINS in explanation.reason
@@ -65,7 +63,7 @@ def test_twins_are_named_in_explanation_status_and_history(one: MergedMap, reaso
     assert any("mapweave map retire a.1 --because TEXT" in line for line in maps_words(explanation))
 
 
-def test_a_few_alike_nodes_or_another_reason_make_no_twins(one: MergedMap) -> None:
+def test_a_few_alike_nodes_or_another_reason_make_no_twins(one: MergedMap):
     first = across(one)[0].a
     few = [link for link in across(one) if link.a == first]
     assert len({link.b for link in across(one)}) >= LEAST_NODES
@@ -74,7 +72,7 @@ def test_a_few_alike_nodes_or_another_reason_make_no_twins(one: MergedMap) -> No
         assert all(TWINS not in standing.apart for standing in map_standings(two).values())
 
 
-def test_maps_that_other_links_join_are_no_twins(one: MergedMap) -> None:
+def test_maps_that_other_links_join_are_no_twins(one: MergedMap):
     joined = replace(one, refused=tuple(refuse(link, ALIASED) for link in across(one)[1:]))
     assert TWINS not in explain_maps(joined, A, B).reason
     assert all(standing.apart == "" for standing in map_standings(joined).values())

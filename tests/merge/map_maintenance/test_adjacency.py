@@ -1,7 +1,5 @@
 """Links by their nodes: only the last links count."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
@@ -21,7 +19,7 @@ def link(pair: Ends) -> Link:
 
 
 @given(st.lists(st.dictionaries(st.sampled_from(PAIRS), st.integers(0, 1), max_size=12), max_size=6))
-def test_the_last_links_are_returned_and_only_new_pairs_are_fresh(rounds: list[dict[Ends, int]]) -> None:
+def test_the_last_links_are_returned_and_only_new_pairs_are_fresh(rounds: list[dict[Ends, int]]):
     # Two links of each pair: it may be measured again.
     links = [{pair: link(pair) for pair in PAIRS} for _ in range(2)]
     known, before = Adjacency(), set[Ends]()

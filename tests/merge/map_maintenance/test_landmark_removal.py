@@ -1,7 +1,5 @@
 """Landmarks that fade: against enumeration of everything that may have happened, and with moved furniture."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise, product
 from typing import Any
@@ -45,7 +43,7 @@ def look(shown: list[bool], result: list[bool], visit: int = 0) -> LandmarkObser
 
 
 @pytest.mark.parametrize("sequence", list(product([None, False, True], repeat=4)))
-def test_presence_is_that_of_all_sequences_together(sequence: tuple[bool | None, ...]) -> None:
+def test_presence_is_that_of_all_sequences_together(sequence: tuple[bool | None, ...]):
     """Every sequence of there and gone, hidden and not, weighed with it and with what was seen."""
     views = [look([seen is not None], [bool(seen)], visit) for visit, seen in enumerate(sequence)]
     weights = {True: 0.0, False: 0.0}
@@ -66,7 +64,7 @@ def test_presence_is_that_of_all_sequences_together(sequence: tuple[bool | None,
     assert there == pytest.approx(weights[True] / sum(weights.values()), abs=1e-12)
 
 
-def test_a_thing_fades_after_two_views_and_a_landmark_alone_after_many() -> None:
+def test_a_thing_fades_after_two_views_and_a_landmark_alone_after_many():
     """Six landmarks of one thing that all are missed; and one of which nothing is around."""
     together = np.eye(26, dtype=np.bool_)
     together[:6, :6] = True
@@ -93,7 +91,7 @@ def test_a_thing_fades_after_two_views_and_a_landmark_alone_after_many() -> None
     assert presence(together, unseen)[0] == removal.AT_FIRST, "no view could show it"
 
 
-def test_landmarks_of_a_place_that_a_visit_sees_a_hundred_times_have_a_presence() -> None:
+def test_landmarks_of_a_place_that_a_visit_sees_a_hundred_times_have_a_presence():
     """Before, all likelihoods of a long visit became 0, and what was found half of the time never faded."""
     rng = np.random.default_rng(0)
     together = np.ones((60, 60), np.bool_)
@@ -102,7 +100,7 @@ def test_landmarks_of_a_place_that_a_visit_sees_a_hundred_times_have_a_presence(
     assert (there > 0.9).all(), "what is missed beside what is found is not gone"
 
 
-def test_near_landmarks_may_be_of_one_thing() -> None:
+def test_near_landmarks_may_be_of_one_thing():
     together = things(NODE, 0.5)
     points = NODE.points_in_robot
     for i, j in product(range(len(points)), repeat=2):
@@ -111,7 +109,7 @@ def test_near_landmarks_may_be_of_one_thing() -> None:
     assert together.any(axis=1).all() and not together.all()
 
 
-def test_expected_landmarks_are_visible_near_and_unoccluded() -> None:
+def test_expected_landmarks_are_visible_near_and_unoccluded():
     """One landmark after the other, from the definition."""
     rng = np.random.default_rng(5)
     world = room(0, 0, 6, 4, 1200, rng)
@@ -171,7 +169,7 @@ def with_thing(seed: int) -> tuple[World, World, np.ndarray, np.random.Generator
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("kept")
-def test_furniture_that_is_moved_fades_and_comes_back() -> None:
+def test_furniture_that_is_moved_fades_and_comes_back():
     """Landmarks of a thing that stands elsewhere from the second drive on; it returns before the last."""
     world, other, thing, rng = with_thing(2)
     merger = Merger()
@@ -195,9 +193,7 @@ def test_furniture_that_is_moved_fades_and_comes_back() -> None:
 
 
 @pytest.mark.usefixtures("kept")
-def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_with_it(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_with_it(monkeypatch):
     """The wall behind has stayed, and localizes the robot; half of what is there is found."""
     rng = np.random.default_rng(3)
     world = room(0, 0, 6, 4, 1200, rng)
@@ -226,7 +222,7 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
 
 
 @pytest.mark.usefixtures("kept")
-def test_views_of_implausible_maps_fade_no_landmarks_of_others() -> None:
+def test_views_of_implausible_maps_fade_no_landmarks_of_others():
     """From when they are found to be so, and until they are not."""
     world, other, _, rng = with_thing(2)
     merger = Merger()
@@ -245,7 +241,7 @@ def test_views_of_implausible_maps_fade_no_landmarks_of_others() -> None:
 
 
 @pytest.mark.slow
-def test_only_changes_are_evaluated_with_the_same_result(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_only_changes_are_evaluated_with_the_same_result(monkeypatch):
     """From drive to drive, superseded nodes included, as a remover that sees only the last map."""
     rng = np.random.default_rng(4)
     world = room(0, 0, 8, 4, 950, rng)

@@ -1,7 +1,5 @@
 """Superseded nodes: only where a newer one covers them, and active again where it no longer does."""
 
-from __future__ import annotations
-
 import math
 from copy import copy
 from dataclasses import replace
@@ -82,7 +80,7 @@ def active(merged: MergedMap) -> set[NodeId]:
     return set(merged.poses) - set(merged.superseded)
 
 
-def test_the_second_drive_supersedes_the_first(drives: Drives, merger: Merger) -> None:
+def test_the_second_drive_supersedes_the_first(drives: Drives, merger: Merger):
     merged = merger.merged()
     assert len(merged.superseded) >= 3
     assert {node.map for node in merged.superseded} == {OLD}, "views the other way are not superseded"
@@ -97,7 +95,7 @@ def test_the_second_drive_supersedes_the_first(drives: Drives, merger: Merger) -
         assert str(fate.by) in str(fate)
 
 
-def test_nothing_that_could_be_reached_is_cut_off(merger: Merger) -> None:
+def test_nothing_that_could_be_reached_is_cut_off(merger: Merger):
     """The graph of the active nodes has the same pieces, by networkx."""
     merged = merger.merged()
     roads = Roadmap(merged, 0.5, ReachabilityCache())
@@ -114,7 +112,7 @@ def test_nothing_that_could_be_reached_is_cut_off(merger: Merger) -> None:
     assert before - {frozenset()} == after
 
 
-def test_routes_from_and_to_superseded_nodes_are_found(merger: Merger) -> None:
+def test_routes_from_and_to_superseded_nodes_are_found(merger: Merger):
     merged = merger.merged()
     router, alive = Router(merged), active(merged)
     old = sorted(merged.superseded)
@@ -125,7 +123,7 @@ def test_routes_from_and_to_superseded_nodes_are_found(merger: Merger) -> None:
         assert set(legs[1:-1]) <= alive, "on the way there are active nodes only"
 
 
-def test_a_file_has_the_superseded_nodes_with_reasons(merger: Merger) -> None:
+def test_a_file_has_the_superseded_nodes_with_reasons(merger: Merger):
     merged = merger.merged()
     again = merged_of(unpack_map_file(pack_map_file(map_file_of(merged))))
     assert again.superseded == merged.superseded
@@ -135,7 +133,7 @@ def test_a_file_has_the_superseded_nodes_with_reasons(merger: Merger) -> None:
     assert any("stay in view" in claim for claim in explanation.claims)
 
 
-def test_questions_are_answered_by_active_nodes(drives: Drives, merger: Merger) -> None:
+def test_questions_are_answered_by_active_nodes(drives: Drives, merger: Merger):
     merged = merger.merged()
     places = ActiveNodes(merger.places, merger.node, merged)
     relocalizer = Relocalizer(places, places.node, merged)
@@ -148,7 +146,7 @@ def test_questions_are_answered_by_active_nodes(drives: Drives, merger: Merger) 
         assert there.distance(drives.truth[node]) < 0.25
 
 
-def test_removing_a_successor_makes_its_nodes_active(drives: Drives) -> None:
+def test_removing_a_successor_makes_its_nodes_active(drives: Drives):
     merger = drives.merger(OLD, NEW, OTHER)
     superseded = merger.merged().superseded
     assert superseded
@@ -163,11 +161,11 @@ def test_removing_a_successor_makes_its_nodes_active(drives: Drives) -> None:
     assert merger.merged().superseded
 
 
-def test_views_of_one_visit_complete_each_other(drives: Drives) -> None:
+def test_views_of_one_visit_complete_each_other(drives: Drives):
     assert not drives.merger(NEW).merged().superseded
 
 
-def test_the_active_nodes_stay_few_over_many_drives(drives: Drives) -> None:
+def test_the_active_nodes_stay_few_over_many_drives(drives: Drives):
     """Each drive like the last, from the same places: the map holds one of them."""
     rng = np.random.default_rng(9)
     merger, counts = Merger(), []
@@ -180,9 +178,7 @@ def test_the_active_nodes_stay_few_over_many_drives(drives: Drives) -> None:
     assert counts[0] == 4 and max(counts) <= 8, counts
 
 
-def test_a_node_among_later_views_is_left_to_one_that_it_was_not_refused_with(
-    drives: Drives, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_node_among_later_views_is_left_to_one_that_it_was_not_refused_with(drives: Drives, monkeypatch):
     """Else it would be active again after the next merge, and the ways to it be gone."""
     monkeypatch.setattr(rules, "superseded_by", lambda *_: None)
     rng, day = np.random.default_rng(11), 86_400 * 10**9
@@ -211,7 +207,7 @@ def test_a_node_among_later_views_is_left_to_one_that_it_was_not_refused_with(
     assert superseder.renewed(again).superseded == after
 
 
-def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) -> None:
+def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives):
     merger = drives.merger(OLD, NEW, OTHER)
     merged = merger.merged()
     assert merged.superseded
@@ -231,9 +227,7 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives) ->
 
 
 @pytest.mark.parametrize("seed", first_quick(range(2), 1))
-def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(seed: int, monkeypatch):
     """Where ways do not matter: each node has an active one that covers it, and none can be removed."""
     rng = np.random.default_rng(seed)
     world = room(0, 0, 6, 4, 1200, rng)
@@ -270,7 +264,7 @@ def covers(merged: MergedMap, first: NodeId, second: NodeId) -> bool:
 
 
 @pytest.mark.slow
-def test_nodes_of_today_are_searched_even_if_superseded(drives: Drives) -> None:
+def test_nodes_of_today_are_searched_even_if_superseded(drives: Drives):
     """Another robot's view of the same hour is evidence; an hour later it is past."""
     rng = np.random.default_rng(8)
     merger = drives.merger(OLD)

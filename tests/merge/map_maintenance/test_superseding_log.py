@@ -1,7 +1,5 @@
 """What a map has superseded among others' nodes is undone when it goes, parts, or becomes unsure."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cache
@@ -103,7 +101,7 @@ def restarted(merger: Merger, seed: int, maps: Sequence[MapId]) -> Merger:
 
 
 @pytest.mark.parametrize("seed", first_quick(SEEDS, 1))
-def test_a_retired_map_leaves_what_was_superseded_as_it_was(seed: int) -> None:
+def test_a_retired_map_leaves_what_was_superseded_as_it_was(seed: int):
     before, merger = with_another(seed)
     merger.constrain(constrained(RetiredMap(ANOTHER)))
     assert merger.merged().superseded == before.superseded
@@ -115,7 +113,7 @@ def test_a_retired_map_leaves_what_was_superseded_as_it_was(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", first_quick(SEEDS, 1))
-def test_a_map_that_is_pruned_as_a_whole_has_not_gone(seed: int) -> None:
+def test_a_map_that_is_pruned_as_a_whole_has_not_gone(seed: int):
     """Newer nodes have taken its place: nothing is undone, and nothing is remembered of it."""
     _, merger = with_another(seed)
     both, log = merger.merged(), merger.record().log
@@ -130,7 +128,7 @@ def test_a_map_that_is_pruned_as_a_whole_has_not_gone(seed: int) -> None:
     assert stays and stays.items() <= merged.superseded.items()
 
 
-def test_a_node_that_a_pruned_one_superseded_before_is_judged_again() -> None:
+def test_a_node_that_a_pruned_one_superseded_before_is_judged_again():
     a, b, c = (NodeId("r0", 1, k) for k in range(3))
     by_b = Superseded(b, 20, 0.1, 0.1)
     step = Changes(
@@ -149,7 +147,7 @@ def test_a_node_that_a_pruned_one_superseded_before_is_judged_again() -> None:
 )
 def test_so_it_does_whatever_came_when_and_across_restarts(
     seed: int, order: Sequence[MapId], bounds: set[int], restarts: list[bool]
-) -> None:
+):
     """Also if the person retires it while no server runs, takes it in again, and retires it again."""
     merger, maps, points = Merger(), [*order], iter(restarts)
 
@@ -174,7 +172,7 @@ def test_so_it_does_whatever_came_when_and_across_restarts(
 
 
 @pytest.mark.parametrize("seed", first_quick(SEEDS, 1))
-def test_a_map_that_is_no_longer_joined_does_too(seed: int) -> None:
+def test_a_map_that_is_no_longer_joined_does_too(seed: int):
     before, merger = with_another(seed)
     merger.constrain(constrained(*(Apart((which, ANOTHER)) for which in HONEST)))
     after = merger.merged()
@@ -185,7 +183,7 @@ def test_a_map_that_is_no_longer_joined_does_too(seed: int) -> None:
 
 @pytest.mark.parametrize("seed", first_quick(SEEDS, 1))
 @pytest.mark.parametrize("at_once", [True, False])
-def test_maps_that_part_because_of_it_are_joined_as_before(seed: int, at_once: bool) -> None:
+def test_maps_that_part_because_of_it_are_joined_as_before(seed: int, at_once: bool):
     """Robots that would have been in one place at one time part, and do not once it is retired.
 
     So it is with a process that goes on from the record, too.
@@ -209,7 +207,7 @@ def followed(superseder: NodeSuperseder, merged: MergedMap, unsure: Collection[M
 
 
 @pytest.mark.parametrize("seed", first_quick(SEEDS[:2], 1))
-def test_a_map_that_becomes_unsure_does_too(seed: int) -> None:
+def test_a_map_that_becomes_unsure_does_too(seed: int):
     """The rest is superseded as if it had been unsure from the first."""
     before, merger = unchanged(seed)
     first, late = NodeSuperseder(), NodeSuperseder()
@@ -221,7 +219,7 @@ def test_a_map_that_becomes_unsure_does_too(seed: int) -> None:
     assert followed(late, both, [ANOTHER]).superseded == at_once.superseded
 
 
-def test_maps_that_came_behind_it_are_judged_again() -> None:
+def test_maps_that_came_behind_it_are_judged_again():
     """They are superseded by none of the map that is gone, and by nodes that are active."""
     seed = SEEDS[0]
     merger = Merger()
@@ -238,7 +236,7 @@ def test_maps_that_came_behind_it_are_judged_again() -> None:
     assert merger.merged().superseded == merged.superseded
 
 
-def test_what_superseded_a_node_before_may_be_superseded_itself() -> None:
+def test_what_superseded_a_node_before_may_be_superseded_itself():
     """By a node that is not undone: the first one is judged again."""
     before, _ = unchanged(SEEDS[0])
     a, b, c = (NodeId("r0", 1, k) for k in range(3))
@@ -251,7 +249,7 @@ def test_what_superseded_a_node_before_may_be_superseded_itself() -> None:
     assert superseded == {b: by[c]} and undone.judged == {a}
 
 
-def test_pruned_maps_and_what_is_forgotten_are_not_undone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_pruned_maps_and_what_is_forgotten_are_not_undone(monkeypatch):
     before, merger = unchanged(SEEDS[0])
     both = merger.merged()
     nodes = both.poses.keys()

@@ -115,7 +115,7 @@ def collision_on(a: Walk, b: Walk, rng: np.random.Generator, **how: tuple[str, s
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_twins_clash_and_the_reason_has_numbers(seed: int) -> None:
+def test_twins_clash_and_the_reason_has_numbers(seed: int):
     a, b, rng = twins(seed)
     collision = collision_on(a, b, rng)
     assert collision is not None and collision.evidence > 10 and collision.nearest < 0.1
@@ -123,7 +123,7 @@ def test_twins_clash_and_the_reason_has_numbers(seed: int) -> None:
     assert f"{collision.time:.1f} s of clock net, {collision.moments} such moments" in collision.reason
 
 
-def test_it_is_the_same_from_either_side() -> None:
+def test_it_is_the_same_from_either_side():
     a, b, rng = twins(4)
     first, second = trajectories(a, b)
     whole = graph(a, b, rng)
@@ -146,7 +146,7 @@ def scarce(seed: int, late: float) -> tuple[Walk, Walk, np.random.Generator]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_trajectory_segments_fill_gaps_between_nodes(seed: int) -> None:
+def test_trajectory_segments_fill_gaps_between_nodes(seed: int):
     """Between nodes the robots' poses are unknown, without trajectory segments."""
     a, b, rng = scarce(seed, 0.7)
     whole = graph(a, b, rng)
@@ -156,7 +156,7 @@ def test_trajectory_segments_fill_gaps_between_nodes(seed: int) -> None:
     assert bare is None or bare.evidence < collision.evidence / 2
 
 
-def test_moments_of_segments_move_with_their_nodes() -> None:
+def test_moments_of_segments_move_with_their_nodes():
     """Against poses composed one by one; a view is a moment of its own, and times ascend."""
     rng = np.random.default_rng(6)
     nodes, means = [], rng.uniform(-3, 3, (5, 3))
@@ -184,7 +184,7 @@ def test_moments_of_segments_move_with_their_nodes() -> None:
     assert np.exp(1j * pose[:, 2]) == pytest.approx(np.exp([1j * vector[2] for _, _, vector in expected]))
 
 
-def test_no_evidence_without_a_common_clock() -> None:
+def test_no_evidence_without_a_common_clock():
     a, b, rng = twins(0)
     assert collision_on(a, b, rng, clocks=("net", "own")) is None
     assert trajectories(a, b, clocks=("", "")) == []
@@ -193,13 +193,13 @@ def test_no_evidence_without_a_common_clock() -> None:
     assert collision_on(a, late, rng) is None
 
 
-def test_a_robot_does_not_clash_with_itself() -> None:
+def test_a_robot_does_not_clash_with_itself():
     a, b, rng = twins(0)
     first, second = trajectories(a, b, agents="aa")
     assert collision_of(graph(a, b, rng, agents="aa"), first, second) is None
 
 
-def test_a_moment_or_two_prove_nothing() -> None:
+def test_a_moment_or_two_prove_nothing():
     """One of the poses may be wrong: two robots that are far apart but for one node."""
     a, b, rng = twins(0)
     b.moved(np.array([5.0, 0.0]))
@@ -207,7 +207,7 @@ def test_a_moment_or_two_prove_nothing() -> None:
     assert collision_on(a, b, rng) is None
 
 
-def test_unknown_poses_are_no_evidence() -> None:
+def test_unknown_poses_are_no_evidence():
     """Every other node is far away in time, so that the straight line between nodes means nothing."""
     a, b, rng = twins(0)
     a.times = 4.0 * a.times
@@ -220,9 +220,7 @@ def test_unknown_poses_are_no_evidence() -> None:
     st.integers(0, 10**6), st.sampled_from(["follows", "wanders"]), st.sampled_from([0.005, 0.02, 0.04]),
     st.booleans(),
 )  # fmt: skip
-def test_robots_that_meet_closely_are_not_refused(
-    seed: int, manner: str, sigma: float, segments: bool
-) -> None:
+def test_robots_that_meet_closely_are_not_refused(seed: int, manner: str, sigma: float, segments: bool):
     """They come as near as 0.35 m, centre to centre, repeatedly: footprints of 0.3 m and a hand between."""
     rng = np.random.default_rng(seed)
     a = Walk(rng)
@@ -238,9 +236,7 @@ def test_robots_that_meet_closely_are_not_refused(
 
 @pytest.mark.slow
 @pytest.mark.parametrize("segments", [False, True])
-def test_robots_that_nearly_touch_rarely_count_as_collisions(
-    segments: bool, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_robots_that_nearly_touch_rarely_count_as_collisions(segments: bool, monkeypatch):
     """The bound holds even for footprints exactly as small as supposed: here at 0.2 m, with loose doubt."""
     monkeypatch.setattr(encounter, "LEAST_WINDOWS", 1)
     s = ExclusionSettings(doubt=0.1)
@@ -255,7 +251,7 @@ def test_robots_that_nearly_touch_rarely_count_as_collisions(
     assert refused <= 10
 
 
-def test_known_radii_decide_the_least_distance() -> None:
+def test_known_radii_decide_the_least_distance():
     """Two that pass at 0.25 m: small ones may, large ones cannot, and one of unknown radius may be small."""
     rng = np.random.default_rng(8)
     a = Walk(rng)
@@ -271,7 +267,7 @@ def test_known_radii_decide_the_least_distance() -> None:
     assert collision_of(whole, *trajectories(a, b), tiny) is not None
 
 
-def test_probabilities_agree_with_monte_carlo() -> None:
+def test_probabilities_agree_with_monte_carlo():
     rng = np.random.default_rng(3)
     offsets = rng.uniform(-0.3, 0.3, (20, 2))
     roots = rng.normal(0, 0.07, (20, 2, 2))

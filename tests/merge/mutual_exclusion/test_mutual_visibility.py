@@ -59,7 +59,7 @@ def marched(angle: float, place: Array, radius: float, reach: float = 6.0) -> fl
 
 
 @pytest.mark.slow
-def test_odds_against_rays_marched_step_by_step() -> None:
+def test_odds_against_rays_marched_step_by_step():
     rng = np.random.default_rng(1)
     for _ in range(15):
         angle = rng.uniform(-np.pi, np.pi)
@@ -89,13 +89,13 @@ def test_odds_against_rays_marched_step_by_step() -> None:
     ("length", "expected"), [(3.16, 8.0), (1.3, 8.0), (0.84, 0.22), (0.6, 1.0)],
     ids=["nothing", "a wall behind", "the robot", "something before"],
 )  # fmt: skip
-def test_the_evidence_of_one_ray(length: float, expected: float) -> None:
+def test_the_evidence_of_one_ray(length: float, expected: float):
     lengths = np.full((1, 16), 0.5)
     lengths[0, 0] = length
     assert np.isclose(odds(looks(np.array([[1.0, 0.0]]), lengths, 0.005))[0], expected, rtol=0.02)
 
 
-def test_a_robot_between_two_rays_is_seen_by_none() -> None:
+def test_a_robot_between_two_rays_is_seen_by_none():
     angle = np.pi / 16
     place = 2.0 * np.array([[np.cos(angle), np.sin(angle)]])
     assert odds(looks(place, np.full((1, 16), 3.16), 0.01))[0] == 1.0
@@ -104,7 +104,7 @@ def test_a_robot_between_two_rays_is_seen_by_none() -> None:
 @pytest.mark.parametrize("missed", [0.0, 0.05, 0.1])
 @pytest.mark.parametrize("spread", [0.01, 0.1])
 @pytest.mark.parametrize("clutter", [0.7, 3.0])
-def test_a_true_merge_has_mean_odds_of_at_most_one(missed: float, spread: float, clutter: float) -> None:
+def test_a_true_merge_has_mean_odds_of_at_most_one(missed: float, spread: float, clutter: float):
     """Robots at random, in random scenery: rays end at the first thing, and miss the robot now and then."""
     rng = np.random.default_rng(5)
     n, k = 6000, 16
@@ -134,7 +134,7 @@ def chain(share: float = 1.0, n: int = 8) -> PoseGraph:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("on_the_way", [1.0, 0.0])
-def test_common_errors_agree_with_monte_carlo(on_the_way: float) -> None:
+def test_common_errors_agree_with_monte_carlo(on_the_way: float):
     """Both look at each other; what each would see is computed from poses that are drawn."""
     rng = np.random.default_rng(2)
     graph = chain()
@@ -178,7 +178,7 @@ def test_common_errors_agree_with_monte_carlo(on_the_way: float) -> None:
         )
 
 
-def test_errors_between_maps_have_opposite_signs() -> None:
+def test_errors_between_maps_have_opposite_signs():
     """The floor: if the second is further east for the first, the first is further west for the second."""
     graph = chain(1e-6)
     observers, others = np.array([0, 8]), np.array([8, 0])
@@ -191,7 +191,7 @@ def test_errors_between_maps_have_opposite_signs() -> None:
 
 
 @pytest.mark.parametrize(("segment", "most"), [(0, 0.05), (4, 0.25)], ids=["nodes", "segments"])
-def test_looking_at_a_thousand_nodes_takes_no_time(segment: int, most: float) -> None:
+def test_looking_at_a_thousand_nodes_takes_no_time(segment: int, most: float):
     """Four robots, each in a room of its own with thin walls: all are in reach, none is in sight."""
     rng = np.random.default_rng(1)
     bearings, pose = np.arange(16) * np.pi / 8, PoseGaussian(Pose2(), np.zeros((3, 3)))

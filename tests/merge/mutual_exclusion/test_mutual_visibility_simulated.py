@@ -120,7 +120,7 @@ def between_twins(seed: int) -> float:
 
 
 @pytest.mark.parametrize("seed", first_quick(range(4), 2))
-def test_twins_should_have_seen_each_other(seed: int) -> None:
+def test_twins_should_have_seen_each_other(seed: int):
     """Within five minutes, in any room: where little floor is free they rarely see each other."""
     collision = walked("twins", seed, (0, 1), 150).collision_on(between_twins(seed))
     assert collision is not None and collision.where and collision.evidence > 6.9
@@ -147,7 +147,7 @@ def with_segments(walks: Walks, every: int = 5) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_twins_should_have_seen_each_other_on_the_way(seed: int) -> None:
+def test_twins_should_have_seen_each_other_on_the_way(seed: int):
     """Nodes alone do not refute the merge, or hardly, segments do; the same scans of another robot."""
     walks = walked("twins", seed, (0, 1), 150)
     all_nodes = walks.collision_on(between_twins(seed))
@@ -160,9 +160,7 @@ def test_twins_should_have_seen_each_other_on_the_way(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_robots_in_one_room_are_not_refused_by_views_on_the_way(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_robots_in_one_room_are_not_refused_by_views_on_the_way(seed: int, monkeypatch):
     """Neither where they meet, nor where the second is taken to be elsewhere by a few centimetres."""
     walks = walked("arena", seed, (0, 0), 100, length=4.0, width=3.0)
     with_segments(walks)
@@ -173,9 +171,7 @@ def test_robots_in_one_room_are_not_refused_by_views_on_the_way(
 
 @pytest.mark.parametrize("seed", first_quick(range(3), 1))
 @pytest.mark.parametrize("kind", ["office", "arena"])
-def test_robots_that_are_in_one_room_are_not_refused(
-    kind: str, seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_robots_that_are_in_one_room_are_not_refused(kind: str, seed: int, monkeypatch):
     """They come as near as they can, with furniture between, and rays that miss them."""
     walks = walked(kind, seed, (0, 0))
     assert walks.collision_on() is None
@@ -187,7 +183,7 @@ def test_robots_that_are_in_one_room_are_not_refused(
 
 
 @pytest.mark.parametrize("fails", ["all for a while", "most for ever"])
-def test_broken_sensors_are_no_evidence(fails: str) -> None:
+def test_broken_sensors_are_no_evidence(fails: str):
     """Rangers that fail say that there is nothing, though the other robot stands there."""
     walks = walked("arena", 3, (0, 0), 120, length=4.0, width=3.0)
     broken = slice(0, 16) if fails == "all for a while" else slice(0, 13)
@@ -200,7 +196,7 @@ def test_broken_sensors_are_no_evidence(fails: str) -> None:
     assert walks.collision_on() is None
 
 
-def test_robots_without_a_radius_are_not_used_for_visibility(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_robots_without_a_radius_are_not_used_for_visibility(monkeypatch):
     walks = walked("twins", 0, (0, 1))
     walks.nodes = [replace(node, radius=0.0) for node in walks.nodes]
     seeing = walks.collision_on(between_twins(0))
@@ -235,7 +231,7 @@ class Exploration:
 
 @pytest.mark.scenario
 @pytest.mark.timeout(500)
-def test_exploring_twin_rooms_are_distinguished_within_100_seconds() -> None:
+def test_exploring_twin_rooms_are_distinguished_within_100_seconds():
     """In most rooms; in some they are hardly in sight of each other."""
     collected = []
     for seed in range(5, 9):
@@ -252,7 +248,7 @@ def test_exploring_twin_rooms_are_distinguished_within_100_seconds() -> None:
         pytest.param("office", 5, marks=pytest.mark.scenario),
     ],
 )
-def test_robots_that_explore_together_are_never_refused(kind: str, seed: int) -> None:
+def test_robots_that_explore_together_are_never_refused(kind: str, seed: int):
     made = Exploration(kind, seed, 4 if kind == "arena" else 3, 80.0)
     loose = ExclusionSettings(doubt=0.5)
     for first, second in combinations(sorted({node.id.agent for node in made.nodes}), 2):

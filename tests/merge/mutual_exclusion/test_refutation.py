@@ -116,7 +116,7 @@ def pairs(result: Sequence[Link]) -> set[tuple[NodeId, NodeId]]:
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_closed_twins_stay_two(seed: int) -> None:
+def test_closed_twins_stay_two(seed: int):
     twins = Twins(seed)
     merged = merge_maps(twins.maps, twins.false)
     assert len(merged.components) == 2 and not merged.links
@@ -127,7 +127,7 @@ def test_closed_twins_stay_two(seed: int) -> None:
 
 
 @pytest.mark.parametrize(("clock", "late"), [("", 0.0), ("net", 500.0)])
-def test_without_a_clock_or_at_other_times_there_is_no_evidence(clock: str, late: float) -> None:
+def test_without_a_clock_or_at_other_times_there_is_no_evidence(clock: str, late: float):
     """A false set without contradiction is kept; with the true one as well, neither is."""
     twins = Twins(1, clock, late)
     merged = merge_maps(twins.maps, twins.false)
@@ -137,7 +137,7 @@ def test_without_a_clock_or_at_other_times_there_is_no_evidence(clock: str, late
     assert "ambiguous" in merged.explain(*twins.false[0].pair)
 
 
-def test_different_clocks_give_no_evidence() -> None:
+def test_different_clocks_give_no_evidence():
     twins = Twins(1)
     for node in list(twins.b.nodes.values()):
         twins.b.apply(NodePut(replace(node, clock="own")))
@@ -145,7 +145,7 @@ def test_different_clocks_give_no_evidence() -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_corridor_between_twins_joins_them(seed: int) -> None:
+def test_the_corridor_between_twins_joins_them(seed: int):
     """The false links are many more, and fall; the true ones, contradicted before, are enough."""
     twins = Twins(seed)
     true = twins.corridor(4)
@@ -156,7 +156,7 @@ def test_the_corridor_between_twins_joins_them(seed: int) -> None:
     assert all("same place at the same time" in merged.explain(*link.pair) for link in twins.false)
 
 
-def test_of_two_equal_sets_the_possible_one_is_kept() -> None:
+def test_of_two_equal_sets_the_possible_one_is_kept():
     twins = Twins(1)
     true = twins.corridor(10, inliers=30)
     assert pairs(merge_maps(twins.maps, twins.false + true).links) == pairs(true)
@@ -174,7 +174,7 @@ def error(merged: MergedMap, truth: Truth) -> float:
     )
 
 
-def test_twins_that_a_third_map_joins_come_apart_at_the_weakest_links() -> None:
+def test_twins_that_a_third_map_joins_come_apart_at_the_weakest_links():
     """Robot c came later into the room of b, and is taken to have been in that of a as well."""
     twins = Twins(1)
     rng = np.random.default_rng(5)
@@ -189,7 +189,7 @@ def test_twins_that_a_third_map_joins_come_apart_at_the_weakest_links() -> None:
     assert "a and b would have been at the same place" in reason and "weakest links" in reason
 
 
-def test_a_link_by_hand_that_cannot_be_true_stays_and_is_reported() -> None:
+def test_a_link_by_hand_that_cannot_be_true_stays_and_is_reported():
     twins = Twins(1)
     s = MergeSettings()
     by_hand = twins.false[:1]
@@ -211,7 +211,7 @@ def test_a_link_by_hand_that_cannot_be_true_stays_and_is_reported() -> None:
     assert all("links by hand join the two" in merged.contradicted[p] for p in pairs(false))
 
 
-def test_true_merges_of_robots_that_map_together_are_kept() -> None:
+def test_true_merges_of_robots_that_map_together_are_kept():
     """Two robots go through one room side by side, 0.35 m apart, with noise in edges and links."""
     for seed in range(5):
         rng = np.random.default_rng(seed)
@@ -223,7 +223,7 @@ def test_true_merges_of_robots_that_map_together_are_kept() -> None:
         assert len(merged.components) == 1 and not any("same place" in r.reason for r in merged.refused)
 
 
-def test_order_does_not_matter() -> None:
+def test_order_does_not_matter():
     twins = Twins(2)
     given = twins.false + twins.corridor(4)
     first = merge_maps(twins.maps, given)
@@ -235,7 +235,7 @@ def test_order_does_not_matter() -> None:
         assert np.array_equal(place.merged_from_robot.mean.vector, other.vector)
 
 
-def test_looking_at_a_thousand_nodes_takes_no_time() -> None:
+def test_looking_at_a_thousand_nodes_takes_no_time():
     rng = np.random.default_rng(1)
     maps: Fleet = {}
     truths = []

@@ -15,7 +15,7 @@ def pairs(result: list[Key]) -> list[tuple[int, int]]:
     return [(a.number, b.number) for a, b in result]
 
 
-def test_joined_pieces_are_not_tested_again() -> None:
+def test_joined_pieces_are_not_tested_again():
     """Each is the other's best, or the other's better ones are not tied to it by any link."""
     weights = keys({(0, 1): 9.0, (0, 2): 8.0, (0, 3): 7.0, (2, 3): 1.0, (4, 5): 2.0, (3, 4): 1.5})
     # 2 and 1 are tied by links that do not suffice: what 1 says of 2 is heard first.

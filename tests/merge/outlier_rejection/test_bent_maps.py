@@ -1,7 +1,5 @@
 """Maps that are a little wrong everywhere, and maps of rooms that look alike."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise
@@ -53,7 +51,7 @@ def links(rng: np.random.Generator, shift: Pose2) -> list[Link]:
     return out
 
 
-def test_a_sound_map_hangs_together_though_links_are_a_little_off() -> None:
+def test_a_sound_map_hangs_together_though_links_are_a_little_off():
     """One pair of links in a hundred that fails the gate makes no second set of them; a bend does."""
     steps = [a.inverse() @ b for a, b in pairwise(TOUR)]
     fixed, sound = piece("a", steps), piece("b", steps)
@@ -80,9 +78,7 @@ def test_a_sound_map_hangs_together_though_links_are_a_little_off() -> None:
         (1.0, Pose2(0.0, 3.0, math.pi), False),
     ],
 )
-def test_a_bent_map_is_at_one_place_and_a_second_room_is_at_another(
-    scale: float, shift: Pose2, bent: bool
-) -> None:
+def test_a_bent_map_is_at_one_place_and_a_second_room_is_at_another(scale: float, shift: Pose2, bent: bool):
     rng = np.random.default_rng(1)
     steps = [a.inverse() @ b for a, b in pairwise(TOUR)]
     placed = piece("b", [Pose2(scale * s.x, scale * s.y, s.heading) for s in steps])
@@ -90,9 +86,7 @@ def test_a_bent_map_is_at_one_place_and_a_second_room_is_at_another(
 
 
 @pytest.mark.parametrize(("scale", "shift", "false"), [(1.2, Pose2(), 0), (1.0, Pose2(4.0), 1)])
-def test_what_contradicts_a_bent_map_is_no_evidence_of_false_places(
-    scale: float, shift: Pose2, false: int
-) -> None:
+def test_what_contradicts_a_bent_map_is_no_evidence_of_false_places(scale: float, shift: Pose2, false: int):
     """Else one robot with a wrong way parts the maps of all others."""
     steps = [a.inverse() @ b for a, b in pairwise(TOUR)]
     placed = piece("b", [Pose2(scale * s.x, scale * s.y, s.heading) for s in steps])

@@ -115,7 +115,7 @@ def silent(links: Sequence[Link]) -> list[Link]:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_landmarks_of_one_bay_alone_are_counted(seed: int) -> None:
+def test_landmarks_of_one_bay_alone_are_counted(seed: int):
     aisle = Aisle(seed, signs=(1, 2)).driven(a=[0, 1, 2], b=[1, 2, 3])
     links = aisle.links()
     between = [link for link in aisle.weighed(links) if not link.within]
@@ -126,7 +126,7 @@ def test_landmarks_of_one_bay_alone_are_counted(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", first_quick(range(4), 2))
-def test_maps_are_joined_where_they_share_unique_landmarks(seed: int) -> None:
+def test_maps_are_joined_where_they_share_unique_landmarks(seed: int):
     aisle = Aisle(seed, signs=(2, 3)).driven(a=[0, 1, 2, 3], b=[2, 3, 4, 5, 6])
     merged = merge_maps(aisle.maps, aisle.links())
     between = [link for link in merged.links if not link.within]
@@ -135,7 +135,7 @@ def test_maps_are_joined_where_they_share_unique_landmarks(seed: int) -> None:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_aliased_aisles_are_not_joined(seed: int) -> None:
+def test_aliased_aisles_are_not_joined(seed: int):
     aisle = Aisle(seed).driven(a=[0, 1], b=[3, 4, 5])
     links = aisle.links()
     merged = merge_maps(aisle.maps, links)
@@ -143,13 +143,13 @@ def test_aliased_aisles_are_not_joined(seed: int) -> None:
     assert any("found at other places too" in refusal.reason for refusal in merged.refused)
 
 
-def test_a_view_of_one_bay_alone_is_ambiguous() -> None:
+def test_a_view_of_one_bay_alone_is_ambiguous():
     """One bay each, of another place: nothing shows that there are two of it. Then the merge is accepted."""
     aisle = Aisle(5).driven(a=[0], b=[3])
     assert len(merge_maps(aisle.maps, aisle.links()).components) == 1
 
 
-def test_without_landmarks_the_better_supported_of_two_bays_wins() -> None:
+def test_without_landmarks_the_better_supported_of_two_bays_wins():
     """What distinctness is for: the same links, counted by how many landmarks agree, join wrongly."""
     wrong = 0
     for seed in range(4):
@@ -163,7 +163,7 @@ def test_without_landmarks_the_better_supported_of_two_bays_wins() -> None:
     assert wrong > 0
 
 
-def test_aliasing_found_for_one_node_is_used_for_its_neighbours() -> None:
+def test_aliasing_found_for_one_node_is_used_for_its_neighbours():
     """A second node of the bay was compared with one place only; that shows its landmarks too."""
     aisle = Aisle(7)
     aisle.drive("a", [0], views=2)
@@ -176,13 +176,13 @@ def test_aliasing_found_for_one_node_is_used_for_its_neighbours() -> None:
     assert [link.aliased for link in aisle.weighed(alone)] == [0]
 
 
-def test_without_aliasing_all_landmarks_count() -> None:
+def test_without_aliasing_all_landmarks_count():
     aisle = Aisle(8, signs=tuple(range(6)), cartons=0).driven(a=[0, 1, 2], b=[1, 2, 3])
     links = aisle.links()
     assert links and all(again is link for link, again in zip(links, aisle.weighed(links), strict=True))
 
 
-def test_measured_badly_is_not_another_place() -> None:
+def test_measured_badly_is_not_another_place():
     """Two links from one node that are a hand's breadth off each other show one place."""
     aisle = Aisle(9, signs=(1,), cartons=0)
     aisle.drive("a", [1], views=1)
@@ -193,7 +193,7 @@ def test_measured_badly_is_not_another_place() -> None:
     assert len(links) == 2 and not any(link.aliased for link in aisle.weighed(links))
 
 
-def test_a_way_that_is_hardly_known_contradicts_nothing() -> None:
+def test_a_way_that_is_hardly_known_contradicts_nothing():
     """A robot slid while it drove from one sight of a bay to the next, and its covariance says so."""
     aisle = Aisle(11, signs=(1,), cartons=0)
     aisle.drive("a", [1], views=1)
@@ -207,7 +207,7 @@ def test_a_way_that_is_hardly_known_contradicts_nothing() -> None:
         assert [link.aliased for link in aisle.weighed(links)] == [doubles] * 2
 
 
-def test_order_does_not_matter() -> None:
+def test_order_does_not_matter():
     aisle = Aisle(10, signs=(1, 2)).driven(a=[0, 1, 2], b=[1, 2, 3])
     links = aisle.links()
     collected = {link.pair: link.aliased for link in aisle.weighed(links)}
@@ -217,7 +217,7 @@ def test_order_does_not_matter() -> None:
     assert {link.canonical().pair: link.aliased for link in aisle.weighed(turned)} == collected
 
 
-def test_one_robot_alone_takes_no_landmarks_from_links_of_others() -> None:
+def test_one_robot_alone_takes_no_landmarks_from_links_of_others():
     """It shows a bay once more, elsewhere on its way; a second robot that does so is believed."""
     aisle = Aisle(1, signs=(0,), cartons=0).driven(a=[0], b=[0])
     aliased = []

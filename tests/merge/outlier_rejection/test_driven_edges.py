@@ -54,7 +54,7 @@ def scene() -> Scene:
     return Scene()
 
 
-def test_a_drive_from_map_to_map_opens_a_way_and_moves_no_node(scene: Scene) -> None:
+def test_a_drive_from_map_to_map_opens_a_way_and_moves_no_node(scene: Scene):
     before = scene.merged()
     a, b = scene.a[0], scene.b[-1]
     assert [leg.kind for leg in Router(before).route(a, b).legs][1:] != [EdgeKind.DRIVEN]
@@ -72,14 +72,14 @@ def test_a_drive_from_map_to_map_opens_a_way_and_moves_no_node(scene: Scene) -> 
     assert [(leg.node.id, leg.kind) for leg in back] == [(b, None), (a, EdgeKind.DRIVEN)]
 
 
-def test_a_drive_that_the_merged_map_contradicts_is_left_out(scene: Scene) -> None:
+def test_a_drive_that_the_merged_map_contradicts_is_left_out(scene: Scene):
     edge = scene.drive(scene.a[0], scene.b[-1], shift=1.0)
     merged = scene.merged()
     assert [r.reason for r in merged.refused if r.edge == edge] == ["a drive contradicts the merged map"]
     assert edge not in merged.union().edges
 
 
-def test_a_drive_joins_no_maps(scene: Scene) -> None:
+def test_a_drive_joins_no_maps(scene: Scene):
     """The merge knows no link between them: then no route may lead along the drive either."""
     edge = scene.drive(scene.a[0], scene.b[0])
     merged = scene.merged(linked=False)
@@ -88,7 +88,7 @@ def test_a_drive_joins_no_maps(scene: Scene) -> None:
     assert not answer.legs and "parts of the map that nothing joins" in answer.reason
 
 
-def test_a_drive_to_a_node_that_is_gone_is_left_out(scene: Scene) -> None:
+def test_a_drive_to_a_node_that_is_gone_is_left_out(scene: Scene):
     edge = scene.drive(scene.a[0], scene.b[-1])
     scene.maps[B].apply(NodeRetired(scene.b[-1]))
     merged = scene.merged()
@@ -96,7 +96,7 @@ def test_a_drive_to_a_node_that_is_gone_is_left_out(scene: Scene) -> None:
     assert edge not in merged.union().edges
 
 
-def test_the_server_still_compares_nodes_connected_by_a_drive(scene: Scene) -> None:
+def test_the_server_still_compares_nodes_connected_by_a_drive(scene: Scene):
     """Neighbours on a robot's way are not compared, for they share its tracks; ends of a drive do not."""
     merger = merger_of({map_id: scene.maps[map_id].contents() for map_id in (A, B)})
     links = [link.pair for link in merger.merged().links]
@@ -109,9 +109,7 @@ def test_the_server_still_compares_nodes_connected_by_a_drive(scene: Scene) -> N
 
 
 @pytest.mark.parametrize("sigmas", [(100.0, 100.0, 3.0), (0.02, 0.02, 0.5), (1.0, 0.02, 0.01)])
-def test_a_drive_that_measured_hardly_anything_opens_no_way(
-    scene: Scene, sigmas: tuple[float, float, float]
-) -> None:
+def test_a_drive_that_measured_hardly_anything_opens_no_way(scene: Scene, sigmas: tuple[float, float, float]):
     """Nothing could contradict it: it would lead through walls."""
     a, b = scene.a[0], scene.b[-1]
     edge = scene.drive(a, b, 0.0, np.array(sigmas))

@@ -1,7 +1,5 @@
 """No robot decides by its own maps which links of others are beyond chance."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import combinations
 
@@ -51,7 +49,7 @@ def of_one_place(
 
 
 @pytest.mark.parametrize("seed", first_quick(range(4), 2))
-def test_wrong_maps_of_one_robot_part_no_others(seed: int) -> None:
+def test_wrong_maps_of_one_robot_part_no_others(seed: int):
     rng = np.random.default_rng(seed)
     fleet = draw_fleet(0.0, rng, FleetSettings(robots=3, nodes=30, true_links=0))
     between = of_one_place(fleet, "r1", "r2", rng)

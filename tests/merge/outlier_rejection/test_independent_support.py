@@ -36,7 +36,7 @@ def along(agent: str, places: list[tuple[float, float]]) -> Fragment:
     return Fragment(ids[0], solve_graph(ids[0], Pose2(*places[0]), steps), tuple(steps))
 
 
-def test_neighbours_at_both_ends_count_as_one_place() -> None:
+def test_neighbours_at_both_ends_count_as_one_place():
     """Three links between two places, one from the same place to another, and one apart."""
     a = along("a", [(0.0, 0.0), (0.7, 0.0), (1.4, 0.0), (8.0, 0.0)])
     b = along("b", [(0.0, 0.0), (0.7, 0.0), (1.4, 0.0), (9.0, 0.0)])
@@ -59,7 +59,7 @@ def test_neighbours_at_both_ends_count_as_one_place() -> None:
     assert support.places == pytest.approx(2.0) and support.others.tolist() == []
 
 
-def test_chance_is_the_share_of_poses_by_which_a_loop_closes_as_well() -> None:
+def test_chance_is_the_share_of_poses_by_which_a_loop_closes_as_well():
     rng = np.random.default_rng(1)
     square = along("a", [(0.0, 0.0), (FLOOR, 0.0), (FLOOR, FLOOR), (0.0, FLOOR)])
     root = np.array([[1.2, 0.0, 0.0], [0.3, 0.9, 0.0], [0.05, -0.02, 0.2]])
@@ -74,7 +74,7 @@ def test_chance_is_the_share_of_poses_by_which_a_loop_closes_as_well() -> None:
         assert result[0, 0] == pytest.approx((distances2 < reach2).mean(), rel=0.05)
 
 
-def test_the_number_of_chance_sets_agrees_with_the_prediction() -> None:
+def test_the_number_of_chance_sets_agrees_with_the_prediction():
     """Pairs of false places that agree, against Monte Carlo."""
     rng = np.random.default_rng(2)
     n, coincidence = 12, 0.03
@@ -86,7 +86,7 @@ def test_the_number_of_chance_sets_agrees_with_the_prediction() -> None:
     assert two.by_chance(false) == pytest.approx(count, rel=0.05)
 
 
-def test_links_of_false_places_agree_with_monte_carlo() -> None:
+def test_links_of_false_places_agree_with_monte_carlo():
     """As if one more had been heard that brings one link, or with half the chance another one, and so on."""
     rng = np.random.default_rng(3)
     false = ChanceSupport(5.0, np.array([6.0, 3.0, 0.0, 1.0]))
@@ -105,7 +105,7 @@ def test_links_of_false_places_agree_with_monte_carlo() -> None:
     assert rich.by_chance(false) < 0.2 * pair.by_chance(false)
 
 
-def test_a_pair_is_not_judged_by_itself() -> None:
+def test_a_pair_is_not_judged_by_itself():
     first = Support(np.array([1, 1, 1]), np.array([2, 2]), 0.1)
     second = Support(np.array([1]), np.array([1, 1, 1, 4, 4, 4, 4]), 0.1)
     every = ChanceSupport.of([first, second])
@@ -117,7 +117,7 @@ def test_a_pair_is_not_judged_by_itself() -> None:
 
 
 @pytest.mark.parametrize("alike", first_quick([4, 1], 1))
-def test_fleets_with_90_percent_false_links_are_joined_correctly_or_not_at_all(alike: int) -> None:
+def test_fleets_with_90_percent_false_links_are_joined_correctly_or_not_at_all(alike: int):
     """Most are as good as with the true links known, and none is joined by false links alone."""
     good = 0
     for seed in range(3):

@@ -1,7 +1,5 @@
 """Is the probability that a link carries the share of such links that are right?"""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -66,7 +64,7 @@ def fleet(seed: int, false_share: float, links: int = 60) -> tuple[np.ndarray, n
 
 
 @pytest.mark.parametrize("false_share", [0.2, 0.8])
-def test_probabilities_are_those_that_links_have(false_share: float) -> None:
+def test_probabilities_are_those_that_links_have(false_share: float):
     both = [fleet(seed, false_share) for seed in (1, 2, 3)]
     lines, right = (np.concatenate(column) for column in zip(*both, strict=True))
     share = right.mean()
@@ -78,7 +76,7 @@ def test_probabilities_are_those_that_links_have(false_share: float) -> None:
     assert ((lines > 0.5) == right)[sure].mean() > 0.98
 
 
-def test_they_are_never_certain_and_grow_with_the_evidence() -> None:
+def test_they_are_never_certain_and_grow_with_the_evidence():
     values = [probability(factor, 2.0) for factor in (-1e9, -3.0, 0.0, 3.0, 1e9)]
     assert values == sorted(values) and 0.0 < values[0] < values[-1] < 1.0
     assert values[2] == pytest.approx(2 / 3)

@@ -66,7 +66,7 @@ class Two:
 
 
 @pytest.mark.parametrize("false_ones", [0, 4, 12])
-def test_planted_false_links_are_refused(false_ones: int) -> None:
+def test_planted_false_links_are_refused(false_ones: int):
     for seed in range(5):
         second = Two(seed)
         true = [second.true_link(k, k) for k in range(0, 12, 2)]
@@ -81,7 +81,7 @@ def test_planted_false_links_are_refused(false_ones: int) -> None:
         assert all(first.reason for first in sorted_links.refused)
 
 
-def test_loop_misclosures_are_calibrated(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_loop_misclosures_are_calibrated(monkeypatch):
     monkeypatch.setattr(pairwise_consistency, "LOOP_FLOOR", 1e-8 * np.eye(3))
     values = []
     for seed in range(40):
@@ -91,7 +91,7 @@ def test_loop_misclosures_are_calibrated(monkeypatch: pytest.MonkeyPatch) -> Non
     assert 2.0 < np.mean(values) < 4.2
 
 
-def test_an_aliased_room_is_refused_when_the_right_one_has_more_support() -> None:
+def test_an_aliased_room_is_refused_when_the_right_one_has_more_support():
     """Links between rooms that look alike agree with each other and are wrong."""
     second = Two(3)
     aliased = second.alike_room()
@@ -106,7 +106,7 @@ def test_an_aliased_room_is_refused_when_the_right_one_has_more_support() -> Non
     }
 
 
-def test_two_sets_with_equal_support_are_both_refused() -> None:
+def test_two_sets_with_equal_support_are_both_refused():
     second = Two(4)
     aliased = second.alike_room()
     right = [second.true_link(k, k) for k in range(3)]
@@ -117,7 +117,7 @@ def test_two_sets_with_equal_support_are_both_refused() -> None:
     )
 
 
-def test_one_place_with_many_links_is_rejected_if_another_contradicts_it() -> None:
+def test_one_place_with_many_links_is_rejected_if_another_contradicts_it():
     """A corner like another gave five links, the corridor that both came by four of half the weight."""
     second = Two(8, n=16)
     shift = Pose2(-8.0, 0.0, 0.0)
@@ -138,14 +138,14 @@ def test_one_place_with_many_links_is_rejected_if_another_contradicts_it() -> No
     assert kept == {first.pair for first in [*true, *more]}
 
 
-def test_a_single_link_is_too_little_unless_overwhelming() -> None:
+def test_a_single_link_is_too_little_unless_overwhelming():
     two = Two(5)
     sorted_links = sort_links([two.true_link(2, 2)], two.a, two.b)
     assert not sorted_links.kept and "no 2 links that share no node agree" in sorted_links.refused[0].reason
     assert len(sort_links([two.true_link(2, 2, inliers=60)], two.a, two.b).kept) == 1
 
 
-def test_links_at_one_node_count_as_one_place() -> None:
+def test_links_at_one_node_count_as_one_place():
     two = Two(6)
     sorted_links = sort_links([two.true_link(2, 2), two.true_link(2, 3)], two.a, two.b)
     assert not sorted_links.kept
@@ -153,7 +153,7 @@ def test_links_at_one_node_count_as_one_place() -> None:
     assert independent_links([two.true_link(2, 2), two.true_link(2, 3), two.true_link(3, 2)], 9) == 2
 
 
-def test_loops_within_a_map_must_agree_with_its_own_way() -> None:
+def test_loops_within_a_map_must_agree_with_its_own_way():
     second = Two(7)
     a, tour = second.a, second.tour_a
     true = [link(a, i, a, j, tour[i].inverse() @ tour[j], second.rng) for i, j in ((0, 9), (2, 11), (1, 7))]
@@ -165,7 +165,7 @@ def test_loops_within_a_map_must_agree_with_its_own_way() -> None:
 
 @settings(max_examples=60, deadline=None)
 @given(st.integers(1, 9), st.integers(0, 10**6))
-def test_best_clique_against_brute_force(n: int, seed: int) -> None:
+def test_best_clique_against_brute_force(n: int, seed: int):
     rng = np.random.default_rng(seed)
     agree = np.triu(rng.random((n, n)) < 0.6, 1)
     agree = agree | agree.T
@@ -184,7 +184,7 @@ def test_best_clique_against_brute_force(n: int, seed: int) -> None:
     assert weights[greedy].sum() >= weights.max()
 
 
-def test_greedy_clique_finds_a_planted_one() -> None:
+def test_greedy_clique_finds_a_planted_one():
     rng = np.random.default_rng(2)
     agree = np.triu(rng.random((120, 120)) < 0.2, 1)
     planted = np.sort(rng.choice(120, 30, replace=False))
@@ -194,7 +194,7 @@ def test_greedy_clique_finds_a_planted_one() -> None:
     assert set(planted) <= set(best_clique(agree, np.full(120, 20)))
 
 
-def test_what_one_robot_shows_twice_takes_nothing_from_links_between_others() -> None:
+def test_what_one_robot_shows_twice_takes_nothing_from_links_between_others():
     """Links of three robots that agree are sorted together; most landmarks of one robot's are aliased."""
     two = Two(9)
     joined = two.b.graph

@@ -80,7 +80,7 @@ GOOD = [(2, 26), (6, 30), (9, 33), (14, 38), (19, 43), (22, 46)]
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_loop_closure_off_by_a_bay_is_left_out_with_a_reason(seed: int) -> None:
+def test_a_loop_closure_off_by_a_bay_is_left_out_with_a_reason(seed: int):
     aisles = Aisles(seed)
     true = [aisles.loop(i, j) for i, j in GOOD]
     [clean] = fragments_of({A: aisles.map})
@@ -101,9 +101,7 @@ def test_a_loop_closure_off_by_a_bay_is_left_out_with_a_reason(seed: int) -> Non
 
 
 @pytest.mark.parametrize("add", [Aisles.loop, Aisles.drive])
-def test_good_loops_and_drives_bring_the_map_nearer_to_the_truth(
-    add: Callable[[Aisles, int, int], EdgeId],
-) -> None:
+def test_good_loops_and_drives_bring_the_map_nearer_to_the_truth(add: Callable[[Aisles, int, int], EdgeId]):
     with_them, without = [], []
     for seed in range(6):
         aisles = Aisles(seed)
@@ -116,14 +114,14 @@ def test_good_loops_and_drives_bring_the_map_nearer_to_the_truth(
     assert np.mean(with_them) < 0.8 * np.mean(without)
 
 
-def test_a_single_loop_that_agrees_is_enough() -> None:
+def test_a_single_loop_that_agrees_is_enough():
     aisles = Aisles(1)
     aisles.loop(2, 26)
     [piece] = fragments_of({A: aisles.map})
     assert not piece.refused and sum(m.robust for m in piece.measurements) == 1
 
 
-def test_a_loop_that_only_other_loops_contradict_is_left_out() -> None:
+def test_a_loop_that_only_other_loops_contradict_is_left_out():
     """The drive alone is too uncertain; four loops that agree are not."""
     aisles = Aisles(2)
     for edge in list(aisles.map.edges.values()):
@@ -137,7 +135,7 @@ def test_a_loop_that_only_other_loops_contradict_is_left_out() -> None:
     assert "own loop contradicts 4 links" in piece.refused[0].reason
 
 
-def test_a_bridge_stays_up_after_any_message() -> None:
+def test_a_bridge_stays_up_after_any_message():
     aisles = Aisles(3, missing=24)
     assert len(fragments_of({A: aisles.map})) == 2
     aisles.loop(23, 24, shift=1.8, inliers=1)
@@ -145,7 +143,7 @@ def test_a_bridge_stays_up_after_any_message() -> None:
     assert not piece.refused and len(piece) == 48
 
 
-def test_of_bridges_that_contradict_each_other_the_better_supported_stay() -> None:
+def test_of_bridges_that_contradict_each_other_the_better_supported_stay():
     aisles = Aisles(3, missing=24)
     for i, j in GOOD[:3]:
         aisles.loop(i, j)
@@ -156,7 +154,7 @@ def test_of_bridges_that_contradict_each_other_the_better_supported_stay() -> No
 
 
 @pytest.mark.parametrize(("i", "j"), [(8, 9), (4, 8), (8, 29)])
-def test_a_drive_between_wrong_places_is_left_out_and_bends_nothing(i: int, j: int) -> None:
+def test_a_drive_between_wrong_places_is_left_out_and_bends_nothing(i: int, j: int):
     """Also between neighbours on the map's own way, and no robot shall drive by it."""
     aisles = Aisles(1)
     for pair in GOOD:
@@ -172,7 +170,7 @@ def test_a_drive_between_wrong_places_is_left_out_and_bends_nothing(i: int, j: i
 
 
 @pytest.mark.parametrize("driven_first", [True, False])
-def test_an_edge_recognised_and_driven_counts_once(driven_first: bool) -> None:
+def test_an_edge_recognised_and_driven_counts_once(driven_first: bool):
     aisles = Aisles(1)
     put = [aisles.drive, aisles.loop] if driven_first else [aisles.loop, aisles.drive]
     both = {item(2, 26) for item in put}
@@ -181,14 +179,14 @@ def test_an_edge_recognised_and_driven_counts_once(driven_first: bool) -> None:
     assert both <= set(merge_maps({A: aisles.map}, []).union().edges)
 
 
-def test_where_both_are_refused_both_are_named() -> None:
+def test_where_both_are_refused_both_are_named():
     aisles = Aisles(1)
     false = {aisles.loop(8, 29, shift=1.8), aisles.drive(8, 29, shift=1.8)}
     [piece] = fragments_of({A: aisles.map})
     assert {r.edge for r in piece.refused} == false
 
 
-def test_a_view_is_trusted_where_a_drive_contradicts_it() -> None:
+def test_a_view_is_trusted_where_a_drive_contradicts_it():
     aisles = Aisles(1)
     seen, driven = aisles.loop(2, 26), aisles.drive(2, 26, shift=0.5)
     [piece] = fragments_of({A: aisles.map})
@@ -199,9 +197,7 @@ def test_a_view_is_trusted_where_a_drive_contradicts_it() -> None:
 
 @settings(max_examples=30, deadline=None)
 @given(st.integers(0, 10**6), st.integers(0, 8), st.integers(0, 4))
-def test_no_set_of_loops_tears_a_map_apart_or_makes_it_depend_on_order(
-    seed: int, loops: int, missing: int
-) -> None:
+def test_no_set_of_loops_tears_a_map_apart_or_makes_it_depend_on_order(seed: int, loops: int, missing: int):
     """For any loop closures: connected nodes stay connected, and all closures are kept or named."""
     aisles = Aisles(seed, missing=12 * missing if missing else None)
     rng = np.random.default_rng(seed)

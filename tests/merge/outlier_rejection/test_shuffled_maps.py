@@ -1,7 +1,5 @@
 """True views with wrong ways between them, and maps of rooms that look alike."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np
@@ -28,7 +26,7 @@ def links(seen: list[Pose2]) -> list[Link]:
 
 
 @pytest.mark.parametrize("count", [LEAST_PLACED, 9, 20])
-def test_views_in_a_wrong_arrangement_are_no_second_place(count: int) -> None:
+def test_views_in_a_wrong_arrangement_are_no_second_place(count: int):
     rng = np.random.default_rng(count)
     fixed = piece("a", [a.inverse() @ b for a, b in pairwise(TOUR)])
     seen = TOUR[:count]
@@ -42,7 +40,7 @@ def test_views_in_a_wrong_arrangement_are_no_second_place(count: int) -> None:
     assert not is_shuffled(links(seen), piece("b", between), fixed)
 
 
-def test_three_nodes_tell_nothing() -> None:
+def test_three_nodes_tell_nothing():
     few = TOUR[: LEAST_PLACED - 1]
     fixed = piece("a", [a.inverse() @ b for a, b in pairwise(TOUR)])
     assert not is_shuffled(links(few), piece("b", [TWIN] * (len(few) - 1)), fixed)

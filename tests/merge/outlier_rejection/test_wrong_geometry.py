@@ -1,7 +1,5 @@
 """Lines of sight, and which of several maps they refute."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from random import Random
 from typing import Any
@@ -49,7 +47,7 @@ def facing_a_wall(map_id: MapId, number: int, distance: float, at: Pose2, count:
         (-1.5, "hidden", "refuted"),
     ],
 )
-def test_a_view_through_a_wall_is_detected(ahead: float, first: str, second: str) -> None:
+def test_a_view_through_a_wall_is_detected(ahead: float, first: str, second: str):
     one, other = (facing_a_wall(MapId("a", 1), k, 3.0, Pose2(), 500) for k in (1, 2))
     there = Pose2(ahead, 0.0, 0.0)
     for node, view, moved, expected in ((one, other, there.inverse(), first), (other, one, there, second)):
@@ -99,7 +97,7 @@ def with_jump(agents: str = "ab") -> dict[MapId, HybridMap]:
 @pytest.mark.parametrize(
     ("scale", "gap", "expected"), [(1.0, 0.0, False), (1.0, 2.0, True), (2.0, 0.0, True)]
 )
-def test_a_map_that_jumps_or_stretches_is_wrong(scale: float, gap: float, expected: bool) -> None:
+def test_a_map_that_jumps_or_stretches_is_wrong(scale: float, gap: float, expected: bool):
     maps = {MapId(agent, 1): corridor(agent) for agent in "ab"}
     maps[MapId("c", 1)] = corridor("c", scale, gap, 12)
     ids, links = links_among(maps)
@@ -114,7 +112,7 @@ def test_a_map_that_jumps_or_stretches_is_wrong(scale: float, gap: float, expect
 
 
 @pytest.mark.parametrize("count", [3, 7])
-def test_no_robot_alone_makes_maps_of_others_seem_wrong(count: int) -> None:
+def test_no_robot_alone_makes_maps_of_others_seem_wrong(count: int):
     """However many maps it sends that agree with each other, also if these come first."""
     maps = {MapId(agent, 1): corridor(agent) for agent in "yz"}
     maps |= {MapId("c", k): corridor("c", 1.0, 2.0, 12, k) for k in range(1, count + 1)}
@@ -149,7 +147,7 @@ def found(maps: dict[MapId, HybridMap], links: dict[tuple[MapId, MapId], list[Li
     return wrong
 
 
-def test_a_few_false_links_make_no_map_wrong_that_all_others_hold_in_one_place() -> None:
+def test_a_few_false_links_make_no_map_wrong_that_all_others_hold_in_one_place():
     """Two false ones of nine and of fifteen, as in the life of a map (seed 62113)."""
     maps, links = drives(6)
     *others, last = sorted(maps)
@@ -161,7 +159,7 @@ def test_a_few_false_links_make_no_map_wrong_that_all_others_hold_in_one_place()
     assert found(maps, links) == set()
 
 
-def test_a_part_of_a_map_that_few_links_show_elsewhere_makes_it_wrong() -> None:
+def test_a_part_of_a_map_that_few_links_show_elsewhere_makes_it_wrong():
     """Nine links in ten hold the rest of it in one place, and do not outvote them."""
     maps, links = drives(6, gap=1.0)
     *others, last = sorted(maps)
@@ -176,7 +174,7 @@ def test_a_part_of_a_map_that_few_links_show_elsewhere_makes_it_wrong() -> None:
 
 @settings(max_examples=10, deadline=None)
 @given(st.randoms(use_true_random=False))
-def test_the_order_in_which_links_were_found_changes_nothing(random: Random) -> None:
+def test_the_order_in_which_links_were_found_changes_nothing(random: Random):
     """Of more links than are tested, those were tested that came at certain turns."""
     maps = with_jump()
     links = links_among(maps)[1]
@@ -188,7 +186,7 @@ def test_the_order_in_which_links_were_found_changes_nothing(random: Random) -> 
         assert second.wrong(maps, shuffled.__getitem__, links.keys()) == wrong
 
 
-def test_a_map_that_was_left_out_when_its_links_came_is_searched_once_it_is_used() -> None:
+def test_a_map_that_was_left_out_when_its_links_came_is_searched_once_it_is_used():
     """Such as one that was taken for a copy. Before, it was searched when its links changed again."""
     maps = with_jump()
     ids, links = links_among(maps)
@@ -197,7 +195,7 @@ def test_a_map_that_was_left_out_when_its_links_came_is_searched_once_it_is_used
     assert finder.wrong(maps, links.__getitem__, ()).keys() == {ids[2]}
 
 
-def test_a_pair_of_maps_that_no_solver_takes_hides_no_other(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pair_of_maps_that_no_solver_takes_hides_no_other(monkeypatch):
     maps = with_jump("abd")
     ids, links = links_among(maps)
     real = wrong_geometry.link_sets

@@ -1,7 +1,5 @@
 """The choice of pairs from the overlaps of all nodes at once, which the choice by changes agrees with."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping
 from typing import Any
 

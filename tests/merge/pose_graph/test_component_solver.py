@@ -1,7 +1,5 @@
 """The solver against a batch optimum, while links come and go."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -33,7 +31,7 @@ def batch(fragments: list[Fragment], links: list[Link], graph: PoseGraph) -> Com
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_links_that_come_and_go_leave_the_batch_optimum(seed: int) -> None:
+def test_links_that_come_and_go_leave_the_batch_optimum(seed: int):
     rng = np.random.default_rng(seed)
     _, fragments, links = drawn(seed)
     solver = ComponentSolver(fragments)
@@ -50,7 +48,7 @@ def test_links_that_come_and_go_leave_the_batch_optimum(seed: int) -> None:
             assert off.max() < 2e-4
 
 
-def test_an_untouched_island_is_the_same_object() -> None:
+def test_an_untouched_island_is_the_same_object():
     _, fragments, links = drawn(3)
     solver = ComponentSolver(fragments)
     names = [fragment.name for fragment in fragments]
@@ -64,7 +62,7 @@ def test_an_untouched_island_is_the_same_object() -> None:
     assert {id(g) for g in solver.solve([*more, *first])} == {id(g) for g in after}, "in whatever order"
 
 
-def test_it_goes_on_from_an_earlier_solution(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_it_goes_on_from_an_earlier_solution(monkeypatch):
     """Few nodes are moved at a time, and far-off ones stay; then all of them settle."""
     fleet, fragments, links = drawn(4)
     rng = np.random.default_rng(4)
@@ -88,9 +86,7 @@ def test_it_goes_on_from_an_earlier_solution(monkeypatch: pytest.MonkeyPatch) ->
         assert np.abs(result.means - b.means)[:, :2].max() < 2e-4
 
 
-def test_covariances_of_a_large_component_are_those_of_the_whole_or_larger(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_covariances_of_a_large_component_are_those_of_the_whole_or_larger(monkeypatch):
     _, fragments, links = drawn(5)
     graph = ComponentSolver(fragments).solve(links)[0]
     nodes = list(graph.nodes)

@@ -1,7 +1,5 @@
 """The pose graph's columns against matrices of the group and finite differences of them."""
 
-from __future__ import annotations
-
 import math
 from itertools import pairwise
 
@@ -51,7 +49,7 @@ def residual(m: RelativePose, a: Array, b: Array) -> Array:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_information_is_that_of_finite_differences(seed: int) -> None:
+def test_information_is_that_of_finite_differences(seed: int):
     """To first order in the residuals, so they are small here."""
     means, measurements = drawn(seed)
     result = factors_of(measurements).information(means).toarray()
@@ -72,7 +70,7 @@ def test_information_is_that_of_finite_differences(seed: int) -> None:
     assert np.allclose(result, expected, atol=2e-3 * np.abs(expected).max())
 
 
-def test_neighbours_are_found_ring_by_ring() -> None:
+def test_neighbours_are_found_ring_by_ring():
     """Along a chain of ten nodes, from its middle."""
     step = PoseGaussian(Pose2(1.0, 0.0, 0.0), np.eye(3))
     ids = [NodeId("a", 1, k) for k in range(10)]

@@ -1,7 +1,5 @@
 """Maps whose lengths are all too long or too short by one factor are corrected, and no others."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import replace
@@ -123,7 +121,7 @@ def apart(one: MergedMap, other: MergedMap, odd: bool) -> float:
 
 
 @pytest.mark.parametrize("factor", first_quick([1.05, 0.96], 1))
-def test_a_map_with_long_lengths_bends_and_parts_no_others(fleet: Fleet, factor: float) -> None:
+def test_a_map_with_long_lengths_bends_and_parts_no_others(fleet: Fleet, factor: float):
     sound, maps = fleet.maps(), fleet.maps(factor, factor)
     links = fleet.links(maps)
     right, merged = merge_maps(sound, fleet.links(sound)), merge_maps(maps, links)
@@ -141,7 +139,7 @@ def test_a_map_with_long_lengths_bends_and_parts_no_others(fleet: Fleet, factor:
 
 
 @pytest.mark.parametrize("factor", first_quick([0.96, 1.05, 1.03], 2))
-def test_the_factor_is_found(fleet: Fleet, factor: float) -> None:
+def test_the_factor_is_found(fleet: Fleet, factor: float):
     scales = scales_of(fleet, factor, factor)
     odd = scales.pop(ODD)
     # Within what it says, and by how much the prior draws it.
@@ -152,11 +150,11 @@ def test_the_factor_is_found(fleet: Fleet, factor: float) -> None:
 
 
 @pytest.mark.parametrize(("way", "depth"), [(1.0, 1.0), (1.0, 1.3), (1.1, 1.0)])
-def test_what_is_no_factor_of_all_lengths_is_left(fleet: Fleet, way: float, depth: float) -> None:
+def test_what_is_no_factor_of_all_lengths_is_left(fleet: Fleet, way: float, depth: float):
     assert all(scale.undone == 0.0 for scale in scales_of(fleet, way, depth).values())
 
 
-def test_false_links_make_no_factor(fleet: Fleet) -> None:
+def test_false_links_make_no_factor(fleet: Fleet):
     maps = fleet.maps()
     rng = np.random.default_rng(SEED)
 
@@ -171,7 +169,7 @@ def test_false_links_make_no_factor(fleet: Fleet) -> None:
     assert not any(scale.undone for scale in found.values())
 
 
-def test_a_link_changes_with_depths_as_is_said(fleet: Fleet) -> None:
+def test_a_link_changes_with_depths_as_is_said(fleet: Fleet):
     maps, more = fleet.maps(), fleet.maps(1.0, 1.02)
     checked = 0
     for link in fleet.links(maps):
@@ -187,7 +185,7 @@ def test_a_link_changes_with_depths_as_is_said(fleet: Fleet) -> None:
     assert checked > 30
 
 
-def test_factors_are_those_of_least_squares_with_the_prior() -> None:
+def test_factors_are_those_of_least_squares_with_the_prior():
     which = [MapId(f"r{k}", 1) for k in range(4)]
     logs = np.array([0.002, -0.004, 0.0, 0.05])
     ratios = {
@@ -212,7 +210,7 @@ def test_factors_are_those_of_least_squares_with_the_prior() -> None:
     assert [two[one].log for one in which[:2]] == pytest.approx([-0.02, 0.02], abs=1e-3)
 
 
-def test_what_did_not_change_is_not_made_again(fleet: Fleet) -> None:
+def test_what_did_not_change_is_not_made_again(fleet: Fleet):
     maps = fleet.maps(1.05, 1.05)
     links, scales = fleet.links(maps), MapScales()
     pieces = fragments_of(maps, ConsistencySettings())

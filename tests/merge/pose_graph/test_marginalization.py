@@ -1,7 +1,5 @@
 """Marginal links against the exact marginal distribution, by dense linear algebra."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -62,7 +60,7 @@ def divergence(exact: Array, approximate: Array) -> float:
     return 0.5 * float(np.trace(approximate @ spread) - len(exact) + logs)
 
 
-def test_a_way_through_one_node_becomes_its_composition() -> None:
+def test_a_way_through_one_node_becomes_its_composition():
     """Three nodes in a row: the link of the outer two is exact."""
     rng = np.random.default_rng(1)
     measured, _ = drawn(rng, 3, 0)
@@ -81,9 +79,7 @@ def shifts(now: Component, before: Component) -> Array:
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_what_is_left_is_near_the_exact_marginal_distribution(
-    seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_left_is_near_the_exact_marginal_distribution(seed: int, monkeypatch):
     measured, truth = drawn(np.random.default_rng(seed), 24, 60)
     removed = {node(k) for k in range(1, 24, 2)}
     graph = solve_graph(node(0), truth[0], measured)
@@ -100,7 +96,7 @@ def test_what_is_left_is_near_the_exact_marginal_distribution(
     assert lost[LINKS] < 0.5 and lost[LINKS] < 0.25 * lost[0], "nats; a tree alone loses several"
 
 
-def test_later_removals_replace_the_links_of_earlier_ones() -> None:
+def test_later_removals_replace_the_links_of_earlier_ones():
     rng = np.random.default_rng(9)
     measured, truth = drawn(rng, 30, 80)
     graph = solve_graph(node(0), truth[0], measured)
@@ -122,7 +118,7 @@ def test_later_removals_replace_the_links_of_earlier_ones() -> None:
     assert mine == pytest.approx(whole, rel=0.25), "and is known as well as before"
 
 
-def test_nodes_far_from_a_removal_keep_their_links() -> None:
+def test_nodes_far_from_a_removal_keep_their_links():
     rng = np.random.default_rng(2)
     measured, truth = drawn(rng, 40, 0)
     graph = solve_graph(node(0), truth[0], measured)
@@ -132,7 +128,7 @@ def test_nodes_far_from_a_removal_keep_their_links() -> None:
     assert len(more) == 2 and links[0] in more
 
 
-def test_a_verified_link_and_a_marginal_one_count_both() -> None:
+def test_a_verified_link_and_a_marginal_one_count_both():
     near, far = (PoseGaussian.from_sigmas(Pose2(x, 0.0, 0.0), 0.02, 0.01) for x in (1.00, 1.02))
     marginal = Link(node(0), node(7), near, evidence={"marginal": 1.0})
     verified = Link(node(0), node(7), far, np.array([[1, 2]]), {"inliers": 30.0})

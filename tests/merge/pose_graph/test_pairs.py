@@ -16,7 +16,7 @@ STEP = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_it_agrees_with_a_fresh_choice(seed: int) -> None:
+def test_it_agrees_with_a_fresh_choice(seed: int):
     """Nodes and edges come and go, nodes are refined; every change is returned once."""
     rng = np.random.default_rng(seed)
     limits = 2, int(rng.integers(1, 4))
@@ -57,7 +57,7 @@ def test_it_agrees_with_a_fresh_choice(seed: int) -> None:
             known = wanted
 
 
-def test_a_refined_node_is_compared_again() -> None:
+def test_a_refined_node_is_compared_again():
     a, b = NodeId("a", 1, 1), NodeId("b", 1, 1)
     table = PairTable()
     table.put(a, {})
@@ -71,7 +71,7 @@ def test_a_refined_node_is_compared_again() -> None:
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
 
 
-def test_overlap_against_a_double_loop() -> None:
+def test_overlap_against_a_double_loop():
     rng = np.random.default_rng(1)
     world = room(0, 0, 5, 4, 600, rng)
     a = take_node(world, NodeId("a", 1, 1), Pose2(2, 2, 0), HERE, rng)
@@ -89,7 +89,7 @@ def test_overlap_against_a_double_loop() -> None:
     assert overlap(np.zeros(0, int), np.zeros(0, int), np.zeros(0), 0.5) == 0.0
 
 
-def test_true_overlaps_rank_above_chance_and_neighbours_are_left_out() -> None:
+def test_true_overlaps_rank_above_chance_and_neighbours_are_left_out():
     rng = np.random.default_rng(2)
     world = room(0, 0, 5, 4, 600, rng)
     tour = [Pose2(1.5 + 0.1 * k, 2, 0.1 * k) for k in range(6)]
@@ -102,7 +102,7 @@ def test_true_overlaps_rank_above_chance_and_neighbours_are_left_out() -> None:
     assert all((b.number - a.number) // 2 >= 3 for a, b in chosen)
 
 
-def test_only_the_best_of_each_map_are_chosen() -> None:
+def test_only_the_best_of_each_map_are_chosen():
     ids = [NodeId("a", 1, 1), *(NodeId("b", 1, k) for k in range(1, 8)), NodeId("c", 1, 1)]
     table = {(ids[0], other): 10.0 + other.number for other in ids[1:]}
     chosen = choose_pairs(table, (), most_per_map=2)

@@ -1,7 +1,5 @@
 """Pinned frames: a component is moved as a whole, and what does not depend on its frame stays."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -43,7 +41,7 @@ def of(map_id: MapId, merger: Merger) -> NodeId:
     return sorted(merger.maps[map_id].nodes)[2]
 
 
-def test_a_pinned_node_has_its_pose_and_the_map_its_shape(merger: Merger) -> None:
+def test_a_pinned_node_has_its_pose_and_the_map_its_shape(merger: Merger):
     free, pin = merged(merger), Pin(of(B, merger), POSE)
     held = merged(merger, pin)
     assert held.pose(pin.node) == POSE
@@ -65,7 +63,7 @@ def test_a_pinned_node_has_its_pose_and_the_map_its_shape(merger: Merger) -> Non
     assert np.array_equal(merged(merger).pose(first).vector, free.pose(first).vector)
 
 
-def test_a_frame_does_not_jump_when_its_component_joins_another(merger: Merger) -> None:
+def test_a_frame_does_not_jump_when_its_component_joins_another(merger: Merger):
     pin = Pin(of(B, merger), POSE)
     apart, one = merged(merger, pin, apart=True), merged(merger, pin)
     assert len(apart.components) == 2 and len(one.components) == 1
@@ -78,7 +76,7 @@ def test_a_frame_does_not_jump_when_its_component_joins_another(merger: Merger) 
     assert min(map(abs, jumps)) > 1.0
 
 
-def test_the_older_of_two_pins_holds_and_the_change_is_known(merger: Merger) -> None:
+def test_the_older_of_two_pins_holds_and_the_change_is_known(merger: Merger):
     old, new = Pin(of(B, merger), POSE), Pin(of(A, merger), Pose2(-5.0, 1.0, -0.3))
     apart = merged(merger, old, new, apart=True)
     assert apart.pose(old.node) == old.merged_from_node and apart.pose(new.node) == new.merged_from_node
@@ -92,7 +90,7 @@ def test_the_older_of_two_pins_holds_and_the_change_is_known(merger: Merger) -> 
         assert one.pose(node).distance(moved) < 0.15
 
 
-def test_pins_outlast_a_retired_node_and_the_beginning_of_a_server(merger: Merger) -> None:
+def test_pins_outlast_a_retired_node_and_the_beginning_of_a_server(merger: Merger):
     pin = Pin(of(A, merger), POSE)
     merger.pin([pin])
     assert merger.apart().pose(pin.node) == POSE
@@ -102,7 +100,7 @@ def test_pins_outlast_a_retired_node_and_the_beginning_of_a_server(merger: Merge
     assert frame_changes(found) == ((gone.node, None, Pose2()),)
 
 
-def test_components_that_do_not_change_stay_the_same_objects(merger: Merger) -> None:
+def test_components_that_do_not_change_stay_the_same_objects(merger: Merger):
     pin = Pin(of(A, merger), POSE)
     first = merged(merger, pin, apart=True)
     merger.constrain(ManualConstraints([*APART.made, ManualConstraint(RetiredMap(B), True, "anna", 10**18)]))
@@ -111,6 +109,6 @@ def test_components_that_do_not_change_stay_the_same_objects(merger: Merger) -> 
 
 
 @pytest.mark.parametrize("pose", [Pose2(1e6, 0.0, 0.0), Pose2(0.0, math.nan, 0.0), Pose2(0.0, 0.0, math.inf)])
-def test_a_pose_out_of_range_is_refused(pose: Pose2) -> None:
+def test_a_pose_out_of_range_is_refused(pose: Pose2):
     with pytest.raises(InvalidValue, match="give a position within"):
         Pin(NodeId("a", 1, 1), pose)

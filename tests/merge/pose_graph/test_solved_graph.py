@@ -62,7 +62,7 @@ def scipy_optimum(true: list[Pose2], measurements: list[RelativePose]) -> tuple[
     return means, covariances
 
 
-def test_optimum_and_covariances_against_scipy() -> None:
+def test_optimum_and_covariances_against_scipy():
     for seed in range(4):
         true, measurements = random_graph(seed)
         graph = solve_graph(IDS[0], true[0], measurements)
@@ -73,7 +73,7 @@ def test_optimum_and_covariances_against_scipy() -> None:
         assert np.allclose(result, covariances, rtol=0.08, atol=2e-5)
 
 
-def test_a_tree_is_solved_by_composition() -> None:
+def test_a_tree_is_solved_by_composition():
     true, measurements = random_graph(5, loops=0)
     graph = solve_graph(IDS[0], true[0], measurements)
     chained = PoseGaussian(true[0], np.zeros((3, 3)))
@@ -85,7 +85,7 @@ def test_a_tree_is_solved_by_composition() -> None:
         assert np.allclose(pose.covariance, chained.covariance, rtol=1e-4, atol=1e-8)
 
 
-def test_relative_covariance_against_sampling_the_joint() -> None:
+def test_relative_covariance_against_sampling_the_joint():
     true, measurements = random_graph(6)
     graph = solve_graph(IDS[0], true[0], measurements)
     rng = np.random.default_rng(1)
@@ -105,7 +105,7 @@ def test_relative_covariance_against_sampling_the_joint() -> None:
     assert np.allclose(result.means[0][:2], (a.inverse() @ b).vector[:2])
 
 
-def test_covariances_are_calibrated() -> None:
+def test_covariances_are_calibrated():
     distances = []
     for seed in range(40):
         true, measurements = random_graph(seed + 100)
@@ -114,7 +114,7 @@ def test_covariances_are_calibrated() -> None:
     assert 2.2 < np.mean(distances) < 3.9
 
 
-def test_order_does_not_matter_and_unconnected_nodes_are_left_out() -> None:
+def test_order_does_not_matter_and_unconnected_nodes_are_left_out():
     true, measurements = random_graph(8)
     apart = RelativePose(NodeId("z", 1, 1), NodeId("z", 1, 2), measurements[0].a_from_b)
     first = solve_graph(IDS[0], true[0], [*measurements, apart])
@@ -126,7 +126,7 @@ def test_order_does_not_matter_and_unconnected_nodes_are_left_out() -> None:
     assert np.allclose(alone.means[0], true[3].vector)
 
 
-def test_marginals_some_at_a_time_are_those_of_all_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_marginals_some_at_a_time_are_those_of_all_at_once(monkeypatch):
     true, measurements = random_graph(9)
     graph = solve_graph(IDS[0], true[0], measurements)
     joint = graph.covariance(graph.nodes)
@@ -139,9 +139,7 @@ def test_marginals_some_at_a_time_are_those_of_all_at_once(monkeypatch: pytest.M
 
 
 @pytest.mark.parametrize("loops", [0, 4, 60])
-def test_marginals_of_a_large_graph_are_those_of_its_dense_inverse(
-    loops: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_marginals_of_a_large_graph_are_those_of_its_dense_inverse(loops: int, monkeypatch):
     """Of a large one they were solved for node by node, which took two minutes of 20 000 nodes."""
     rng = np.random.default_rng(loops)
     ids = [NodeId("a", 1, k) for k in range(60)]
@@ -162,7 +160,7 @@ def test_marginals_of_a_large_graph_are_those_of_its_dense_inverse(
         assert np.array_equal(result[node].mean.vector, graph.means[k])
 
 
-def test_marginals_of_nodes_that_nothing_joins() -> None:
+def test_marginals_of_nodes_that_nothing_joins():
     """Each has its own inverse; entries that are zero by chance change nothing."""
     rng = np.random.default_rng(4)
     own = np.array([one @ one.T + np.eye(3) for one in rng.normal(size=(4, 3, 3))])
@@ -176,7 +174,7 @@ def test_marginals_of_nodes_that_nothing_joins() -> None:
 
 
 @pytest.mark.parametrize("seed", range(20))
-def test_a_nearly_singular_covariance_still_makes_a_graph(seed: int) -> None:
+def test_a_nearly_singular_covariance_still_makes_a_graph(seed: int):
     """Of any rank, with the greatest variance there is, and an eigenvalue that rounding made negative."""
     rng = np.random.default_rng(seed)
     measurements = []

@@ -1,7 +1,5 @@
 """What an implausible map measured moves no node of another map."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 
@@ -66,7 +64,7 @@ def merged_map(graph: Component) -> MergedMap:
     "names", [("a", "b", "m"), ("n", "o", "m")], ids=["behind the others", "first of all"]
 )
 @pytest.mark.parametrize("seed", range(3))
-def test_the_others_are_where_they_are_without_it(seed: int, names: tuple[str, str, str]) -> None:
+def test_the_others_are_where_they_are_without_it(seed: int, names: tuple[str, str, str]):
     measurements = drawn(seed, names, ((0, 1), (0, 2), (1, 2)))
     graph = solved(measurements)
     alone = solved([m for m in measurements if ODD not in {m.a.map, m.b.map}])
@@ -111,7 +109,7 @@ def test_the_others_are_where_they_are_without_it(seed: int, names: tuple[str, s
 
 
 @pytest.mark.parametrize("names", [("a", "b", "m"), ("n", "o", "m")], ids=["behind", "first of all"])
-def test_what_it_alone_would_join_is_not_joined(names: tuple[str, str, str]) -> None:
+def test_what_it_alone_would_join_is_not_joined(names: tuple[str, str, str]):
     measurements = drawn(1, names, ((0, 2), (1, 2)))
     # One link more to the second.
     rng = np.random.default_rng(3)
@@ -140,7 +138,7 @@ def test_what_it_alone_would_join_is_not_joined(names: tuple[str, str, str]) -> 
     assert last.solved(replace(merged, maps=maps), {ODD}).graphs == parted.graphs
 
 
-def test_what_did_not_change_is_the_same_object() -> None:
+def test_what_did_not_change_is_the_same_object():
     merged, last = (
         merged_map(solved(drawn(1, ("a", "b", "m"), ((0, 1), (0, 2), (1, 2))))),
         StagedOptimization(),

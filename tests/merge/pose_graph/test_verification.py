@@ -1,7 +1,5 @@
 """A robot chooses the ids of its nodes, and these seed the random numbers by which nodes are compared."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from itertools import combinations
@@ -21,7 +19,7 @@ FALSE = (0.0, 0.45, 0.6)
 
 
 @pytest.mark.parametrize("seed", first_quick([33001, 33002, 33003], 1))
-def test_ids_do_not_decide_whether_two_nodes_are_linked_or_where(seed: int) -> None:
+def test_ids_do_not_decide_whether_two_nodes_are_linked_or_where(seed: int):
     found = 0
     for a, b in _alike(seed):
         for share in FALSE:

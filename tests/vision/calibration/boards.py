@@ -1,7 +1,5 @@
 """Views of the printed target: its PDF is read back, drawn, and seen through a known camera."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Estimation against truth and finite differences: the stated sigma is the error, bad sets are refused."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 
@@ -24,7 +22,7 @@ NOISE_PX = 0.15
 
 
 @pytest.mark.parametrize(("model", "true"), MODELS)
-def test_derivatives_are_those_of_finite_differences(model: LensModel, true: np.ndarray) -> None:
+def test_derivatives_are_those_of_finite_differences(model: LensModel, true: np.ndarray):
     pose, points = np.array([0.2, -0.1, 0.05, -0.05, -0.1, 0.4]), CalibrationTarget().corners
     seen = project(model, true, pose, points)
     assert np.allclose(seen.pixels, pixels_of(true, pose, points), atol=1e-9)
@@ -40,7 +38,7 @@ def test_derivatives_are_those_of_finite_differences(model: LensModel, true: np.
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("model", "true"), MODELS)
-def test_the_stated_uncertainty_is_the_error_over_draws(model: LensModel, true: np.ndarray) -> None:
+def test_the_stated_uncertainty_is_the_error_over_draws(model: LensModel, true: np.ndarray):
     rng = np.random.default_rng(5)
     draws, squares, shares = 12, [], []
     middles = ((np.arange(n) + 0.5) / n * side - 0.5 for n, side in zip(GRID, SIZE, strict=True))
@@ -78,7 +76,7 @@ def _rays(true: np.ndarray, pixels: np.ndarray) -> np.ndarray:
 
 
 @pytest.mark.parametrize(("model", "true"), first_quick(MODELS, 1))
-def test_outliers_are_left_out_and_the_lens_is_found(model: LensModel, true: np.ndarray) -> None:
+def test_outliers_are_left_out_and_the_lens_is_found(model: LensModel, true: np.ndarray):
     rng = np.random.default_rng(2)
     views = corner_views(rng, true, 30, NOISE_PX)
     for view in views:
@@ -105,7 +103,7 @@ def missing(views: list[BoardView]) -> str:
 
 
 @pytest.mark.slow
-def test_sets_that_leave_something_out_are_refused_with_what_is_missing() -> None:
+def test_sets_that_leave_something_out_are_refused_with_what_is_missing():
     rng = np.random.default_rng(4)
     whole = corner_views(rng, PINHOLE, 40, 0.1)
     assert refused(whole, None) == ""
@@ -122,7 +120,7 @@ def test_sets_that_leave_something_out_are_refused_with_what_is_missing() -> Non
     assert "nearer to the camera" in missing(far)
 
 
-def test_sets_that_cannot_be_right_are_refused() -> None:
+def test_sets_that_cannot_be_right_are_refused():
     rng = np.random.default_rng(6)
     stretched = []
     for view in corner_views(rng, PINHOLE, 25, 0.1):
@@ -144,7 +142,7 @@ def test_sets_that_cannot_be_right_are_refused() -> None:
         calibrate_camera([*views, replace(views[0], image_size=(320, 240))])
 
 
-def test_placements_are_those_of_ros() -> None:
+def test_placements_are_those_of_ros():
     """A board that faces the camera: its place, its share of the image, and no skew."""
     target = CalibrationTarget()
     width, height = (target.columns - 2) * target.square, (target.rows - 2) * target.square

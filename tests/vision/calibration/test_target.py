@@ -1,7 +1,5 @@
 """The printed target: sizes in the PDF, rulers, and OpenCV's own picture of the board."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
@@ -21,7 +19,7 @@ BOARDS = [
 
 @pytest.mark.parametrize("paper", PAPERS)
 @pytest.mark.parametrize("target", BOARDS, ids=str)
-def test_sizes_are_true_and_everything_is_on_the_paper(target: CalibrationTarget, paper: str) -> None:
+def test_sizes_are_true_and_everything_is_on_the_paper(target: CalibrationTarget, paper: str):
     page = read_page(target_pdf(target, paper))
     assert page.size == pytest.approx(PAPERS[paper], abs=0.01)
     squares = page.rectangles[np.isclose(page.rectangles[:, 2], 1e3 * target.square, atol=1e-3)]
@@ -44,7 +42,7 @@ def test_sizes_are_true_and_everything_is_on_the_paper(target: CalibrationTarget
 
 
 @pytest.mark.parametrize("target", BOARDS, ids=str)
-def test_the_print_is_opencvs_board(target: CalibrationTarget) -> None:
+def test_the_print_is_opencvs_board(target: CalibrationTarget):
     picture, target_from_bitmap = bitmap(read_page(target_pdf(target, "a3")), per_mm=4.0)
     view = BoardDetector(target).find(picture)
     assert view is not None and len(view.ids) == (target.columns - 1) * (target.rows - 1)
@@ -72,11 +70,11 @@ def test_the_print_is_opencvs_board(target: CalibrationTarget) -> None:
         ({"pattern": Pattern.CHESSBOARD, "columns": 8}, "looks the same upside down"),
     ],
 )
-def test_targets_that_are_none(values: dict[str, object], words: str) -> None:
+def test_targets_that_are_none(values: dict[str, object], words: str):
     with pytest.raises(InvalidValue, match=words):
         CalibrationTarget(**values)  # type: ignore[arg-type]
 
 
-def test_a_target_that_is_too_large_for_the_paper() -> None:
+def test_a_target_that_is_too_large_for_the_paper():
     with pytest.raises(InvalidValue, match="280 x 400 mm do not fit on a4, which has 184 x 261 mm"):
         target_pdf(CalibrationTarget(square=0.04, marker=0.03), "a4")
