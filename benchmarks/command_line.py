@@ -1,7 +1,5 @@
 """What all benchmarks share: their command line, how they fail, and a table of figures."""
 
-from __future__ import annotations
-
 import argparse
 import sys
 from collections.abc import Callable, Iterator, Mapping

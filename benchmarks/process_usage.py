@@ -1,7 +1,5 @@
 """Processor time and memory of processes, by what Linux tells of their threads."""
 
-from __future__ import annotations
-
 import contextlib
 import ctypes
 import gc

@@ -3,8 +3,6 @@
 `make docs` runs it; by itself: `python docs/floor_plan.py`.
 """
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from tempfile import TemporaryDirectory

@@ -3,8 +3,6 @@
 `make docs` runs it; by itself: `python docs/independent_support.py`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path

@@ -3,8 +3,6 @@
 python -m docs.wire_vectors    # writes docs/wire_vectors.json
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Callable, Mapping

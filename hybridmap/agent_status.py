@@ -1,7 +1,5 @@
 """What a robot is doing: for people, for the map server, and for scenarios."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """The pinhole camera on a planar robot."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import Any

@@ -1,7 +1,5 @@
 """Changes: a map is the replay of its log."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId

@@ -1,7 +1,5 @@
 """Counts in messages for people."""
 
-from __future__ import annotations
-
 
 def counted(count: int, noun: str) -> str:
     """A number with its noun, for example `1 node`, `2 nodes`; the noun is given in the singular."""

@@ -7,8 +7,6 @@ of steps, the same step for all. With a coder that spends bits by frequency (map
 that is within a quarter of a bit a coordinate of the best that any rounding can do (Gish and Pierce 1968).
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

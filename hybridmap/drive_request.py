@@ -1,7 +1,5 @@
 """A person drives a robot: velocity commands, and what its agent answers."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """What edges a robot can have measured."""
 
-from __future__ import annotations
-
 import math
 
 from mapweave.hybridmap.node import Edge, EdgeKind

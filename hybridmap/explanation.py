@@ -1,7 +1,5 @@
 """Why two nodes, or two maps, are linked or are not: plain values with every number behind the verdict."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """Floor plans: an image of the building, and the pairs of places by which it lies under the merged map."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated, ClassVar
 

@@ -4,8 +4,6 @@ They are part of the wire format: every robot and server of a fleet must hold th
 `python -m benchmarks.train_descriptor --write` and carry a version, which every message contains.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from importlib import resources

@@ -4,8 +4,6 @@ In a program they are plain types. Messages and files with a field out of range 
 (`mapweave.wire.typed`). Text is one printable line and numbers are finite in all of them.
 """
 
-from __future__ import annotations
-
 from typing import Annotated
 
 from msgspec import Meta

@@ -1,7 +1,5 @@
 """What has happened to a merged map, with dates: plain values, no transport."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 

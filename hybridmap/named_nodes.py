@@ -1,7 +1,5 @@
 """Ids for what people write: ids of nodes and maps stay, names of places and positions are looked up."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from numbers import Real
 from typing import TypeGuard, cast

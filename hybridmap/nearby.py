@@ -1,7 +1,5 @@
 """Where other robots are around a robot: a question and its answer, plain values."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Pins: a person holds the frame of a component by the pose of one of its nodes."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import ClassVar

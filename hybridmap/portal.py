@@ -1,7 +1,5 @@
 """Portals: lifts, ramps and doors through which a robot asks to be taken."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 from typing import Annotated, ClassVar

@@ -1,7 +1,5 @@
 """Pruned nodes: superseded ones that have left the map for good, with what is left of each."""
 
-from __future__ import annotations
-
 from collections.abc import Container, Mapping
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Questions that a robot asks about the fleet's map, and their answers: plain values, no transport."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Annotated

@@ -6,8 +6,6 @@ landmarks that both nodes show: enough of them must stay in view all the way, an
 further off, and no more turned, than the servo manages from (docs/decisions/life-of-a-map.md gives figures).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Cache of reachability: an edge is evaluated once, however many merged maps contain it."""
 
-from __future__ import annotations
-
 from collections.abc import Container, Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Ways through a hybrid map: A* with the paper's Euclidean weights and heuristic."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping
 from dataclasses import dataclass, field
 from heapq import heappop, heappush

@@ -1,7 +1,5 @@
 """How near straight ways pass to places."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapweave.hybridmap.pose import Array

@@ -1,7 +1,5 @@
 """Superseded nodes: newer ones of the same place replace them."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

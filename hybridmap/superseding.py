@@ -4,8 +4,6 @@ A node is superseded if a robot at its pose would recognise another node and cou
 between its neighbours becomes much longer without it (docs/decisions/life-of-a-map.md has the figures).
 """
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Callable, Mapping
 

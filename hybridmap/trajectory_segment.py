@@ -1,7 +1,5 @@
 """Trajectory segments: where a robot was around a node, and what its proximity sensors saw there."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 import numpy as np

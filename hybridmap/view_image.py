@@ -1,7 +1,5 @@
 """The image of which a node was made, as people are shown it. Maps have no images."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Wall time as people write it: local time, or UTC where that is said."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from datetime import UTC, datetime, timedelta, tzinfo

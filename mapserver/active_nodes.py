@@ -1,7 +1,5 @@
 """The active nodes, from which questions are answered."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import replace
 from typing import Protocol

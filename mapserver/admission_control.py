@@ -1,7 +1,5 @@
 """Workers for long questions. A question that would wait too long is refused with a time to retry."""
 
-from __future__ import annotations
-
 import math
 import os
 import threading

@@ -1,7 +1,5 @@
 """What an annotation does to a map, and a retirement to annotations, for a person who has not said it yet."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Annotations in a person's words: places and positions where the record has nodes and polygons."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from datetime import UTC
 from typing import Any, TypeVar

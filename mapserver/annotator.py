@@ -1,7 +1,5 @@
 """What people say about the map: the record of annotations on the disk, and questions about it."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Edges that robots could not drive: routes of other robots avoid them."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Collection
 

@@ -3,8 +3,6 @@
 a line with its kind, arrays in NumPy's format ..., SHA-256 of all before
 """
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json

@@ -1,7 +1,5 @@
 """The server's record of commands: who has sent, stopped or driven which robot, when and why."""
 
-from __future__ import annotations
-
 import logging
 import re
 import threading

@@ -1,7 +1,5 @@
 """The history of the maps: what people decided and said, and the merge's own events, in order."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from mapweave.hybridmap.annotation import Annotations

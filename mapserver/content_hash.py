@@ -17,8 +17,6 @@ What follows from these is left out: poses and probabilities, which are computed
 read, and words for people (title, reasons, history).
 """
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Iterator
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Fleet coverage: what other robots have mapped around a robot, in its own map."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Explanations of merges and routes for people, and their manual constraints."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Collection, Iterable

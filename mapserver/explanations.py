@@ -1,7 +1,5 @@
 """Any explanation of a merged map, as it is asked for: of two nodes, of maps, of a route."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 from mapweave.hybridmap.explanation import MAX_MAPS_LISTED, Explanation, FleetExplanation

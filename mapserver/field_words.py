@@ -3,8 +3,6 @@
 `msgspec` says it in terms of its types: "Expected `str`, got `int` - at `$.name`".
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from types import MappingProxyType

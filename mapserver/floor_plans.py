@@ -1,7 +1,5 @@
 """Floor plans under a merged map: the transform of each, what its pairs say of each other, and doubts."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Iterable, Sequence

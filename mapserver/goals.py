@@ -1,7 +1,5 @@
 """Goals, and places on the way, in a person's words: a node, a named place, a position, home."""
 
-from __future__ import annotations
-
 from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.places import PlaceResolver, position_of

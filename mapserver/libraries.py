@@ -1,7 +1,5 @@
 """Libraries that take long to import: loaded once the map is shown, before a robot has to wait for them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import partial
 from importlib import import_module

@@ -1,7 +1,5 @@
 """Merged maps as map files, and back: a file holds the parts, so that it can be explained or merged again."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import replace
 

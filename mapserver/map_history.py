@@ -1,7 +1,5 @@
 """The server's record of what has become of the maps: what joined, what came apart and why, with dates."""
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

@@ -1,7 +1,5 @@
 """Keeps the answers up to date: takes changes in and merges in the background, piece by piece."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Iterable, Mapping, Sequence

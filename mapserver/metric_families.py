@@ -1,7 +1,5 @@
 """Metrics as Prometheus reads them: a number, or one for each value of a label."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import TypeVar
 

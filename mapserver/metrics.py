@@ -4,8 +4,6 @@ Counters that the server keeps for itself are read when they are asked for. Name
 Prometheus; `docs/monitoring.md` lists them.
 """
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import Future

@@ -4,8 +4,6 @@ Robots work without it: an order may also go to an agent directly. A robot that 
 mission when it is back.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Where the robots of a fleet are, by what they say when they ask who is around them."""
 
-from __future__ import annotations
-
 import math
 import threading
 from collections.abc import Collection

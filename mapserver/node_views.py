@@ -1,7 +1,5 @@
 """Images of nodes, from the robots that keep them. A server keeps none but the last ones, in memory."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Places that ways should not pass: a robot did not get through, or another one stands there."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The robots' own maps in a map file."""
 
-from __future__ import annotations
-
 from mapweave.hybridmap.change import EdgePut
 from mapweave.hybridmap.explanation import MARGINAL
 from mapweave.hybridmap.hybrid_map import HybridMap

@@ -4,8 +4,6 @@ Packing 1000 nodes takes seconds, in which acknowledgements, routes and status m
 that comes while it is packed waits for the one pack after it, so a crowd costs no more than two.
 """
 
-from __future__ import annotations
-
 import threading
 import weakref
 from collections.abc import Callable, Iterable, Mapping

@@ -1,7 +1,5 @@
 """Routes past robots that stand on the way: by another way where that is not much longer."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 

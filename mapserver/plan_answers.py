@@ -1,7 +1,5 @@
 """Answers in the coordinates of a floor plan, and goals that are given in them."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, fields
 from typing import Any

@@ -1,7 +1,5 @@
 """Images of floor plans on the server's disk, in a folder beside the store, each named by its content."""
 
-from __future__ import annotations
-
 import hashlib
 import threading
 from collections.abc import Iterable, Mapping

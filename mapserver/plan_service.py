@@ -1,7 +1,5 @@
 """Floor plans of a running server: their images, and where each lies under the newest merged map."""
 
-from __future__ import annotations
-
 import hashlib
 import logging
 import threading

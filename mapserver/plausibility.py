@@ -5,8 +5,6 @@ Such a map is merged as far as its links carry it, but it moves and joins no oth
 show it makes no answer ambiguous (mapweave.mapserver.active_nodes).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Container, Mapping
 

@@ -1,7 +1,5 @@
 """Portals of one merged map: ways between its parts through which people take robots."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from itertools import pairwise

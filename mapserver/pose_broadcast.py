@@ -4,8 +4,6 @@ An agent's own map stays as it is: its nodes keep their poses, and routes come a
 poses beside its map.
 """
 
-from __future__ import annotations
-
 import math
 import secrets
 import threading

@@ -1,7 +1,5 @@
 """What is read again each time it is asked for, and holds up no caller for long."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import Executor
 from typing import Generic, TypeVar

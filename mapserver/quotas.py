@@ -4,8 +4,6 @@ Nothing is lost by a quota. A change that is held back is not acknowledged: it s
 is pulled later. A question is refused with a time to retry.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """What routes may use of a merged map: edges that can be driven, and active nodes."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping
 from functools import cached_property
 

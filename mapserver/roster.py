@@ -1,7 +1,5 @@
 """The robots that the server hears of: their last status, whether they are alive, where they are."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import threading

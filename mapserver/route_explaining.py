@@ -1,7 +1,5 @@
 """Explanations of routes, and of what is missing where there is none."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import dataclass, replace

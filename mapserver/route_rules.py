@@ -1,7 +1,5 @@
 """What people have closed, preferred and avoided on a roadmap, at one time."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -9,8 +9,6 @@ them, and lock-step waits until all of it is taken. So has the place index above
 repeatable simulation reaches.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import threading

@@ -1,7 +1,5 @@
 """Robots' questions over the bus. Views pass admission control, the map is packed in the background."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from concurrent.futures import Executor, Future

@@ -1,7 +1,5 @@
 """Backups of a store: copies that a server can be started on later, when robots have gone on."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Callable
 from contextlib import closing

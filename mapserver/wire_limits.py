@@ -4,8 +4,6 @@ A map may have its nodes anywhere, and a camera may have its principal point any
 numbers may be out of the range of messages.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Checks a manual constraint before it is kept: what has no effect, or contradicts the map, is refused."""
 
-from __future__ import annotations
-
 from bisect import bisect
 from collections.abc import Container
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Checks a link that a person wants to make: against the images, the merged map and the robots' drives."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Apply manual constraints: what is excluded takes no part in the merge; refusals say who, when and why."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 from functools import lru_cache

@@ -9,8 +9,6 @@ Loop closures at a retired node show what it shows, and go with it: if nothing e
 it falls into pieces.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """What a person sets of the merge: `[merge]` in a settings file. It imports no library of the merge."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Links by hand that no merge has taken in yet: what is decided next must fit them, too."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 from mapweave.hybridmap.manual_constraint import ManualConstraints

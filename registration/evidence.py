@@ -1,7 +1,5 @@
 """Evidence for or against a recognition, in addition to the number of inliers."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

@@ -6,8 +6,6 @@ round linearises at the points' present estimates, the residual refers back to w
 their covariance is part of the residual's (the iterated extended Kalman filter's form of a Schur complement).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

@@ -5,8 +5,6 @@ robot's camera is level and at its height. So the photograph's pitch, roll and r
 with the robot's pose, by Gauss-Newton on the recognised landmarks.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -5,8 +5,6 @@ with little texture makes dozens of wrong matches that agree with some geometry.
 in both directions, and distinctly better than the second best in both.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -8,8 +8,6 @@ With the camera at (tx, ty, heading) of the points' frame, c and s the heading's
   and a turn and a shift in the plane carry the two of the robot's frame upon the two of the points' frame.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -6,8 +6,6 @@ of planar pose; Schweighofer and Pinz 2006, Collins and Bartoli 2014). Refinemen
 the other, so it is tried explicitly.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

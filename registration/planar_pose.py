@@ -7,8 +7,6 @@ Two cameras never look equally far up. By how much they differ is estimated with
 parameter with a Gaussian prior, if a setting says how much it may be.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

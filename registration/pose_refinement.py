@@ -4,8 +4,6 @@ A recognition takes a pixel to be off by one: features found again at another sc
 where the node was made they are off by a tenth, and where the robot is follows so much more surely.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

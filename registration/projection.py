@@ -15,8 +15,6 @@ These are kernels (mapweave.hybridmap.jit): the code for sighting n runs for eac
 at once.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

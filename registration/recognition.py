@@ -7,8 +7,6 @@ of the features that matched at all, all over the image, and determine the pose;
 as evidence for those who can compare places (merge, mapweave.mapserver.relocalization.relocalizer).
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from typing import Any

@@ -5,8 +5,6 @@ landmark at the same spot adds little, since a pose is determined by spread. So 
 always the one of highest worth, until the node's byte budget is used.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

@@ -5,8 +5,6 @@ there Gauss-Newton steps minimise r' C^-1 r with the joint covariance C of all p
 points as one do no harm: they are in the span of the transform's own parameters.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -3,8 +3,6 @@
 Only regular files are read: a device or a pipe may have no end.
 """
 
-from __future__ import annotations
-
 import errno
 import os
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """SQLite files that survive the loss of power, belong to one process, and report errors clearly."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 from collections.abc import Callable, Iterator

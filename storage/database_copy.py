@@ -1,7 +1,5 @@
 """A copy of an SQLite file, also of one that a running process writes to."""
 
-from __future__ import annotations
-
 import os
 import sqlite3
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Reading an SQLite file without changing anything: not the file, not its folder."""
 
-from __future__ import annotations
-
 import shutil
 import sqlite3
 import tempfile

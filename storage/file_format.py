@@ -1,7 +1,5 @@
 """What to do with a file or a database of another format than this program's, in words."""
 
-from __future__ import annotations
-
 
 def of_format(stored: int, used: int) -> str:
     """That something has another format, and what to do, as the end of a sentence."""

@@ -1,7 +1,5 @@
 """The process that a file belongs to, while others may read the file."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import time

@@ -1,7 +1,5 @@
 """Images on disk, as recordings and people bring them. Their size is read before they are decoded."""
 
-from __future__ import annotations
-
 import re
 import struct
 from os import PathLike

@@ -13,8 +13,6 @@ Poses and landmarks have the wire's precision. A file is written under another n
 that a reader, or a loss of power, finds either the old file or the new one.
 """
 
-from __future__ import annotations
-
 import hashlib
 import struct
 from collections.abc import Mapping

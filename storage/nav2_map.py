@@ -1,7 +1,5 @@
 """Maps of Nav2 and ROS 1: a `map.yaml` beside an image (nav2_map_server, map_server)."""
 
-from __future__ import annotations
-
 import io
 import reprlib
 from dataclasses import dataclass

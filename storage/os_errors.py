@@ -1,7 +1,5 @@
 """What the operating system refuses, in words that say what to do."""
 
-from __future__ import annotations
-
 import errno
 import os
 import pwd

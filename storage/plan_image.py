@@ -1,7 +1,5 @@
 """Images of floor plans: any image is kept as a PNG of 8 bits, and named by its content."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass
 from pathlib import Path

@@ -6,8 +6,6 @@ recovers, or whether it takes sessions, and then refuses this one for another re
 what libpq traces.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import select

@@ -7,8 +7,6 @@ must go on waiting. So another connection is made to the same machine: a Postgre
 refuses it.
 """
 
-from __future__ import annotations
-
 import threading
 import time
 

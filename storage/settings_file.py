@@ -1,7 +1,5 @@
 """Tables of TOML or MessagePack into frozen dataclasses; a wrong name or value is an error."""
 
-from __future__ import annotations
-
 import dataclasses
 import difflib
 import math

@@ -1,7 +1,5 @@
 """Images of nodes as small JPEG files: a robot writes them, and a map server checks what comes of a robot."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -6,8 +6,6 @@ before the next one begins, so where two follow a wrong frame, the disk has chan
 See "WAL File Format" in https://www.sqlite.org/fileformat2.html.
 """
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Iterable
 from pathlib import Path

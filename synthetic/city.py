@@ -5,8 +5,6 @@ optimum costs what GTSAM's batch optimum costs. Headings that are little known l
 Daniilidis & Dellaert, ICRA 2015, make the Manhattan data hard by them).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

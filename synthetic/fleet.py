@@ -5,8 +5,6 @@ buildings: a place that looks like another gives one to four of them, which agre
 many landmarks as true ones have.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

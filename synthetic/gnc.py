@@ -8,8 +8,6 @@ which are wrong to begin with, and is no proof either: with many more wrong meas
 may end in another minimum.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import gtsam

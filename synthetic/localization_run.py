@@ -4,8 +4,6 @@ A start is as the paper's: the pose is wrong by 1 m in x and in y and by 1 rad (
 least four landmarks of the node are in view for the static fix, and the filter has 19 steps to find itself.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

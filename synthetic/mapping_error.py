@@ -1,7 +1,5 @@
 """How far off a mapping run's estimates are, by its truth."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

@@ -1,7 +1,5 @@
 """The independent optimum: all poses and landmarks of a mapping run at once, by GTSAM."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 

@@ -1,7 +1,5 @@
 """Random mapping runs with truth: a robot, landmarks, wheels that slip and pixels that tremble."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

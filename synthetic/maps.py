@@ -1,7 +1,5 @@
 """Robots' maps of synthetic worlds as changes, as a server's store, and as merged maps."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Ways to merge fleets, and what they are worth by the truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 
 import networkx as nx

@@ -1,7 +1,5 @@
 """Pose graphs of others: split among robots, and GTSAM's batch optimum of them."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 
 import gtsam

@@ -4,8 +4,6 @@
 `synthetic.world`, with seeds, so the file is the same each time.
 """
 
-from __future__ import annotations
-
 import math
 import shutil
 import time

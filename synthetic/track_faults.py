@@ -1,7 +1,5 @@
 """What goes wrong with tracks: they jump, slide away, stick to a walking person, change places."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

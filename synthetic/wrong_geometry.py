@@ -1,7 +1,5 @@
 """Fleets of which one robot has wrong geometry: a long or turning odometry, a slip, a carried robot."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Sequence

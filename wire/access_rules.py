@@ -5,8 +5,6 @@ key. Declarations, questions and answers are messages too: a robot that may not 
 for `server/s0/route` gets no question.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 from mapweave.wire.credentials import Role, RouterAccess

@@ -5,8 +5,6 @@ end. So of each participant a few are known, further ones are left out and count
 reported by one task a participant, however often it changes until that is done.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable

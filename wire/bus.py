@@ -1,7 +1,5 @@
 """The Bus protocol: publish, subscribe, ask, serve, liveliness. The implementations are separate files."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """Where the fleet's router is."""
 
-from __future__ import annotations
-
 import ipaddress
 import re
 from dataclasses import dataclass

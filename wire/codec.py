@@ -7,8 +7,6 @@ Encoding rounds (see mapweave.hybridmap.quantization), and brings variances and 
 what was decoded encodes to the same bytes again.
 """
 
-from __future__ import annotations
-
 import math
 import struct
 from typing import Annotated, Any

@@ -5,8 +5,6 @@ complete. Another thread that uses the type meanwhile reads a null pointer: the 
 segmentation fault. Here one thread at a time gathers it, and no other uses the type before.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from typing import Any, TypeVar

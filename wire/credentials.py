@@ -1,7 +1,5 @@
 """What proves to a router who connects, and to a client which router it is: certificates or a password."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import StrEnum
 

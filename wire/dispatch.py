@@ -7,8 +7,6 @@ knows, and liveliness news always find room, because they are not repeated. Robo
 one that floods a server waits for itself.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Which robots are there, and asking many of them for one thing, such as to stop."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor

@@ -1,7 +1,5 @@
 """Closes at the interpreter's exit what its owner forgot to close."""
 
-from __future__ import annotations
-
 import threading
 
 from mapweave.wire.bus import Closing

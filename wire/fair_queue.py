@@ -1,7 +1,5 @@
 """A queue in which each sender waits behind its own things alone: senders take turns."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ A key is chunks joined by `/`. In a pattern, `*` matches one whole chunk and `**
 none included. This is the part of Zenoh's key expressions that Mapweave uses.
 """
 
-from __future__ import annotations
-
 import re
 from functools import lru_cache
 

@@ -7,8 +7,6 @@ y are written as steps up (Elias 1974, Fano 1971). The low ones, and x, are what
 begins with, so they cost what they hold.
 """
 
-from __future__ import annotations
-
 import struct
 import zlib
 from functools import cache

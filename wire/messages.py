@@ -4,8 +4,6 @@ See mapweave.hybridmap.query and mapweave.hybridmap.explanation for what they me
 their own names.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, TypeVar
 

@@ -1,7 +1,5 @@
 """How many files a router may have open: each of its sessions is one."""
 
-from __future__ import annotations
-
 import logging
 
 try:

@@ -5,8 +5,6 @@ line, and its numbers are finite. `msgspec.convert` checks each field. An invali
 InvalidMessage with one line.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Asking servers that may be busy."""
 
-from __future__ import annotations
-
 import math
 import threading
 import time

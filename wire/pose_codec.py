@@ -1,7 +1,5 @@
 """Cameras and poses as packed bytes, little-endian."""
 
-from __future__ import annotations
-
 import struct
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The publishers of a Zenoh session, one for each key in use."""
 
-from __future__ import annotations
-
 import threading
 from collections import OrderedDict
 

@@ -7,8 +7,6 @@ distances K uint8   255: nothing in reach; else that share of 254 of the reach, 
 What was decoded encodes to the same bytes again.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

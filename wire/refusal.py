@@ -1,7 +1,5 @@
 """What goes back instead of an answer, as bytes: why, and when it is worth asking again."""
 
-from __future__ import annotations
-
 import math
 import struct
 

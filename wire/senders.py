@@ -5,8 +5,6 @@ name in the key, whatever the message says. On a fleet without keys people ask u
 message's word holds.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue

@@ -1,7 +1,5 @@
 """A bus that counts what goes through it."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from typing import Any

@@ -8,8 +8,6 @@ distances K S uint8 as in `mapweave.wire.range_codec`
 What was decoded encodes to the same bytes again.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue

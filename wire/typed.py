@@ -8,8 +8,6 @@ array is `[kind, shape, bytes]`, a map with ids or pairs of them as keys is a li
 may be one of several dataclasses (`A | B`), each has a `TAG`, which travels as the field `kind`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Set
 from dataclasses import MISSING, fields, is_dataclass

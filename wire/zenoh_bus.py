@@ -5,8 +5,6 @@ own, since opening without a router fails: constructing a bus never blocks and a
 From the first connection on Zenoh itself reconnects and declares again.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 import threading

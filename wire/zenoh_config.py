@@ -1,7 +1,5 @@
 """The session settings: no scouting, only the configured endpoints."""
 
-from __future__ import annotations
-
 import base64
 import json
 from typing import Any

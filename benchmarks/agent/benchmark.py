@@ -12,8 +12,6 @@ the median of the ticks in which a node is made. `wheel_mb` is the size of what 
 downloads besides Mapweave itself.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

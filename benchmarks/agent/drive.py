@@ -1,7 +1,5 @@
 """A drive through the simulated office, kept as the messages of a robot's base, and played again."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path

@@ -5,8 +5,6 @@
 Nothing but the standard library is imported before the time is taken. Prints one JSON object.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 import threading

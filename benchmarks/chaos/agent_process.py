@@ -13,8 +13,6 @@ journal has is handed over, what it has not is handed over again. Times are thos
 clock, s. The acknowledgements that the journal has noted are in a file of their own: SERVER WATERMARK TIME.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

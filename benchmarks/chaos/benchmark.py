@@ -27,8 +27,6 @@ the robot's router, is killed, or a server stopped; it is the longest time witho
 place. `frozen_router_gap_s` is the same with the robot's router stopped, which it has to give up first.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import shutil

@@ -1,7 +1,5 @@
 """Messages that come twice, late and so in another order: at a robot's link, and as a listener hears them."""
 
-from __future__ import annotations
-
 import heapq
 import threading
 import time

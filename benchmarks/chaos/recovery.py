@@ -1,7 +1,5 @@
 """How long after a disturbance everything is acknowledged again, by the logs of the robots."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What is done to a fleet, and when: drawn with a seed, so that a run can be looked at again."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import StrEnum

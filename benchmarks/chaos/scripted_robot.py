@@ -1,7 +1,5 @@
 """What each robot maps, step by step: the same in every process and after every restart."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from benchmarks.fleet.drives import drive, name_of

@@ -11,8 +11,6 @@ driven through again and again with the map that the drive before has left. Time
 FilterPy's (benchmarks.ekf_speed).
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator

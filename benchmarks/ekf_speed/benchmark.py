@@ -7,8 +7,6 @@ Three filters take turns of 20 steps on the same run, in one process on one core
 refuse nothing); and FilterPy's on the same model. Each pays for its own model. Medians over 200 steps.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

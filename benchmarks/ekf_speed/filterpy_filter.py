@@ -5,8 +5,6 @@ FilterPy would write it: dense F, Q and H in numpy, all landmarks at once, no ga
 twice. The formulas are written here again and share no code with mapweave.agent.ekf.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
 

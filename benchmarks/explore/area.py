@@ -1,7 +1,5 @@
 """Which floor a fleet's nodes show, and since when: by the truth, for scoring alone."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

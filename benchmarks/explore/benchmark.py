@@ -16,8 +16,6 @@ Floor is mapped once a node shows it, by the truth: in the field of view of its 
 nothing solid between. `overlap` is the share of it which nodes of more than one robot show.
 """
 
-from __future__ import annotations
-
 import json
 import tempfile
 from collections.abc import Callable

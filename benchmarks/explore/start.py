@@ -1,7 +1,5 @@
 """Where a fleet begins to explore: set down in one place, or each robot in a room of its own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

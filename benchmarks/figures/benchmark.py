@@ -6,8 +6,6 @@ Without --run the pages are written of the results in docs/figures/. With it the
 one after the other, each in a process of its own.
 """
 
-from __future__ import annotations
-
 import argparse
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 `DATA` is the folder of recordings (`--data`).
 """
 
-from __future__ import annotations
-
 MEASUREMENTS: dict[str, str] = {
     "ekf": "python -m benchmarks.ekf --runs 60 --seed 701 --json",
     "ekf_speed": "python -m benchmarks.ekf_speed --seed 702 --json",

@@ -5,8 +5,6 @@ a figure; `{command}` becomes the commands behind the figures of its row, `{meas
 result.
 """
 
-from __future__ import annotations
-
 import re
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Stored results: a command, when and where it ran, and the JSON object that it printed last."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform

@@ -3,8 +3,6 @@
 `scale.md` beside this file is the template, see `benchmarks.figures.page`.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from pathlib import Path

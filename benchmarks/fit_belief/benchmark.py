@@ -8,8 +8,6 @@ Each place recognised in a view of simulated buildings, disturbed ones and twin 
 or wrong by the truth. Weights are those of a logistic regression, by Newton's method, weakly pulled to zero.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from itertools import pairwise

@@ -7,8 +7,6 @@ start, prints one JSON object when all is acknowledged, and stays connected unti
 may still wait. Times are those of the system's monotonic clock, s. It ends with the process that started it.
 """
 
-from __future__ import annotations
-
 import ctypes
 import heapq
 import json

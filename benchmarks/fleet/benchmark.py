@@ -28,8 +28,6 @@ bare Zenoh question, answered after a bare commit of SQLite, in the same run on 
 largest fleet is as fast as `asked`, all is acknowledged, and something is said of every agent that disturbs.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

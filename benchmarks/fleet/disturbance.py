@@ -1,7 +1,5 @@
 """Agents that hold a server up, if it lets them: a slow one, a frozen one and one that floods."""
 
-from __future__ import annotations
-
 import os
 import signal
 import threading

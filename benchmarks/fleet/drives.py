@@ -1,7 +1,5 @@
 """What each robot of the fleet maps: a tour of a room of its own."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

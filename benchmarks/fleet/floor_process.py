@@ -3,8 +3,6 @@
 python -m benchmarks.fleet.floor_process ENDPOINT FOLDER
 """
 
-from __future__ import annotations
-
 import sqlite3
 import sys
 from pathlib import Path

@@ -9,8 +9,6 @@ any exception but a refusal in one line, or the end of the process; a hang is on
 place in the code counts once.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """What passes between a server, its gateway, shards and workers: each message is taken or refused."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cache
 from itertools import pairwise

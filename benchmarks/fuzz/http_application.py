@@ -1,7 +1,5 @@
 """The map server's HTTP application without sockets: requests by ASGI, as the web server hands them over."""
 
-from __future__ import annotations
-
 import asyncio
 import tempfile
 from pathlib import Path

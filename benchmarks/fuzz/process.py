@@ -6,8 +6,6 @@ Good samples are in FOLDER/corpus. Findings go to FOLDER: the input, and beside 
 `counts.json` is kept up to date, so that it is there even if the process dies.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import logging

@@ -3,8 +3,6 @@
 An input is the number of a file of the recording, one byte, and what that file then has. All others are good.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace

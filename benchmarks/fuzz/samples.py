@@ -1,7 +1,5 @@
 """Good input of every kind: what is mutated."""
 
-from __future__ import annotations
-
 import base64
 import sqlite3
 import tempfile

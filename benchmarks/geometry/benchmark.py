@@ -16,8 +16,6 @@ With --seed the wheels are simulated: the increments of truth.csv with 2 % of no
 the way, 0.15 degrees a step and 0.01 degrees a step all along on the turn.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

@@ -1,7 +1,5 @@
 """Images under known homographies: what matches is right or wrong without asking an estimator."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import cv2

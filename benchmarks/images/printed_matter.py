@@ -1,7 +1,5 @@
 """Generated posters: lettering, rules, pictures and halftone, as stand on the walls of an office."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,5 @@
 """Where the points that a robot follows really are: rays from its true camera against the world's panels."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -16,8 +16,6 @@ Then, in simulated places, how often a view from up to half a metre and 20 degre
 pose right within 0.25 m and 5 degrees, over what the node may cost (`--places 0` leaves it out).
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

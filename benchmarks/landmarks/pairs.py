@@ -1,7 +1,5 @@
 """Pairs of images that show the same: photographs of a folder, known warps, and simulated rooms."""
 
-from __future__ import annotations
-
 import re
 import sys
 from collections.abc import Callable, Iterator

@@ -1,7 +1,5 @@
 """Ways to keep a view so that it is recognised: our landmarks, SIFT in floats and bytes, ORB, and JPEG."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from dataclasses import dataclass

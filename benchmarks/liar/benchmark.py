@@ -20,8 +20,6 @@ ways of `margins.py` are, each without the one rule that contains it. With `--re
 the robot that lies has sent, and the three are compared, node by node, with what they had without it.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import logging

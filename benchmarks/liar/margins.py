@@ -3,8 +3,6 @@
 They show what a rule adds where the ways of `mapweave.scenarios.liar.lies` are contained by several.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 

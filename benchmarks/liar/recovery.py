@@ -1,7 +1,5 @@
 """What is left of a lie once a person has retired the maps of the robot that lies."""
 
-from __future__ import annotations
-
 import shutil
 import time
 from collections.abc import Callable, Iterable

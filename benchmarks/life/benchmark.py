@@ -23,8 +23,6 @@ and journal over the last five drives by those over the five about the fiftieth.
 process, less what it was before the first drive.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import time

@@ -9,8 +9,6 @@ landmark, as it was known last, with where the ray of its first pixel meets the 
 lie in DIR, those of the other runs in folders below it: fig7 pose, fig8 encoders, landmarks, map, view.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -6,8 +6,6 @@ is written down beside it, and used for the start alone: a robot that shall look
 before it.
 """
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterator

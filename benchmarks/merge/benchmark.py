@@ -26,8 +26,6 @@ the clock, of the processor on average, the memory held, and what came out. 1000
 on a quiet machine, 100000 much longer.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -7,8 +7,6 @@ are fed one by one through the real Merger, candidates from the place index and 
 after every few nodes the merged map is made.
 """
 
-from __future__ import annotations
-
 import statistics
 import time
 from collections.abc import Sequence

@@ -24,8 +24,6 @@ A run takes one to three minutes on a core of its own; 10 runs of all four scena
 minutes. A run that fails or is killed is reported, is under `failed`, and makes the exit status 1.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

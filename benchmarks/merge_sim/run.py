@@ -5,8 +5,6 @@
 Prints one JSON object. It is a process so that a run that is killed, or runs out of memory, is one run less.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import sys

@@ -12,8 +12,6 @@ before and after them. DIR gets fig11.png (desired and reached views), drives.pn
 later call with the same DIR, seed and rooms takes up again.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import os

@@ -1,7 +1,5 @@
 """One drive of the navigation benchmark: put down, relocalize, drive, park; judged by the truth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import dataclass

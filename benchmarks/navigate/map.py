@@ -1,7 +1,5 @@
 """What drives have done to the map: the edges that they measured, and the merged map before and after."""
 
-from __future__ import annotations
-
 import statistics
 
 import numpy as np

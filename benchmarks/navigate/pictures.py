@@ -1,7 +1,5 @@
 """Pictures of the drives: desired against reached views (the paper's Figure 11), and the ways driven."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Where robots are put down, and where they shall go. Truth sets the stage; it does not help."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -16,8 +16,6 @@ the goal's view.
 With --out the paper's Figures 12, 13 and 14 are drawn, of the parking with the median time.
 """
 
-from __future__ import annotations
-
 import json
 import math
 from collections.abc import Iterator, Sequence

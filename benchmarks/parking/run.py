@@ -1,7 +1,5 @@
 """One parking of the benchmark: put down, find itself, park; what was seen, and what is true."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, field
 from itertools import pairwise

@@ -3,8 +3,6 @@
 The simulator's truth draws the scene and scores it; the robot never sees it.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -18,8 +18,6 @@ A server has its nodes ready; here those beyond the real ones are made on demand
 time for that is not counted, neither in an answer's nor in the index's.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

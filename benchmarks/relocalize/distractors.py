@@ -5,8 +5,6 @@ between two real views. So distractors look like each other as much as real plac
 either half.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The ceiling: every node compared with every view, by whole descriptors, and judged as always."""
 
-from __future__ import annotations
-
 import math
 import zlib
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """The fleet whose map is asked, real places and made ones, and all questions to it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import cached_property

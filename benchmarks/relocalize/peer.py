@@ -4,8 +4,6 @@ A vocabulary tree (Nister and Stewenius, CVPR 2006) over the same compact descri
 (Sivic and Zisserman, ICCV 2003); plain numpy and scipy. What it retrieves is verified by the same geometry.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from itertools import islice
 from typing import Any

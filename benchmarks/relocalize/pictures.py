@@ -5,8 +5,6 @@ drives there is left out. What is kept is named by a digest of the sources that 
 is used.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 import tempfile

@@ -1,7 +1,5 @@
 """Buildings as a fleet has mapped them: nodes about as robots make them, and the map that joins them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Views of mapped places, undisturbed and disturbed, of twin rooms, and of unmapped places."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

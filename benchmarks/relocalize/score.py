@@ -1,7 +1,5 @@
 """What answers are worth, by the truth."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence

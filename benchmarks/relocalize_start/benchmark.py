@@ -10,8 +10,6 @@ asked once, while the server still compares the maps: it does so beside the answ
 Filling takes about 3 ms of processor a node, and 4.5 kB of disk; with --store it is kept, and used again.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import os

@@ -4,8 +4,6 @@ Robots `m0`, `m1` ... mapped a building each; robots `d0`, `d1` ... have mapped 
 (benchmarks.relocalize.distractors). Each robot's nodes hang together by edges, as the ways of a real one do.
 """
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Iterator, Sequence

@@ -24,8 +24,6 @@ Drives are explorations of offices, 90 s each; images or wheels are spoiled, and
 rules, and without those that the fault needs: how many edges are wrong, maps begun, ticks used.
 """
 
-from __future__ import annotations
-
 import json
 import os
 from pathlib import Path

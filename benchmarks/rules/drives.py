@@ -1,7 +1,5 @@
 """Drives with faults of images and wheels, mapped with all rules on frames, and without one."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

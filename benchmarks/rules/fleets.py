@@ -1,7 +1,5 @@
 """Synthetic fleets merged with all rules, and without each."""
 
-from __future__ import annotations
-
 import statistics
 from collections.abc import Callable
 from dataclasses import replace

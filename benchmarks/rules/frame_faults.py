@@ -1,7 +1,5 @@
 """What goes wrong with images and wheels on a drive: drives are spoiled after they were recorded."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple

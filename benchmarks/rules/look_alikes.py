@@ -5,8 +5,6 @@ poor cameras in rooms and halls where things were moved, a picture that hangs in
 place, a flat thing that is seen from aside.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """A robot's own loop closures, half of them false, merged with all rules on them, and without each."""
 
-from __future__ import annotations
-
 import statistics
 from dataclasses import replace
 

@@ -3,8 +3,6 @@
 No product code knows of these switches: a function is replaced for as long as something is measured.
 """
 
-from __future__ import annotations
-
 import contextlib
 import math
 from collections.abc import Callable, Iterator, Mapping, Sequence

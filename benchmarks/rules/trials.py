@@ -1,7 +1,5 @@
 """Simulated trials whose maps are merged once more with all rules, and without each."""
 
-from __future__ import annotations
-
 import tempfile
 from collections import Counter
 from pathlib import Path

@@ -10,8 +10,6 @@ admissible path are left out and counted. Greedy switching and a pursuit that ig
 the same trials.
 """
 
-from __future__ import annotations
-
 import json
 import math
 import time

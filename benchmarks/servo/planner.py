@@ -4,8 +4,6 @@ Dijkstra (scipy) over a lattice of 5 cm cells and 96 headings with free turns on
 within a few per cent of those of a finer lattice; where it finds no path, a start is taken to have none.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the servo is compared with: greedy switching of 2004, and pursuit that ignores the field of view."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from typing import Protocol

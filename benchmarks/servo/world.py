@@ -3,8 +3,6 @@
 Nothing of mapweave.agent.servo is used here: what is in view is judged by this module alone.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

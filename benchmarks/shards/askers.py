@@ -1,7 +1,5 @@
 """Lost robots that ask without a pause, and what they were answered."""
 
-from __future__ import annotations
-
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor

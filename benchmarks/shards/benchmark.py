@@ -26,8 +26,6 @@ primary is taken for dead is added. The server without Ray is alone, with SQLite
 and `not_killed` what was not killed, and why.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 import math

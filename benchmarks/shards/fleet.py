@@ -1,7 +1,5 @@
 """A fleet in one building, its store, the views that lost robots ask about, and a robot that maps on."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from pathlib import Path

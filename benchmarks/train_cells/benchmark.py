@@ -8,8 +8,6 @@ scikit-image ships and that are in the public domain or CC0. What comes out on o
 The balance is measured on other buildings, on other photographs, and on the images in given folders.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from collections.abc import Iterator

@@ -8,8 +8,6 @@ matter and on views of the simulator's rooms. What comes out on one machine is a
 tables are is measured by `python -m benchmarks.landmarks`, on other images.
 """
 
-from __future__ import annotations
-
 import argparse
 import json
 from pathlib import Path

@@ -10,8 +10,6 @@ clearance, the way driven while it was lied to, and whether it arrives in the en
 promises of the way.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """An office with a map as robots would have made it, and the truth about both."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """A map server that lies: a test double behind the robot's own bus. It can also tell the truth."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -8,8 +8,6 @@ map, with it, and with it while no map is looked for that has wrong geometry. Th
 that look the same: answers there must not become more certain.
 """
 
-from __future__ import annotations
-
 import json
 from collections import Counter
 from itertools import product

@@ -4,8 +4,6 @@ The target is read from its own PDF and seen through a lens with barrel distorti
 what `mapweave calibrate camera` says.
 """
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

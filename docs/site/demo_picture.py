@@ -4,8 +4,6 @@ python -m docs.site.demo_picture          # runs a demo first
 python -m docs.site.demo_picture FOLDER   # the folder of one that has run, as `make demo` leaves out/demo
 """
 
-from __future__ import annotations
-
 import json
 import shutil
 import subprocess

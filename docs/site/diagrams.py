@@ -1,7 +1,5 @@
 """Diagrams of the tutorials: a robot as its settings file describes it, and what is sent in a fleet."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """Films of the tutorials, as GIF: maps of the recorded fleet as they grow, merged as robots' maps are."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Hooks of the pages' build: pictures are drawn, and files beside the pages are named instead of linked."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

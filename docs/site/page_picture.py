@@ -5,8 +5,6 @@ the words on the page, where the robots are, and the files of which the page con
 that is the same.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import sys

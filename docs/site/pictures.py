@@ -3,8 +3,6 @@
 python docs/site/pictures.py
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 from pathlib import Path
 

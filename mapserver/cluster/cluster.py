@@ -1,7 +1,5 @@
 """The cluster as the server uses it: an index in shards, and nodes compared by its workers."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from mapweave.mapserver.cluster.gateway import WORK, Gateway

@@ -4,8 +4,6 @@ Ray ends a driver that has lost its cluster, holds threads and signal handlers, 
 So the server never imports it: requests and answers are bytes that pass through the child.
 """
 
-from __future__ import annotations
-
 import logging
 import subprocess
 import sys

@@ -5,8 +5,6 @@
 Each shard is an actor that Ray starts again, as often as needed; all belong to this process and end with it.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import socket

@@ -1,7 +1,5 @@
 """Settings of the cluster that a map server uses."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Annotated
 

@@ -4,8 +4,6 @@ It holds nothing that the server's record has not. A shard that was started agai
 another `incarnation`; the server then fills it again.
 """
 
-from __future__ import annotations
-
 import secrets
 from collections.abc import Collection, Iterable
 from dataclasses import replace

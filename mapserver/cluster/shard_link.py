@@ -6,8 +6,6 @@ from the nodes that the server has of its record. Until the first time that it i
 for long, a stand-in in this process answers in its place.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

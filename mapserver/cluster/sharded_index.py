@@ -5,8 +5,6 @@ compared, votes, and with them the candidates of a view, are those of one index 
 shard searches as many as an index of its share alone. Overlaps of two nodes depend on these two alone.
 """
 
-from __future__ import annotations
-
 import time
 import zlib
 from collections.abc import Collection, Iterable, Sequence

@@ -3,8 +3,6 @@
 Whatever does not come back is done here, so a process that fails does no harm.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Iterable, Iterator

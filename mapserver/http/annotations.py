@@ -1,7 +1,5 @@
 """Annotations over HTTP, as JSON."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from typing import Any

@@ -1,7 +1,5 @@
 """What the HTTP server asks the map server."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from concurrent.futures import Future
 from typing import Protocol

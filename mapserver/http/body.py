@@ -1,7 +1,5 @@
 """The body of a request: of a kind that is expected, of a length that is stated, within a time."""
 
-from __future__ import annotations
-
 from http import HTTPStatus
 
 from starlette.exceptions import HTTPException

@@ -12,8 +12,6 @@ name of an area retires the area. With each: `because`, `by`, `undo: true` (take
 (only says what it would do).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import msgspec

@@ -6,8 +6,6 @@
 /route?a=1,2&b=3,4&near=r1.1.5 positions in the part of the map of this node or place, not in the largest one
 """
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 from starlette.datastructures import QueryParams

@@ -1,7 +1,5 @@
 """The content of a POST: an image as the body itself, or in a form with values of its camera."""
 
-from __future__ import annotations
-
 import json
 import logging
 from typing import Any

@@ -1,7 +1,5 @@
 """JSON that people post."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import TypeVar
 

@@ -1,7 +1,5 @@
 """Values as JSON: the fields of the wire, with ids as `r0.1.17` and poses and arrays as numbers."""
 
-from __future__ import annotations
-
 from dataclasses import fields
 from datetime import UTC, datetime
 from typing import Any

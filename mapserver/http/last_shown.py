@@ -1,7 +1,5 @@
 """What the page showed last: kept beside the store, and shown while the next server loads and merges."""
 
-from __future__ import annotations
-
 import json
 import logging
 import zlib

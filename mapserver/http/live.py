@@ -4,8 +4,6 @@ A viewer gets the whole map and then differences. Between two messages it is sen
 gets the newest state when it is ready, and no queue grows.
 """
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import logging

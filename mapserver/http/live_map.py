@@ -1,7 +1,5 @@
 """The merged map as columns of numbers for viewers: as a whole, or what has changed since a version."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

@@ -1,7 +1,5 @@
 """While a map server loads: "ask again" to what is asked, except for what the page needs by itself."""
 
-from __future__ import annotations
-
 from typing import Any
 
 from mapweave.hybridmap.annotation import Annotations

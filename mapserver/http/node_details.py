@@ -1,7 +1,5 @@
 """One node of the merged map, for people: where it is, what it saw, what it costs, what replaces it."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

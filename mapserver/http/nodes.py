@@ -1,7 +1,5 @@
 """Nodes over HTTP: what is known of one, as JSON, and its image, if its robot has kept one."""
 
-from __future__ import annotations
-
 from collections.abc import Awaitable, Callable, Mapping
 from http import HTTPStatus
 from typing import Any

@@ -1,7 +1,5 @@
 """The page and its files, from memory: it has thirty, each on a connection of its own."""
 
-from __future__ import annotations
-
 from collections.abc import Awaitable, Callable
 from http import HTTPStatus
 from pathlib import Path

@@ -1,7 +1,5 @@
 """A photograph from a phone or a file: what its camera was, and its features as a question to the map."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Floor plans over HTTP: where they lie, as JSON, and their images."""
 
-from __future__ import annotations
-
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """How often one person may ask what takes long: one who asks without end harms no other."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable

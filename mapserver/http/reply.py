@@ -1,7 +1,5 @@
 """Answers as one JSON object on a line, and refusals."""
 
-from __future__ import annotations
-
 import asyncio
 import math
 from collections.abc import Mapping

@@ -7,8 +7,6 @@ its own.
 Images and scripts of a page are asked for without `Origin`: `Sec-Fetch-Site` says that the page is another's.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import socket
 

@@ -4,8 +4,6 @@ A viewer that has all rows as of some version needs only those that have changed
 no memory for each viewer, and one that is slow skips what it missed.
 """
 
-from __future__ import annotations
-
 import base64
 from collections.abc import Hashable, Sequence
 from typing import Any

@@ -1,7 +1,5 @@
 """A server that refuses what pages of other sites ask."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from http import HTTPStatus
 

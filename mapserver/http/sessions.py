@@ -1,7 +1,5 @@
 """Sessions of people in browsers, and failed attempts to log in. Both are kept in memory, with limits."""
 
-from __future__ import annotations
-
 import ipaddress
 import secrets
 import time

@@ -1,7 +1,5 @@
 """HTTPS by the server's certificate of the fleet's authority."""
 
-from __future__ import annotations
-
 import ssl
 from pathlib import Path
 from tempfile import TemporaryDirectory

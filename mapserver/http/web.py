@@ -29,8 +29,6 @@ Retry-After in whole seconds and `retry_after` exactly; who asks more than `rate
 Retry-After. The pages are in `static/`.
 """
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import ssl

@@ -1,7 +1,5 @@
 """A WebSocket with limits: a viewer that is gone or takes nothing is dropped."""
 
-from __future__ import annotations
-
 import asyncio
 from typing import Any
 

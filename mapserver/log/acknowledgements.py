@@ -1,7 +1,5 @@
 """Notifies agents up to where their logs are on the disk, or why they are not taken."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable
 
 from mapweave.hybridmap.errors import InvalidFile, InvalidMessage

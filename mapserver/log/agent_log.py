@@ -1,7 +1,5 @@
 """State of one agent's log at the ingest, and when the next piece of it should be pulled."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, field
 

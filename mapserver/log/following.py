@@ -1,7 +1,5 @@
 """Changes that this server did not take itself: another one wrote them to the store that they share."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable, Iterable

@@ -4,8 +4,6 @@ A commit waits for the disk, a few milliseconds whatever is in it: one for each 
 hundred changes a second, one for all that wait takes in thousands.
 """
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """What has come from robots and waits for the ingest's thread: robots take turns."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Callable
 from typing import Generic, TypeVar

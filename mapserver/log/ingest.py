@@ -12,8 +12,6 @@ on the way. If it does not decode when it is pulled either, the agent's log itse
 refused: kept aside with the reason, which is sent with the acknowledgement, and the log goes on after it.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

@@ -1,7 +1,5 @@
 """Counters of an ingest."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 

@@ -1,7 +1,5 @@
 """Times of an ingest."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from mapweave.mapserver.log.agent_log import PullSettings

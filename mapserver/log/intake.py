@@ -1,7 +1,5 @@
 """How much of one robot's logs the server takes now."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Sequence
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ each lost change the part of its log that must be pulled from its robot again is
 useless, so the rows before and after it show what is missing.
 """
 
-from __future__ import annotations
-
 import logging
 import sqlite3
 import zlib

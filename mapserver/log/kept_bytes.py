@@ -6,8 +6,6 @@ that much larger, and reading it through costs a fixed share of what the robot h
 is deleted with each run of changes that comes, so that other robots do not wait.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """The logs of which a server has heard, and how far it is behind them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Opens the store of an address."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from mapweave.mapserver.log.sqlite_store import SqliteStore

@@ -1,7 +1,5 @@
 """What other servers write to a shared store, and which of them leads."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import time

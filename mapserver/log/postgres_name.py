@@ -1,7 +1,5 @@
 """The name of a server on a store that servers share: one server has it at a time."""
 
-from __future__ import annotations
-
 import hashlib
 import os
 import secrets

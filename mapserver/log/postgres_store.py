@@ -4,8 +4,6 @@ Damage is PostgreSQL's to find: its pages have checksums where `initdb --data-ch
 standby has good ones. So rows have no checksums of their own here, and nothing is salvaged.
 """
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Which log is asked for a missing piece next, so that no robot keeps others waiting."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 from mapweave.hybridmap.ids import MapId

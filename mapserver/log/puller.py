@@ -1,7 +1,5 @@
 """Asks agents for what is missing of their logs; a few threads wait for the answers."""
 
-from __future__ import annotations
-
 import itertools
 import logging
 import time

@@ -5,8 +5,6 @@ disk has lost, that may have been the retirement of what the store still has: al
 compared with the robot's log, and what the robot has dropped goes here, too.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable
 

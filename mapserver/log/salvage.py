@@ -1,7 +1,5 @@
 """Salvage of a store that does not open any more."""
 
-from __future__ import annotations
-
 import sqlite3
 from dataclasses import dataclass, replace
 from pathlib import Path

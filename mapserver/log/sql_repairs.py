@@ -1,7 +1,5 @@
 """Logs of which a store has lost a part: what is damaged, what is restored, what has to be verified."""
 
-from __future__ import annotations
-
 import logging
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence

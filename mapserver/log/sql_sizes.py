@@ -1,7 +1,5 @@
 """How much a store keeps, and what of it later changes have superseded."""
 
-from __future__ import annotations
-
 import threading
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Sequence

@@ -1,7 +1,5 @@
 """The store in one SQLite file on the server's disk."""
 
-from __future__ import annotations
-
 import logging
 import threading
 import zlib

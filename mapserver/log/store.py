@@ -4,8 +4,6 @@ There are two: one SQLite file (mapweave.mapserver.log.sqlite_store), and a Post
 servers share (mapweave.mapserver.log.postgres_store).
 """
 
-from __future__ import annotations
-
 import logging
 import secrets
 import zlib

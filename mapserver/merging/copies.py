@@ -1,7 +1,5 @@
 """Copies: nodes whose landmarks are other robots', bit by bit or one for one."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Which verdicts count in a merge: no link joins a map with wrong geometry with another one."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Mapping
 
 from mapweave.hybridmap.hybrid_map import HybridMap

@@ -1,7 +1,5 @@
 """Implausible maps: what is wrong with each map by itself, and beside the others once they are merged."""
 
-from __future__ import annotations
-
 from collections.abc import Container
 
 from mapweave.hybridmap.hybrid_map import HybridMap

@@ -1,7 +1,5 @@
 """Isolation: maps with which the merge fails are set apart, so that all others are merged."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import TypeVar

@@ -4,8 +4,6 @@ Changes are held back until a merge that has them is handed over: then the maps 
 merged, which digests prove. The nodes among them can be found all the while.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import time

@@ -1,7 +1,5 @@
 """The server that leads hands its merges over to those that follow it, in a small share of its time."""
 
-from __future__ import annotations
-
 import logging
 import math
 from collections.abc import Callable, Mapping

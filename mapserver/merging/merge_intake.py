@@ -1,7 +1,5 @@
 """Changes on their way into a merger: known at once, taken in when it is their turn."""
 
-from __future__ import annotations
-
 import logging
 import threading
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """From maps to a merged map, with what each step knows from the last time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence, Set
 from dataclasses import replace
 

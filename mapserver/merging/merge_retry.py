@@ -1,7 +1,5 @@
 """When merging is tried again that has ended for want of memory: in this process, or with it."""
 
-from __future__ import annotations
-
 import gc
 import logging
 import math

@@ -5,8 +5,6 @@ large map costs what is new, the poses and the decisions. All of it follows from
 server merges for itself.
 """
 
-from __future__ import annotations
-
 import hashlib
 import zlib
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """Keeps the merged map up to date as changes come in."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace

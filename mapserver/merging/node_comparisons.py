@@ -1,7 +1,5 @@
 """Comparing nodes: which look alike, and the verdicts on pairs of them, each found once."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence, Set
 from itertools import islice

@@ -4,8 +4,6 @@ A robot chooses the ids of its nodes. Which pairs are looked at depends on a key
 else ids could be chosen so that the pairs that contradict are never among them.
 """
 
-from __future__ import annotations
-
 import hashlib
 import math
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set

@@ -9,8 +9,6 @@ Some superseded nodes stay: the first of each component, which gives the compone
 person's words or constraints name; those of maps with anything held against them.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Set
 from dataclasses import dataclass, fields, is_dataclass

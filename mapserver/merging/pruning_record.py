@@ -4,8 +4,6 @@ Of the servers that share a store the one that leads prunes; the others take ove
 the store has counts: a node that its robot has sent again meanwhile stays.
 """
 
-from __future__ import annotations
-
 import logging
 import secrets
 from collections.abc import Callable, Collection, Iterable, Mapping

@@ -4,8 +4,6 @@ supersedes the nodes that it had superseded.
 header (JSON), the record as a message (see mapweave.wire.typed)
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 

@@ -1,7 +1,5 @@
 """For how long what has come has waited for a merge that contains it."""
 
-from __future__ import annotations
-
 import threading
 from collections import deque
 from collections.abc import Callable

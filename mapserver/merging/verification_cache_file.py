@@ -4,8 +4,6 @@ not compare again.
 header (JSON), agents (JSON), nodes, prints, overlaps, verdicts, reasons (JSON), links ...
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import pairwise
 from typing import Any

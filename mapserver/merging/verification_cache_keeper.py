@@ -1,7 +1,5 @@
 """Keeps comparisons of nodes, and what is superseded, on the disk next to the store for the next start."""
 
-from __future__ import annotations
-
 import logging
 import time
 from collections.abc import Callable

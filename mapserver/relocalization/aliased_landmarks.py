@@ -5,8 +5,6 @@ happen to be landmarks there, or because they leave the pose open. Two nodes com
 best landmarks, with depths.
 """
 
-from __future__ import annotations
-
 from collections import OrderedDict
 from dataclasses import replace
 from typing import Any

@@ -6,8 +6,6 @@ motion from room to room. The robot may be at the place that this motion gives: 
 are aliased, or if their counterparts were not observed there.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Collection, Iterable, Iterator, Sequence
 from dataclasses import dataclass

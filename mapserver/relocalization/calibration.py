@@ -4,8 +4,6 @@ A logistic regression on views of simulated buildings, with truth, by `python -m
 buildings are not those on which benchmarks.relocalize measures.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Retrieval: candidate nodes for a view. The first of three steps to an answer."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Protocol

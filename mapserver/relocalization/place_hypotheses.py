@@ -1,7 +1,5 @@
 """Place hypotheses: places recognised in one view, their evidence, and averaged estimates."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

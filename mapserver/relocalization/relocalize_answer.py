@@ -1,7 +1,5 @@
 """A verdict as the answer that robots and people get: poses, probabilities, and a reason in words."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 from mapweave.hybridmap.counted import counted

@@ -1,7 +1,5 @@
 """The verdict: at which places the view may have been taken, and whether one is certain. The last step."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from enum import Enum, auto

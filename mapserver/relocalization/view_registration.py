@@ -1,7 +1,5 @@
 """Registration: in which of the candidates the view is recognised, and from where. The second step."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace

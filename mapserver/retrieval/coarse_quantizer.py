@@ -5,8 +5,6 @@ centres of the nearest few families. No robot's data moves them: they are made o
 by `python -m benchmarks.train_cells --write`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache, cached_property
 from importlib import resources

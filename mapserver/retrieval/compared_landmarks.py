@@ -1,7 +1,5 @@
 """How many landmarks of a node are compared."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Landmarks of a small fleet, of which every one is compared."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -4,8 +4,6 @@ FAISS's inverted file, a byte a coordinate: whole steps are kept as they are in 
 exact, and only cells that are not searched can hide something.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 

@@ -6,8 +6,6 @@ cells. Where most are hidden, they are kept in cells of two sizes: a question th
 smaller ones.
 """
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass

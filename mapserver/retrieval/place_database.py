@@ -5,8 +5,6 @@ a new node costs the same on every drive. Nodes of today stay in it, superseded 
 made, links between all of them distinguish true merges from false ones.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Sequence
 from typing import Protocol
 

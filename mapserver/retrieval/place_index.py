@@ -1,7 +1,5 @@
 """The place index: finds nodes that look like a view, by the descriptors of all landmarks of the fleet."""
 
-from __future__ import annotations
-
 import logging
 from collections import deque
 from collections.abc import Callable, Collection, Iterable, Iterator

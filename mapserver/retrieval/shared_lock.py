@@ -1,7 +1,5 @@
 """A lock that many may share who only read, and that one has alone who writes."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager

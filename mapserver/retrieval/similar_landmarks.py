@@ -7,8 +7,6 @@ is compared at once. On one core 120 descriptors are compared with 35 000 in 3 m
 The k nearest are in those k groups that hold the greatest products, so few products are looked at singly.
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 

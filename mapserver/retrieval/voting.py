@@ -1,7 +1,5 @@
 """Voting: from similar landmarks to similar nodes, for candidates of a view and overlaps of a node."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

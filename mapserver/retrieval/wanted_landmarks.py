@@ -1,7 +1,5 @@
 """The nearest landmarks without those that are hidden, of an index that knows nothing of that."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Partings: what has become one map, or is no longer one, from one merge to the next."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Collection, Iterable
 

@@ -1,7 +1,5 @@
 """Explanations of two maps: why they are one, or are not, and which nodes came nearest to joining them."""
 
-from __future__ import annotations
-
 import heapq
 from collections import Counter
 from collections.abc import Collection, Sequence

@@ -1,7 +1,5 @@
 """Maps whose lengths are all too long, or too short, in words."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 

@@ -1,7 +1,5 @@
 """How each map stands in the merge, in a few words: for lists of robots, where an explanation is too long."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Explanations of two nodes: why they are linked, or are not, with every number behind it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The robots' own edges between two nodes, and what follows for routes."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 

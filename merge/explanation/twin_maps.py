@@ -1,7 +1,5 @@
 """Twin maps: two that show the same places and cannot be one. No server can tell which of them is right."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from mapweave.hybridmap.ids import MapId

@@ -1,7 +1,5 @@
 """The links of a merged map by their nodes, kept from merged map to merged map: most stay what they are."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Iterator
 
 from mapweave.hybridmap.ids import NodeId

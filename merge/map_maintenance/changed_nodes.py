@@ -1,7 +1,5 @@
 """Drift: which nodes of a merged map are new, were written again, or have moved since the last time."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 

@@ -1,7 +1,5 @@
 """Comparisons of nodes that the merge had no need of, each made once."""
 
-from __future__ import annotations
-
 from collections.abc import Container
 
 from mapweave.hybridmap.ids import NodeId

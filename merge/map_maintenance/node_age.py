@@ -1,7 +1,5 @@
 """Ages: which of two nodes is the older one."""
 
-from __future__ import annotations
-
 from mapweave.hybridmap.node import Node
 
 

@@ -18,8 +18,6 @@ Nodes of maps that may not be right supersede none of other robots' nodes, and a
 these: a superseded node answers no more, and is deleted in the end.
 """
 
-from __future__ import annotations
-
 import heapq
 from collections.abc import Iterable, Mapping, Set
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Collisions: two robots that cannot both have been where a merge puts them, and why in words."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 WORDS = ("would have seen", "would have been at the same place")

@@ -1,7 +1,5 @@
 """Encounters: the common moments of two robots, and their evidence about a merge."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -13,8 +13,6 @@ Robots are also seen: the odds of `mapweave.merge.mutual_exclusion.mutual_visibi
 these.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

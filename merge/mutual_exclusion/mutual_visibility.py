@@ -26,8 +26,6 @@ its probability: under a merge the likelihood of the measurements is the mean ov
 against the merge are one over the mean of their inverses.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import product
 

@@ -1,7 +1,5 @@
 """Quadrature: fixed samples of a normal distribution in the plane."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Refutation: which groups of links cannot be true, because robots exclude each other."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Trajectories: when a robot was where, by its nodes and their trajectory segments."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 

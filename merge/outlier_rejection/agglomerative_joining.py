@@ -6,8 +6,6 @@ each round joins only pieces that are each other's best supported partner. Then 
 pieces are sorted again, all together, and those within one piece are tested against it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Container, Mapping, Sequence, Set
 
 from mapweave.hybridmap.ids import MapId, NodeId

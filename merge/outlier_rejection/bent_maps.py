@@ -4,8 +4,6 @@ Links of a bent map contradict each other, but each puts the map nearly where al
 so near to the first: the map is at that one place, and its geometry is wrong.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -1,7 +1,5 @@
 """Joins pieces of map by sorted groups of links; how far a link is from a solved graph."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import networkx as nx

@@ -4,8 +4,6 @@ Everything kept here depends on nothing but what it is kept with, compared by id
 links are never changed, only replaced. So a merge with a cache is the merge without one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from mapweave.hybridmap.hybrid_map import HybridMap

@@ -5,8 +5,6 @@ relative pose of nodes of different maps comes from their landmarks, which can b
 edge takes no part in the merge; it is only checked against the result.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 import numpy as np

@@ -5,8 +5,6 @@ same direction, and it has some behind theirs. Clutter and wrong depths are seen
 shares are compared with what is usual.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 

@@ -15,8 +15,6 @@ same agree with one another; against these the merge has other rules
 (mapweave.merge.mutual_exclusion.refutation and mapweave.merge.outlier_rejection.pairwise_consistency).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

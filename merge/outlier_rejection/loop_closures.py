@@ -1,7 +1,5 @@
 """Loop closures: edges between two nodes of a robot's own map that rest on place recognition."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 from mapweave.hybridmap.ids import NodeId

@@ -1,7 +1,5 @@
 """Cliques: the best set of links in which all agree, and how many of a set have no node in common."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import networkx as nx

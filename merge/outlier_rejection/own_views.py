@@ -8,8 +8,6 @@ most landmarks without any pose that they agree on.
 What is off otherwise tells of something else: places that look alike, a way that slipped once.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass

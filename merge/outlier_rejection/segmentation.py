@@ -8,8 +8,6 @@ is never torn apart: where a robot resumed its map elsewhere, loop closures alon
 the old one.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 

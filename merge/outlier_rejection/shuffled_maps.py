@@ -4,8 +4,6 @@ A second place that looks the same looks the same from several nodes, and they a
 each other. In a shuffled map each node shows a place of its own, and no two agree.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

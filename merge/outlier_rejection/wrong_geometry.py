@@ -23,8 +23,6 @@ Of few links between two maps some miss by chance, and the two seem to contradic
 right if its links to all maps that agree put the whole of it in one place.
 """
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence

@@ -4,8 +4,6 @@ The overlap of two nodes depends on these two alone, not on the rest of the flee
 grow node by node and the choice made from it does not depend on the order.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

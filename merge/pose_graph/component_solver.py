@@ -4,8 +4,6 @@ What no change touches is kept as it is, object by object. Where few measurement
 come or gone, only the nodes around them are moved, further out until those at the rim stay where they are.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Sequence
 
 import networkx as nx

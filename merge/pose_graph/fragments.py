@@ -1,7 +1,5 @@
 """Fragments: pieces of map that hold together by themselves."""
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from dataclasses import dataclass
 from functools import cached_property

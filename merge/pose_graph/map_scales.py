@@ -18,8 +18,6 @@ decided. So all that follows, covariances included, is as if the robot had measu
 uncertain the factor is, is part of no covariance: neither is what all wheels of a fleet have in common.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace

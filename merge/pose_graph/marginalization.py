@@ -22,8 +22,6 @@ nodes stay as they are.
     Communications in Statistics 7, 1978.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterable, Set
 
 import networkx as nx

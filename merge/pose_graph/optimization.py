@@ -1,7 +1,5 @@
 """Poses that agree best with what was measured between them: GTSAM, from where they were."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ The table of all overlaps is never traversed. Only what a change affects is upda
 it contains, and the few edges around a new or removed edge.
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 

@@ -5,8 +5,6 @@ of them gets the other's frame. A pin holds the frame of its component instead, 
 component, the oldest of them does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple

@@ -5,8 +5,6 @@ But the others are where they are without it, as certain, and in the same compon
 and then held. Where it alone would join others it stays with those to which most links tie it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Iterator, Mapping, Sequence, Set
 from dataclasses import replace
 from typing import NamedTuple

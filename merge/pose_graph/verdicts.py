@@ -1,7 +1,5 @@
 """Verdicts: what was found of pairs of nodes, by their maps."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping, Set
 
 from mapweave.hybridmap.ids import MapId

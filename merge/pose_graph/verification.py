@@ -1,7 +1,5 @@
 """Candidate pairs become links: do the two nodes' landmarks agree on a pose?"""
 
-from __future__ import annotations
-
 import math
 import zlib
 

@@ -5,8 +5,6 @@ since rmw_zenoh_cpp 0.1.2 (Humble), 0.2.4 (Jazzy) and 0.6.0, and nothing is ever
 form of before is read as well.
 """
 
-from __future__ import annotations
-
 import struct
 from typing import NamedTuple
 

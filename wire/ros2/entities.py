@@ -1,7 +1,5 @@
 """What a ROS 2 node declares in its Zenoh session."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

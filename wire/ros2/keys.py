@@ -12,8 +12,6 @@ In a token `%` replaces each `/` of a name. The bridge's key is the topic itself
 `@/<session>/@ros2_lv/MP|MS/<topic>/<type>/<quality of service>`, where `§` replaces each `/`.
 """
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from enum import StrEnum

@@ -1,7 +1,5 @@
 """ROS 2 messages as bytes (CDR) and back, and the hashes of their types, by `rosbags`."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

@@ -1,7 +1,5 @@
 """How a ROS 2 graph is reached."""
 
-from __future__ import annotations
-
 import os
 import re
 from dataclasses import dataclass
