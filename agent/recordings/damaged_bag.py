@@ -216,7 +216,9 @@ def _sqlite(path: Path) -> Iterator[Item]:
         # Without this SQLite refuses a file that is shorter than its header says.
         file.execute("PRAGMA writable_schema = ON")
         for number, name, kind in file.execute("SELECT id, name, type FROM topics"):
-            yield number, name, full_type(kind)
+            # What stood on a page that was cut off is NULL.
+            if isinstance(name, str) and isinstance(kind, str):
+                yield number, name, full_type(kind)
         last: Item | None = None
         for row in file.execute("SELECT topic_id, timestamp, data FROM messages NOT INDEXED ORDER BY rowid"):
             if last is not None:

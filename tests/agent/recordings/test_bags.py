@@ -268,6 +268,15 @@ def test_a_bag_cut_off_anywhere_is_used_up_to_there(
     check_prefix(path, drive)
 
 
+@pytest.mark.parametrize("cut", range(0, 32768, 331))
+def test_a_database_cut_off_in_its_list_of_topics_is_used_up_to_there(
+    cut: int, whole_bags: dict[str, bytes], drive: Drive, tmp_path
+):
+    path = tmp_path / "drive.db3"
+    path.write_bytes(whole_bags["db3"][:cut])
+    check_prefix(path, drive)
+
+
 @pytest.mark.parametrize("name", FORMATS)
 def test_the_longer_a_cut_bag_is_the_more_images_it_has(
     name: str, whole_bags: dict[str, bytes], drive: Drive, tmp_path
