@@ -203,10 +203,10 @@ def compared_with_scipy(seed: int, pitch: float) -> tuple[np.ndarray, Callable[[
     return kept, alone
 
 
-@settings(max_examples=12, deadline=None, derandomize=True)
-@given(st.integers(0, 10**6), st.floats(-0.03, 0.03))
-def test_pitch_against_scipy_with_points_and_pitch_as_variables(seed: int, pitch: float):
+@pytest.mark.parametrize("seed", range(12))
+def test_pitch_against_scipy_with_points_and_pitch_as_variables(seed: int):
     """The same draws each time: in one of 500 more than two lie outside their gates by chance."""
+    pitch = np.random.default_rng([seed, 1]).uniform(-0.03, 0.03)
     kept, _ = compared_with_scipy(seed, pitch)
     assert kept.sum() >= len(kept) - 2
 
