@@ -102,6 +102,7 @@ def hostile(
 
 
 @pytest.mark.slow
+@pytest.mark.waits
 @pytest.mark.timeout(600)
 def test_a_hostile_server_neither_fills_nor_stops_a_robot_nor_leads_it_astray(hostile: Hostile):
     rng, bus = np.random.default_rng(0), hostile.bus
