@@ -220,7 +220,8 @@ def test_robots_that_were_sent_stand_once_the_last_page_is_closed(fleet: Fleet, 
     assert fleet.mission("r0").order.by == "s0"
     assert fleet.mission("r1").order.by == "start" and fleet.mission("r1").state is MissionState.RUNNING
     # The order is done before the wheels have come to rest; then it does not move at all.
-    eventually(lambda: fleet.moved("r0", 0.5) < 0.0001, PATIENCE)
+    fleet.moved("r0", 2.0)
+    assert fleet.moved("r0", 0.5) < 0.0001
     assert fleet.moved("r0", 5.0) < 0.001
     eventually(lambda: serves(browser, fleet.http))
     person.press("tab-events")
