@@ -162,7 +162,8 @@ def check_outline(corners: Sequence[tuple[float, float]]) -> None:
     Raises:
         InvalidValue: it crosses itself, and where.
     """
-    outline = np.array(corners, dtype=float)
+    # Far below a sliver: quotients of sides overflow where one is 1e-300 m long.
+    outline = np.round(np.array(corners, dtype=float), 9)
     crossings = _crossings(outline)
     if not _encloses_twice(outline, crossings):
         return
@@ -201,7 +202,8 @@ def _encloses_twice(outline: Floats, crossings: Mapping[tuple[int, int], float])
         outline: (C, 2) corners in order.
         crossings: of its sides.
     """
-    (x1, y1), (x2, y2) = outline.T, np.roll(outline, -1, axis=0).T
+    begin, end = outline, np.roll(outline, -1, axis=0)
+    sides = end - begin
     levels = np.unique([*outline[:, 1], *crossings.values()])
     turns = {0}
     for low, high in pairwise(levels):
@@ -209,13 +211,11 @@ def _encloses_twice(outline: Floats, crossings: Mapping[tuple[int, int], float])
             continue
         # Between two levels no side begins, ends or crosses another.
         y = (low + high) / 2.0
-        across = (np.minimum(y1, y2) < y) & (y < np.maximum(y1, y2))
-        up, x = (
-            y2[across] > y1[across],
-            (x1 + (y - y1) / np.where(y2 == y1, 1.0, y2 - y1) * (x2 - x1))[across],
-        )
+        across = (begin[:, 1] < y) != (end[:, 1] < y)
+        along, up = sides[across].T
+        x = begin[across, 0] + (y - begin[across, 1]) / up * along
         order = np.argsort(x)
-        around = np.cumsum(np.where(up[order], 1, -1))[:-1]
+        around = np.cumsum(np.sign(up[order]))[:-1]
         turns.update(around[np.diff(x[order]) > SLIVER].tolist())
         if max(turns) - min(turns) > 1:
             return True

@@ -7,7 +7,7 @@ from itertools import combinations, pairwise
 import cv2
 import numpy as np
 import pytest
-from hypothesis import assume, given
+from hypothesis import assume, given, settings
 from hypothesis import strategies as st
 
 from mapweave.hybridmap.area import Area, crosses, inside, read_corner
@@ -148,6 +148,21 @@ def test_how_an_outline_is_written_down_does_not_matter(corners, heading, first)
     assert crosses_itself([*corners, corners[0]]) == expected
     turned = Area.of_merged(NODE, Pose2(2.1, -0.3, heading), [*corners[first:], *corners[:first]])
     assert crosses_itself(turned.corners) == expected
+
+
+tiny = st.sampled_from([0.0, 1e-10, -1e-12, 1e-170, -1e-300, 1e-310, 5e-324])
+
+
+close = st.tuples(st.integers(-1, 1), st.integers(-1, 1))
+tight = st.lists(close, min_size=3, max_size=8, unique=True).filter(lambda corners: not on_one_line(corners))
+
+
+@settings(max_examples=200)
+@given(tight, st.data())
+def test_corners_off_by_less_than_a_sliver_change_nothing_and_overflow_nowhere(corners, data):
+    """A byte of a message gone bad makes 4.0 a number of 1e-310."""
+    near = [(x + data.draw(tiny), y + data.draw(tiny)) for x, y in corners]
+    assert crosses_itself(near) == crosses_itself(corners)
 
 
 @pytest.mark.parametrize(
