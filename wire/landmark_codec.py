@@ -9,14 +9,13 @@ begins with, so they cost what they hold.
 
 import struct
 import zlib
-from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
-from mapweave.hybridmap.landmark_tables import SYMBOLS, TOTAL_BITS, VERSION, landmark_tables
+from mapweave.hybridmap.landmark_tables import SYMBOLS, TOTAL_BITS, VERSION
 from mapweave.hybridmap.limits import MAX_LANDMARKS
 from mapweave.hybridmap.node import CODE_BYTES, Landmarks
 from mapweave.hybridmap.quantization import (
@@ -26,8 +25,8 @@ from mapweave.hybridmap.quantization import (
     restore_landmarks,
     round_landmarks,
 )
-from mapweave.wire.landmark_reader import LandmarkHead, Numbers, read
-from mapweave.wire.rans import Column, Frequencies, Ints, LaneWriter, pack_bits
+from mapweave.wire.landmark_reader import CELLS, SHARES, LandmarkHead, Numbers, landmark_columns, read
+from mapweave.wire.rans import Ints, LaneWriter, pack_bits
 
 HEAD = struct.Struct("<BBHHHHH")
 """Version, flags, count, least x, reach of x, least y, reach of y."""
@@ -88,23 +87,6 @@ def unpack_features(data: bytes, camera: Camera) -> tuple[NDArray[np.float32], N
     return PixelGrid.of(camera).restore(numbers.x, numbers.y), numbers.codes
 
 
-@cache
-def _code_columns() -> tuple[Column, ...]:
-    return tuple(Column(frequencies) for frequencies in landmark_tables().codes)
-
-
-@cache
-def _depth_columns() -> tuple[Column, Column]:
-    return Column(landmark_tables().shares), Column(landmark_tables().cells)
-
-
-@cache
-def _written_columns() -> tuple[Frequencies, Frequencies, Frequencies]:
-    """The columns of codes, shares and cells."""
-    shares, cells = _depth_columns()
-    return Frequencies.of(_code_columns()), Frequencies.of([shares]), Frequencies.of([cells])
-
-
 def _pack(rounded: QuantizedLandmarks, codes: NDArray[np.uint8], with_depths: bool) -> bytes:
     count = len(codes)
     if count > MAX_LANDMARKS:
@@ -121,7 +103,7 @@ def _pack(rounded: QuantizedLandmarks, codes: NDArray[np.uint8], with_depths: bo
     lanes = LaneWriter((x << low | y & ((1 << low) - 1)) + (1 << size), size)
     if with_depths:
         _push_depths(lanes, rounded)
-    lanes.push(codes.T, _written_columns()[0])
+    lanes.push(codes.T, landmark_columns().part(0, SHARES))
     flags = ASCENDING * ascending + WITH_DEPTHS * with_depths
     head = HEAD.pack(VERSION, flags, count, least_x, reach_x, least_y, reach_y)
     rows = row, np.ones_like(row)
@@ -162,13 +144,13 @@ def _unpack(data: bytes, with_depths: bool) -> Numbers:
 
 
 def _push_depths(lanes: LaneWriter, rounded: QuantizedLandmarks) -> None:
-    _, shares, cells = _written_columns()
+    columns = landmark_columns()
     with_depth = np.flatnonzero(rounded.share)
     fine = FINE_BITS[rounded.share[with_depth]]
     depth = rounded.depth[with_depth]
     lanes.push_plain(depth & ((1 << fine) - 1), fine, with_depth)
-    lanes.push((depth >> fine).astype(np.uint8)[None], cells, with_depth)
-    lanes.push(rounded.share.astype(np.uint8)[None], shares)
+    lanes.push((depth >> fine).astype(np.uint8)[None], columns.part(CELLS, CELLS + 1), with_depth)
+    lanes.push(rounded.share.astype(np.uint8)[None], columns.part(SHARES, CELLS))
 
 
 def _low_bits(count: int, reach: int) -> int:

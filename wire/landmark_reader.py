@@ -17,7 +17,7 @@ from mapweave.hybridmap.jit import compiled, compiled_form_of
 from mapweave.hybridmap.landmark_tables import TOTAL_BITS, landmark_tables
 from mapweave.hybridmap.node import CODE_BYTES
 from mapweave.hybridmap.quantization import FINE_BITS
-from mapweave.wire.rans import CUT_OFF, TOTAL, BitReader, Bytes, Column, Columns, Ints, LaneReader, Small
+from mapweave.wire.rans import CUT_OFF, TOTAL, BitReader, Bytes, Columns, Ints, LaneReader
 
 Row = Annotated[NDArray[np.uint8], 1]
 
@@ -26,6 +26,8 @@ OTHER_ROWS = "landmarks: the rows are not those of {} landmarks"
 TOO_LONG = "landmarks: more than there should be"
 REASONS = ("", CUT_OFF, OTHER_ROWS, TOO_LONG, OFF_THE_GRID)
 """By what the compiled form returns."""
+SHARES, CELLS = CODE_BYTES, CODE_BYTES + 1
+"""Columns behind those of the codes: of the share and of the cell of a depth."""
 
 
 class LandmarkHead(NamedTuple):
@@ -78,57 +80,21 @@ class Numbers(NamedTuple):
         return Numbers(x, y, share, depth, np.zeros((count, CODE_BYTES), np.uint8))
 
 
-class Alphabets(NamedTuple):
-    """Columns in the order of reading: those of the codes, of shares and of cells. See `Column`.
-
-    What depends on the symbol alone is kept by symbol: so all of it stays in the processor's first cache.
-
-    Attributes:
-        symbols: (K, 4096) of each slot.
-        frequencies: (K, S).
-        starts: (K, S).
-        missing: (K, S) bits that a state lacks at least after the symbol has been taken out of it.
-        fine: (S,) bits of a depth beside its cell, by the share.
-    """
-
-    symbols: Bytes
-    frequencies: Small
-    starts: Small
-    missing: Small
-    fine: Ints
-
-
 @cache
-def alphabets() -> Alphabets:
-    """Those of the fleet's tables."""
+def landmark_columns() -> Columns:
+    """The columns of the fleet's tables in the order of reading: of the codes, of shares and of cells."""
     tables = landmark_tables()
-    frequencies = np.concatenate([tables.codes, tables.shares[None], tables.cells[None]])
-    columns = [Column(of) for of in frequencies]
-    missing = TOTAL_BITS - np.frexp(np.maximum(frequencies, 1))[1]
-    return Alphabets(
-        np.stack([column.symbols for column in columns]).astype(np.uint8),
-        frequencies.astype(np.uint16),
-        np.stack([column.starts for column in columns]).astype(np.uint16),
-        np.maximum(missing, 0).astype(np.uint16),
-        np.ascontiguousarray(FINE_BITS, np.int64),
-    )
+    return Columns.of(np.concatenate([tables.codes, tables.shares[None], tables.cells[None]]))
 
 
-@cache
-def _columns() -> tuple[Columns, Columns, Columns]:
-    """The columns of codes, shares and cells."""
-    tables = landmark_tables()
-    codes, shares, cells = tables.codes, tables.shares[None], tables.cells[None]
-    return tuple(Columns.of([Column(of) for of in part]) for part in (codes, shares, cells))  # type: ignore[return-value]
-
-
-def read_in_numpy(data: Row, layout: LandmarkHead, tables: Alphabets, out: Numbers) -> int:
+def read_in_numpy(data: Row, layout: LandmarkHead, columns: Columns, fine: Ints, out: Numbers) -> int:
     """Read landmarks, a lane for each, side by side.
 
     Args:
         data: the bytes behind the head.
         layout: of the landmarks.
-        tables: of the columns.
+        columns: of the landmarks.
+        fine: (64,) bits of a depth beside its cell, by the share.
         out: is filled.
 
     Returns:
@@ -137,7 +103,6 @@ def read_in_numpy(data: Row, layout: LandmarkHead, tables: Alphabets, out: Numbe
     Raises:
         InvalidMessage: there is too little or too much, or a number is out of its range.
     """
-    codes, shares, cells = _columns()
     bits, high = BitReader(data.tobytes()), np.zeros(layout.landmarks, np.int64)
     if layout.steps >= 0:
         row = bits.read(np.ones(layout.landmarks + layout.steps if layout.landmarks else 0, np.int64))
@@ -146,13 +111,13 @@ def read_in_numpy(data: Row, layout: LandmarkHead, tables: Alphabets, out: Numbe
             raise InvalidMessage(OTHER_ROWS.format(layout.landmarks))
         high = ones - np.arange(layout.landmarks)
     lanes = LaneReader(bits, layout.landmarks, layout.size)
-    out.codes[:] = lanes.pop(codes).T
+    out.codes[:] = lanes.pop(columns.part(0, SHARES)).T
     if layout.with_depths:
-        out.share[:] = lanes.pop(shares)[0]
+        out.share[:] = lanes.pop(columns.part(SHARES, CELLS))[0]
         known = np.flatnonzero(out.share)
-        fine = tables.fine[out.share[known]]
-        cell = lanes.pop(cells, known)[0].astype(np.int64)
-        out.depth[known] = (cell << fine) | lanes.pop_plain(fine, known)
+        beside = fine[out.share[known]]
+        cell = lanes.pop(columns.part(CELLS, CELLS + 1), known)[0].astype(np.int64)
+        out.depth[known] = (cell << beside) | lanes.pop_plain(beside, known)
     bits.end()
     seeds = lanes.states - (1 << layout.size)
     out.x[:] = layout.least_x + (seeds >> layout.low)
@@ -182,10 +147,10 @@ def bits_at(window: Ints, at: int, width: int) -> int:
 
 
 @compiled
-def pop(tables: Alphabets, k: int, states: Ints, symbols: Row, window: Ints, at: int, size: int) -> int:
+def pop(columns: Columns, k: int, states: Ints, symbols: Row, window: Ints, at: int, size: int) -> int:
     """Take a symbol of column k out of each lane; returns the bit behind what is read, or -1: cut off."""
-    of_slot, frequencies = tables.symbols[k], tables.frequencies[k]
-    starts, missing = tables.starts[k], tables.missing[k]
+    of_slot, frequencies = columns.symbols[k], columns.frequencies[k]
+    starts, missing = columns.starts[k], columns.missing[k]
     end = 8 * (len(window) - 1)
     for n in range(len(states)):
         state = states[n]
@@ -203,22 +168,24 @@ def pop(tables: Alphabets, k: int, states: Ints, symbols: Row, window: Ints, at:
 
 
 @compiled
-def pop_depths(tables: Alphabets, out: Numbers, states: Ints, window: Ints, at: int, size: int) -> int:
+def pop_depths(
+    columns: Columns, fine: Ints, out: Numbers, states: Ints, window: Ints, at: int, size: int
+) -> int:
     """Take shares and depths out of the lanes that have them, likewise."""
     symbols = np.empty(len(states), np.uint8)
-    at = pop(tables, CODE_BYTES, states, symbols, window, at, size)
+    at = pop(columns, SHARES, states, symbols, window, at, size)
     if at < 0:
         return at
     out.share[:] = symbols
     known = np.flatnonzero(symbols)
     some = states[known]
-    at = pop(tables, CODE_BYTES + 1, some, symbols, window, at, size)
+    at = pop(columns, CELLS, some, symbols, window, at, size)
     if at < 0:
         return at
     for k in range(len(known)):
         n = known[k]
         # All steps within a cell are equally likely: as many bits come as leave the state.
-        bits: Any = tables.fine[out.share[n]]
+        bits: Any = fine[out.share[n]]
         if at + bits > 8 * (len(window) - 1):
             return -1
         rest = TOTAL_BITS - bits
@@ -231,7 +198,7 @@ def pop_depths(tables: Alphabets, out: Numbers, states: Ints, window: Ints, at: 
 
 
 @compiled_form_of(read_in_numpy)
-def read_landmarks(data: Row, layout: LandmarkHead, tables: Alphabets, out: Numbers) -> int:
+def read_landmarks(data: Row, layout: LandmarkHead, columns: Columns, fine: Ints, out: Numbers) -> int:
     """Read landmarks in one pass; returns the number of the reason why they are refused, else 0."""
     at, length, count, size = 0, 8 * len(data), layout.landmarks, layout.size
     if layout.steps >= 0 and count:
@@ -255,12 +222,12 @@ def read_landmarks(data: Row, layout: LandmarkHead, tables: Alphabets, out: Numb
         at += size
     symbols = np.empty((CODE_BYTES, count), np.uint8)
     for k in range(CODE_BYTES):
-        at = pop(tables, k, states, symbols[k], window, at, size)
+        at = pop(columns, k, states, symbols[k], window, at, size)
         if at < 0:
             return 1
     out.codes[:] = symbols.T
     if layout.with_depths:
-        at = pop_depths(tables, out, states, window, at, size)
+        at = pop_depths(columns, fine, out, states, window, at, size)
         if at < 0:
             return 1
     if length - at >= 8 or bits_at(window, at, length - at):
@@ -283,6 +250,6 @@ def read(data: bytes, layout: LandmarkHead) -> Numbers:
     out = Numbers.zeros(layout.landmarks)
     # Writable, as the compiled form wants it.
     row = np.frombuffer(bytearray(data), np.uint8)
-    if reason := REASONS[read_landmarks(row, layout, alphabets(), out)]:
+    if reason := REASONS[read_landmarks(row, layout, landmark_columns(), FINE_BITS, out)]:
         raise InvalidMessage(reason.format(layout.landmarks))
     return out

@@ -9,9 +9,7 @@ hold m bits of something else. All lanes move together: a column is a few operat
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
 from typing import Annotated, NamedTuple
 
 import numpy as np
@@ -36,63 +34,39 @@ def log2(numbers: Ints) -> Ints:
     return np.frexp(numbers)[1].astype(np.int64) - 1
 
 
-@dataclass(frozen=True, eq=False)
-class Column:
-    """Frequencies of one column's symbols.
-
-    Attributes:
-        frequencies: (S,) int64, with sum 2^12.
-    """
-
-    frequencies: Ints
-
-    @cached_property
-    def starts(self) -> Ints:
-        """(S,) sum of the frequencies before each symbol."""
-        return np.cumsum(self.frequencies) - self.frequencies
-
-    @cached_property
-    def symbols(self) -> Ints:
-        """(4096,) symbol of each slot."""
-        return np.repeat(np.arange(len(self.frequencies)), self.frequencies)
-
-    @cached_property
-    def widths(self) -> Ints:
-        """(4096,) frequency of each slot's symbol."""
-        return self.frequencies[self.symbols]
-
-    @cached_property
-    def places(self) -> Ints:
-        """(4096,) number of each slot among those of its symbol."""
-        return np.arange(TOTAL) - self.starts[self.symbols]
-
-
 class Columns(NamedTuple):
-    """Columns that are read one after the other, by the slot of a state; see Column.
+    """Columns of symbols that are read, or written, one after the other.
 
-    They are small, because all of them are needed for each landmark.
+    What depends on the symbol alone is kept by symbol: so all of it stays in the processor's first cache.
 
     Attributes:
-        symbols: (K, 4096).
-        widths: (K, 4096).
-        places: (K, 4096).
-        missing: (K, 4096) bits that a state lacks at least after a symbol has been taken out of it.
+        symbols: (K, 4096) of each slot.
+        frequencies: (K, S) of each symbol, with sum 2^12.
+        starts: (K, S) sum of the frequencies before each symbol.
+        missing: (K, S) bits that a state lacks at least after the symbol has been taken out of it.
     """
 
-    symbols: Small
-    widths: Small
-    places: Small
+    symbols: Bytes
+    frequencies: Small
+    starts: Small
     missing: Small
 
     @staticmethod
-    def of(columns: Sequence[Column]) -> Columns:
-        """Some columns, in the order of reading."""
-        symbols, widths, places = (
-            np.stack([getattr(column, name) for column in columns]).astype(np.uint16)
-            for name in ("symbols", "widths", "places")
+    def of(frequencies: Table) -> Columns:
+        """Columns of (K, S) frequencies, in the order of reading."""
+        names = np.arange(frequencies.shape[1])
+        missing = TOTAL_BITS - 1 - log2(np.maximum(frequencies, 1))
+        return Columns(
+            np.stack([np.repeat(names, of) for of in frequencies]).astype(np.uint8),
+            frequencies.astype(np.uint16),
+            (np.cumsum(frequencies, axis=1) - frequencies).astype(np.uint16),
+            np.maximum(missing, 0).astype(np.uint16),
         )
-        missing = np.maximum(TOTAL_BITS - 1 - log2(widths.astype(np.int64)), 0)
-        return Columns(symbols, widths, places, missing.astype(np.uint16))
+
+    def part(self, first: int, last: int) -> Columns:
+        """Those from first to last, that one left out."""
+        some = slice(first, last)
+        return Columns(self.symbols[some], self.frequencies[some], self.starts[some], self.missing[some])
 
 
 def pop_columns(
@@ -116,8 +90,9 @@ def pop_columns(
     for k in range(len(symbols)):
         slots = states & (TOTAL - 1)
         symbols[k] = columns.symbols[k][slots]
-        left = columns.widths[k][slots] * (states >> TOTAL_BITS) + columns.places[k][slots]
-        bits = columns.missing[k][slots].astype(np.int64)
+        left = columns.frequencies[k][symbols[k]] * (states >> TOTAL_BITS)
+        left += slots - columns.starts[k][symbols[k]]
+        bits = columns.missing[k][symbols[k]].astype(np.int64)
         bits += (left << bits) < full
         ends = np.cumsum(bits) + at
         if len(ends):
@@ -129,30 +104,9 @@ def pop_columns(
     return at
 
 
-class Frequencies(NamedTuple):
-    """Columns that are written one after the other, by symbol; see Column.
-
-    Attributes:
-        frequencies: (K, S).
-        starts: (K, S).
-        most_out: (K, S) bits that leave a state at most before a symbol is pushed to it.
-    """
-
-    frequencies: Table
-    starts: Table
-    most_out: Table
-
-    @staticmethod
-    def of(columns: Sequence[Column]) -> Frequencies:
-        """Some columns of equally many symbols, in the order of reading."""
-        frequencies = np.stack([column.frequencies for column in columns])
-        starts = np.stack([column.starts for column in columns])
-        return Frequencies(frequencies, starts, TOTAL_BITS - log2(np.maximum(frequencies, 1)))
-
-
 @compiled
 def push_columns(
-    columns: Frequencies, size: int, symbols: Bytes, states: Ints, numbers: Table, widths: Table
+    columns: Columns, size: int, symbols: Bytes, states: Ints, numbers: Table, widths: Table
 ) -> None:
     """Push one symbol to each lane for each of K columns, the last column first: `pop_columns` undone.
 
@@ -165,8 +119,8 @@ def push_columns(
         widths: (K, N) is filled: how many bits.
     """
     for k in range(len(symbols) - 1, -1, -1):
-        frequencies = columns.frequencies[k][symbols[k]]
-        out = columns.most_out[k][symbols[k]]
+        frequencies = columns.frequencies[k][symbols[k]].astype(np.int64)
+        out = columns.missing[k][symbols[k]].astype(np.int64) + 1
         out -= (states >> out) < (frequencies << (size - TOTAL_BITS))
         numbers[k] = states & ((1 << out) - 1)
         widths[k] = out
@@ -188,7 +142,7 @@ class LaneWriter:
     size: int
     _bits: list[tuple[Ints, Ints]] = field(default_factory=list)
 
-    def push(self, symbols: Bytes, columns: Frequencies, lanes: Lanes = EVERY) -> None:
+    def push(self, symbols: Bytes, columns: Columns, lanes: Lanes = EVERY) -> None:
         """(K, N) one symbol of each lane for each of K columns; none may be of frequency 0."""
         states = self.states[lanes]
         numbers, widths = np.empty(symbols.shape, np.int64), np.empty(symbols.shape, np.int64)

@@ -9,9 +9,7 @@ from mapweave.hybridmap.errors import InvalidMessage
 from mapweave.wire.rans import (
     TOTAL,
     BitReader,
-    Column,
     Columns,
-    Frequencies,
     Ints,
     LaneReader,
     LaneWriter,
@@ -24,22 +22,22 @@ __all__ = ["form"]
 pytestmark = pytest.mark.usefixtures("form")
 
 
-def some_column(random: np.random.Generator, symbols: int) -> Column:
+def some_column(random: np.random.Generator, symbols: int) -> Ints:
     """Frequencies that sum to 2^12, some of them 1."""
     cuts = np.sort(random.choice(np.arange(1, TOTAL), symbols - 1, replace=False))
-    return Column(np.diff(np.concatenate([[0], cuts, [TOTAL]])))
+    return np.diff(np.concatenate([[0], cuts, [TOTAL]]))
 
 
-def push(writer: LaneWriter, symbols: Ints, column: Column) -> None:
+def push(writer: LaneWriter, symbols: Ints, column: Ints) -> None:
     """One column."""
-    writer.push(symbols.astype(np.uint8)[None], Frequencies.of([column]))
+    writer.push(symbols.astype(np.uint8)[None], Columns.of(column[None]))
 
 
 @given(st.integers(0, 2**32 - 1), st.integers(0, 30), st.integers(1, 12), st.integers(12, 18))
 def test_pushed_symbols_come_back(seed: int, lanes: int, steps: int, size: int):
     random = np.random.default_rng(seed)
     columns = [some_column(random, int(random.integers(1, 60))) for _ in range(steps)]
-    symbols = [random.integers(0, len(c.frequencies), lanes) for c in columns]
+    symbols = [random.integers(0, len(c), lanes) for c in columns]
     seeds = random.integers(0, 1 << size, lanes)
     some = np.flatnonzero(random.random(lanes) < 0.5)
     widths = random.integers(0, 13, len(some))
@@ -52,7 +50,7 @@ def test_pushed_symbols_come_back(seed: int, lanes: int, steps: int, size: int):
     bits = BitReader(data)
     reader = LaneReader(bits, lanes, size)
     for column, row in zip(columns, symbols, strict=True):
-        assert np.array_equal(reader.pop(Columns.of([column]))[0], row)
+        assert np.array_equal(reader.pop(Columns.of(column[None]))[0], row)
     assert np.array_equal(reader.pop_plain(widths, some), plain)
     assert np.array_equal(reader.states - (1 << size), seeds)
     bits.end()
@@ -70,25 +68,25 @@ def test_many_columns_at_once_equal_one_by_one(seed: int):
     for column, row in zip(columns[::-1], symbols[::-1], strict=True):
         push(writer, row, column)
     data = pack_bits(*writer.finish())
-    at_once.push(np.array(symbols, np.uint8).reshape(9, lanes), Frequencies.of(columns))
+    at_once.push(np.array(symbols, np.uint8).reshape(9, lanes), Columns.of(np.array(columns)))
     assert pack_bits(*at_once.finish()) == data
     bits, other = BitReader(data), BitReader(data)
     reader, plain = LaneReader(bits, lanes, size), LaneReader(other, lanes, size)
-    result = reader.pop(Columns.of(columns))
-    assert np.array_equal(result, np.concatenate([plain.pop(Columns.of([column])) for column in columns]))
+    result = reader.pop(Columns.of(np.array(columns)))
+    assert np.array_equal(result, np.concatenate([plain.pop(Columns.of(column[None])) for column in columns]))
     assert np.array_equal(result, np.array(symbols).reshape(9, lanes))
     assert np.array_equal(reader.states, plain.states) and bits.at == other.at
     if lanes > 10:
         short = BitReader(data[: -(-lanes * size // 8) + 1])
         with pytest.raises(InvalidMessage, match="cut off"):
-            LaneReader(short, lanes, size).pop(Columns.of(columns))
+            LaneReader(short, lanes, size).pop(Columns.of(np.array(columns)))
 
 
 def test_a_symbol_costs_its_entropy():
     random = np.random.default_rng(1)
     shares = np.array([0.7, 0.15, 0.1, 0.04, 0.01])
-    column = Column(np.array([2867, 614, 410, 164, 41]))
-    assert column.frequencies.sum() == TOTAL
+    column = np.array([2867, 614, 410, 164, 41])
+    assert column.sum() == TOTAL
     entropy = -(shares * np.log2(shares)).sum()
     lanes, steps = 100, 200
     writer = LaneWriter(np.full(lanes, 1 << 15), 15)
@@ -111,11 +109,11 @@ def test_one_rans_lane_in_plain_python():
     for symbol in symbols:
         slot = state % TOTAL
         begin, count = 0, 0
-        while begin + column.frequencies[count] <= slot:
-            begin += column.frequencies[count]
+        while begin + column[count] <= slot:
+            begin += column[count]
             count += 1
         assert count == symbol
-        state = int(column.frequencies[count]) * (state // TOTAL) + slot - int(begin)
+        state = int(column[count]) * (state // TOTAL) + slot - int(begin)
         while state < 1 << size:
             state, text = 2 * state + int(text[0]), text[1:]
     assert state == (1 << size) + 77
