@@ -27,16 +27,21 @@ def command_line(
         description=about if whole else (about or "").splitlines()[0],
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
-    parser.add_argument("--seed", type=_seed, default=0, help=f"{seed} (default 0)")
+    parser.add_argument("--seed", type=at_least(0), default=0, help=f"{seed} (default 0)")
     parser.add_argument("--json", action="store_true", help="last line of output: one JSON object")
     return parser
 
 
-def _seed(word: str) -> int:
-    seed = int(word)
-    if seed < 0:
-        raise argparse.ArgumentTypeError(f"{seed}: give 0 or more")
-    return seed
+def at_least(least: int) -> Callable[[str], int]:
+    """The type of an argument that is a whole number, and at least so much."""
+
+    def number(word: str) -> int:
+        value = int(word)
+        if value < least:
+            raise argparse.ArgumentTypeError(f"{value}: give at least {least}")
+        return value
+
+    return number
 
 
 @contextmanager

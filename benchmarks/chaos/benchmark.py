@@ -51,7 +51,7 @@ from benchmarks.chaos.questions import LostRobot
 from benchmarks.chaos.recovery import RobotTimes, recoveries
 from benchmarks.chaos.schedule import KILLS, LINKS, Disturbance, Kind, draw_schedule
 from benchmarks.chaos.scripted_robot import ScriptedRobot
-from benchmarks.command_line import command_line, figure_table
+from benchmarks.command_line import at_least, command_line, figure_table
 from mapweave.agent.replication.journal import Journal
 from mapweave.mapserver.log.opening import open_store
 from mapweave.scenarios.children import ChildFailed
@@ -267,7 +267,7 @@ def good(report: dict[str, Any]) -> bool:
 def main() -> None:
     """Run once, print, and exit with 1 if anything is lost or stays unacknowledged."""
     parser = command_line("chaos", __doc__)
-    parser.add_argument("--agents", type=int, default=5)
+    parser.add_argument("--agents", type=at_least(1), default=5)
     parser.add_argument("--seconds", type=float, default=60.0, help="of mapping and disturbances")
     parser.add_argument(
         "--store", nargs="+", default=[SQLITE] if binaries() is None else [SQLITE, POSTGRESQL],
@@ -276,8 +276,8 @@ def main() -> None:
     )  # fmt: skip
     parser.add_argument("--keep", type=Path, metavar="FOLDER", help="keep journals, stores and logs here")
     options = parser.parse_args()
-    if options.agents < 1 or options.seconds < LEAST_SECONDS:
-        parser.error(f"--agents must be positive, --seconds at least {LEAST_SECONDS:g}")
+    if options.seconds < LEAST_SECONDS:
+        parser.error(f"--seconds must be at least {LEAST_SECONDS:g}")
     columns = (TextColumn("{task.description}"), BarColumn(), TimeElapsedColumn())
     with (
         tempfile.TemporaryDirectory() as place,

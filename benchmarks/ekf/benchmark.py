@@ -23,7 +23,7 @@ from rich.console import Console
 from rich.progress import track
 from scipy.special import chdtri
 
-from benchmarks.command_line import command_line, figure_table
+from benchmarks.command_line import at_least, command_line, figure_table
 from benchmarks.ekf_speed.benchmark import measure, one_thread
 from mapweave.agent.ekf.mapping_state import PRIOR_DEPTH, PRIOR_SPREAD
 from synthetic.localization_run import FEW, Start, SurveyedNode, try_drives, try_start
@@ -115,11 +115,9 @@ def _by_drive(figures: list[list[float]]) -> list[float]:
 def main() -> None:
     """Run and print."""
     parser = command_line("ekf", __doc__)
-    parser.add_argument("--runs", type=int, default=100, help="mapping runs (default 100)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
+    parser.add_argument("--runs", type=at_least(1), default=100, help="mapping runs (default 100)")
+    parser.add_argument("--jobs", type=at_least(1), default=1, help="processes")
     arguments = parser.parse_args()
-    if min(arguments.runs, arguments.jobs) < 1:
-        parser.error("--runs and --jobs must be at least 1")
     console = Console(stderr=arguments.json)
     one_thread()
     with console.status("timing ..."):

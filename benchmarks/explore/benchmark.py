@@ -29,12 +29,11 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import at_least, command_line, failing_in_one_line
 from benchmarks.explore.area import Look, MappedFloor, mapped_floor
 from benchmarks.explore.start import office
 from mapweave.agent.settings import AgentSettings, ExplorerSettings
 from mapweave.evaluation.map_score import score_map
-from mapweave.hybridmap.errors import MapweaveError
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import EdgeKind
@@ -207,19 +206,17 @@ def _short(value: float | None, digits: int) -> str:
 def main() -> None:
     """Run and print."""
     parser = command_line("explore", __doc__, whole=True)
-    parser.add_argument("--robots", type=int, nargs="+", default=[1, 2, 3], help="how many; 1 to 16")
+    parser.add_argument("--robots", type=at_least(1), nargs="+", default=[1, 2, 3], help="how many; 1 to 16")
     parser.add_argument("--minutes", type=float, default=5.0, help="simulated (default: 5)")
     parser.add_argument("--rooms", type=int, default=6, help="of the office, 3 to 12 (default: 6)")
     parser.add_argument("--spread", action="store_true", help="each robot begins in a room of its own")
     arguments = parser.parse_args()
-    if arguments.minutes <= 0.0 or min(arguments.robots) < 1:
-        parser.error("--minutes and --robots must be positive")
+    if not arguments.minutes > 0.0:
+        parser.error("--minutes must be positive")
     cv2.setNumThreads(1)
     robots, minutes, seed = arguments.robots, arguments.minutes, arguments.seed
-    try:
+    with failing_in_one_line("explore"):
         done = measure(robots, arguments.rooms, minutes, seed, arguments.spread, arguments.json)
-    except MapweaveError as error:
-        parser.error(str(error))
     result = figures(done, minutes, seed)
     if arguments.json:
         print(json.dumps(result))

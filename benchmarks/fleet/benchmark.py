@@ -48,7 +48,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import at_least, command_line
 from benchmarks.fleet import floor_process
 from benchmarks.fleet.agents_process import FLEET, INTERVAL, PATIENCE, Orders, first_stops
 from benchmarks.fleet.disturbance import KINDS, THAW_BEFORE, Freeze
@@ -364,13 +364,15 @@ def measure_floor(folder: Path, questions: int = 300) -> Figures:
 def main() -> None:
     """Measure, print, and exit with 1 if that is not good."""
     parser = command_line("fleet", __doc__)
-    parser.add_argument("--agents", type=int, nargs="+", default=[10, 50, 200, 1000], help="fleets")
+    parser.add_argument("--agents", type=at_least(1), nargs="+", default=[10, 50, 200, 1000], help="fleets")
     parser.add_argument("--seconds", type=float, default=20.0, help="of mapping")
-    parser.add_argument("--burst", type=int, default=1000, help="changes within a second, behind that")
+    parser.add_argument(
+        "--burst", type=at_least(0), default=1000, help="changes within a second, behind that"
+    )
     parser.add_argument("--disturb", action="store_true", help="with a slow, a frozen and a flooding agent")
     options = parser.parse_args()
-    if min(options.agents) < 1 or options.seconds < INTERVAL or options.burst < 0:
-        parser.error(f"--agents must be positive, --seconds at least {INTERVAL:g}, --burst not negative")
+    if options.seconds < INTERVAL:
+        parser.error(f"--seconds must be at least {INTERVAL:g}")
     rows: dict[str, Figures] = {}
     report: dict[str, Any] = {
         "seed": options.seed, "disturbed": options.disturb, "cores": os.cpu_count(),

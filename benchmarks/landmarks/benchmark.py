@@ -19,7 +19,6 @@ pose right within 0.25 m and 5 degrees, over what the node may cost (`--places 0
 import argparse
 import json
 import os
-import sys
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -34,7 +33,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import at_least, command_line, failing_in_one_line
 from benchmarks.landmarks.curve import LABELS, recall_curve
 from benchmarks.landmarks.pairs import Pair, folder_pairs, known_pairs
 from benchmarks.landmarks.rivals import MOST, Packed, features, keep_all, matched, pack
@@ -187,18 +186,15 @@ def main() -> None:
     """Run and print."""
     parser = command_line("landmarks", __doc__, "changes pairs and places", whole=True)
     parser.add_argument("--images", type=Path, metavar="DIR", help="photographs of one scene")
-    parser.add_argument("--pairs", type=int, default=60, help="of views, at most (default 60)")
-    parser.add_argument("--places", type=int, default=40, help="simulated, for the recall (default 40)")
+    parser.add_argument("--pairs", type=at_least(2), default=60, help="of views, at most (default 60)")
+    parser.add_argument(
+        "--places", type=at_least(0), default=40, help="simulated, for the recall (default 40)"
+    )
     arguments = parser.parse_args()
-    if arguments.pairs < 2 or arguments.places < 0:
-        parser.error("at least 2 pairs, 0 places and seed 0 are needed")
     cv2.setNumThreads(1)
     console = Console(stderr=arguments.json)
-    try:
+    with failing_in_one_line("landmarks"):
         result = run(arguments, console)
-    except InvalidFile as error:
-        print(f"landmarks: {error}", file=sys.stderr)
-        raise SystemExit(2) from None
     show(result, console)
     if arguments.json:
         print(json.dumps(result))

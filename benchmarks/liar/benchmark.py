@@ -34,7 +34,7 @@ from typing import Any
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import at_least, command_line
 from benchmarks.liar.margins import MARGINS
 from benchmarks.liar.recovery import RecoveryOutcome, RecoveryTrial, recovery_row
 from benchmarks.rules.switches import ALL, Switch, switched_off
@@ -151,16 +151,14 @@ def _without(seed: int, queries: int, ways: Sequence[str], rule: str) -> dict[st
 def main() -> None:
     """Run and print."""
     parser = command_line("liar", __doc__, "of the fleet")
-    parser.add_argument("--queries", type=int, default=12, help="of lost robots (default 12)")
+    parser.add_argument("--queries", type=at_least(1), default=12, help="of lost robots (default 12)")
     parser.add_argument("--ways", nargs="+", default=list(EVERY), choices=list(EVERY), metavar="NAME")
     parser.add_argument("--without", choices=list(RULES), metavar="RULE", help="switch a rule off: see RULES")
     parser.add_argument("--rules", action="store_true", help="all rules, and without each of them")
     parser.add_argument("--margins", action="store_true", help="the ways that one rule alone contains")
     parser.add_argument("--recovery", action="store_true", help="what is left once a person has retired it")
-    parser.add_argument("--jobs", type=int, default=1, help="processes, with --rules (default 1)")
+    parser.add_argument("--jobs", type=at_least(1), default=1, help="processes, with --rules (default 1)")
     arguments = parser.parse_args()
-    if min(arguments.queries, arguments.jobs) < 1:
-        parser.error("--queries and --jobs must be at least 1")
     if arguments.rules and arguments.without:
         parser.error("--rules switches each rule off: leave out --without")
     if arguments.margins and (arguments.rules or arguments.without):

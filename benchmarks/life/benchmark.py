@@ -38,7 +38,7 @@ from rich.console import Console
 from rich.progress import track
 from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import at_least, command_line
 from benchmarks.life.house import TwoRooms
 from benchmarks.process_usage import held_bytes
 from mapweave.agent.replication.journal import Journal
@@ -106,14 +106,16 @@ class MapAfterDrive:
 def main() -> None:
     """Drive, count, ask, print."""
     parser = command_line("life", __doc__, "of rooms, stops and noise")
-    parser.add_argument("--drives", type=int, default=10, help="through the same rooms (default 10)")
-    parser.add_argument("--stops", type=int, default=5, help="in a room on every drive (default 5)")
+    parser.add_argument("--drives", type=at_least(1), default=10, help="through the same rooms (default 10)")
+    parser.add_argument("--stops", type=at_least(1), default=5, help="in a room on every drive (default 5)")
     parser.add_argument("--moved", type=float, default=0.0, help="share of landmarks moved after each drive")
-    parser.add_argument("--queries", type=int, default=200, help="views that are asked about (default 200)")
+    parser.add_argument(
+        "--queries", type=at_least(1), default=200, help="views that are asked about (default 200)"
+    )
     parser.add_argument("--keep-days", type=float, default=14.0, help="superseded nodes are kept")
     a = parser.parse_args()
-    if a.drives < 1 or a.stops < 1 or a.queries < 1 or not 0.0 <= a.moved <= 1.0:
-        parser.error("at least one drive, stop and query; a share of 0 to 1")
+    if not 0.0 <= a.moved <= 1.0:
+        parser.error("--moved is a share of 0 to 1")
     console = Console(stderr=a.json)
     figures, drives = run(a.drives, a.seed, a.stops, a.moved, a.queries, a.keep_days, console)
     columns = "drive", "nodes", "superseded", "pruned", "components", "ms a new node", "last merge s"

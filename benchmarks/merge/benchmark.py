@@ -41,7 +41,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.command_line import command_line, failing_in_one_line
+from benchmarks.command_line import at_least, command_line, failing_in_one_line
 from benchmarks.merge.robots import kept_links
 from benchmarks.merge.scale import scale
 from mapweave.formats.g2o import G2oGraph, read_g2o
@@ -68,8 +68,6 @@ def main() -> None:
     arguments = _arguments()
     console = Console(stderr=arguments.json)
     with failing_in_one_line("merge"):
-        if arguments.runs < 1 or arguments.split < 2:
-            raise InvalidValue("--runs is at least 1, --split at least 2")
         if arguments.scale is not None and (arguments.g2o or arguments.robots):
             raise InvalidValue("--scale runs by itself: leave out --g2o and --robots")
         if arguments.scale is not None:
@@ -197,11 +195,13 @@ def _table(figure: str, found: dict[str, Figures], of_what: str = "") -> Table:
 
 def _arguments() -> argparse.Namespace:
     parser = command_line("merge", __doc__, "of the fleets")
-    parser.add_argument("--runs", type=int, default=5, help="fleets of each share (default 5)")
+    parser.add_argument("--runs", type=at_least(1), default=5, help="fleets of each share (default 5)")
     parser.add_argument(
         "--g2o", type=Path, nargs="*", default=[], help="planar pose graphs to split and merge"
     )
-    parser.add_argument("--split", type=int, default=4, help="robots among which they are split (default 4)")
+    parser.add_argument(
+        "--split", type=at_least(2), default=4, help="robots among which they are split (default 4)"
+    )
     parser.add_argument("--robots", type=Path, nargs="*", default=[], help="folders of one g2o file a robot")
     parser.add_argument(
         "--scale",

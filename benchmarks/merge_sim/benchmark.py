@@ -40,7 +40,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from benchmarks.command_line import command_line, figure_table
+from benchmarks.command_line import at_least, command_line, figure_table
 from benchmarks.merge_sim.run import MergeRun
 
 SCENARIOS: dict[str, tuple[str, ...]] = {
@@ -229,12 +229,14 @@ def _median(values: Sequence[float]) -> float | None:
 def _arguments() -> argparse.Namespace:
     parser = command_line("merge_sim", __doc__, "run k has the seed 1000 * SEED + k", whole=True)
     parser.add_argument("--runs", type=int, default=10, help="of each scenario (default 10)")
-    parser.add_argument("--workers", type=int, default=2, help="runs at a time, some 500 MB each (default 2)")
+    parser.add_argument(
+        "--workers", type=at_least(1), default=2, help="runs at a time, some 500 MB each (default 2)"
+    )
     parser.add_argument(
         "--scenarios", nargs="+", choices=list(SCENARIOS), default=list(SCENARIOS), help="(default: all)"
     )
     arguments = parser.parse_args()
-    if not 1 <= arguments.runs <= SEEDS_APART or arguments.workers < 1:
-        parser.error(f"--runs is 1 to {SEEDS_APART}, --workers at least 1")
+    if not 1 <= arguments.runs <= SEEDS_APART:
+        parser.error(f"--runs is 1 to {SEEDS_APART}")
     arguments.scenarios = list(dict.fromkeys(arguments.scenarios))
     return arguments

@@ -28,7 +28,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
 from rich.table import Table
 
-from benchmarks.command_line import command_line, failing_in_one_line, figure_table
+from benchmarks.command_line import at_least, command_line, failing_in_one_line, figure_table
 from benchmarks.navigate.drives import NavigationOutcome, drive
 from benchmarks.navigate.floor import FreeFloor
 from benchmarks.navigate.map import Figures, map_figures
@@ -90,7 +90,7 @@ def summary(outcomes: Sequence[NavigationOutcome]) -> Figures:
 def _arguments() -> argparse.Namespace:
     parser = command_line("navigate", __doc__, "of office, robot, starts and goals")
     parser.add_argument("--out", type=Path, default=Path("out/navigate"), help="folder of map and pictures")
-    parser.add_argument("--runs", type=int, default=20, help="drives (default 20)")
+    parser.add_argument("--runs", type=at_least(1), default=20, help="drives (default 20)")
     parser.add_argument("--rooms", type=int, default=2, help="of the office (default 2)")
     parser.add_argument(
         "--map-time", type=float, default=420.0, help="exploration ends after this, simulated s (default 420)"
@@ -101,8 +101,6 @@ def _arguments() -> argparse.Namespace:
 def _run(
     arguments: argparse.Namespace, console: Console
 ) -> tuple[list[NavigationOutcome], Mapped, BuildingPlan, Figures]:
-    if arguments.runs < 1:
-        raise InvalidValue(f"--runs {arguments.runs}: at least one drive")
     folder = arguments.out / f"map-{arguments.seed}-{arguments.rooms}-{arguments.map_time:g}"
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.fields[doing]}"))
     with Progress(*columns, TimeElapsedColumn(), console=console) as progress:

@@ -27,11 +27,10 @@ from rich.markup import escape
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import at_least, command_line, failing_in_one_line
 from benchmarks.parking.figures import draw_figures
 from benchmarks.parking.run import ParkingOutcome, park
 from benchmarks.parking.scene import ParkingScene
-from mapweave.hybridmap.errors import MapweaveError
 
 DEALT = 0x57A7
 """Separates the draws of starts from those of scenes."""
@@ -144,31 +143,22 @@ def run(
 
 
 def main() -> None:
-    """Run and print.
-
-    Raises:
-        SystemExit: an option that cannot be.
-    """
+    """Run and print."""
     parser = command_line("parking", __doc__)
-    parser.add_argument("--starts", type=int, default=20, help="starts with a path (default 20)")
-    parser.add_argument("--goals", type=int, default=5, help="goals, each in another arena (default 5)")
+    parser.add_argument("--starts", type=at_least(1), default=20, help="starts with a path (default 20)")
+    parser.add_argument(
+        "--goals", type=at_least(1), default=5, help="goals, each in another arena (default 5)"
+    )
     parser.add_argument("--one-view", action="store_true", help="map the goal's view alone")
     parser.add_argument("--out", type=Path, help="folder for the pictures; it is made")
     arguments = parser.parse_args()
-    if arguments.starts < 1 or arguments.goals < 1:
-        parser.error("--starts and --goals must be at least 1")
-    if arguments.out is not None:
-        try:
-            arguments.out.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            parser.error(f"--out {arguments.out}: {error.strerror}; name a folder that can be made")
     console = Console(stderr=arguments.json)
-    try:
+    with failing_in_one_line("parking"):
+        if arguments.out is not None:
+            arguments.out.mkdir(parents=True, exist_ok=True)
         figures = run(
             arguments.seed, arguments.starts, min(arguments.goals, arguments.starts), arguments.one_view,
             arguments.out, console,
         )  # fmt: skip
-    except MapweaveError as error:
-        parser.error(str(error))
     if arguments.json:
         print(json.dumps({key: None if math.isnan(v) else v for key, v in figures.items()}))

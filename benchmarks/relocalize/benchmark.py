@@ -34,7 +34,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import at_least, command_line
 from benchmarks.process_usage import held_bytes
 from benchmarks.relocalize.fleet import Bench
 from benchmarks.relocalize.peer import WordIndex
@@ -131,14 +131,12 @@ def main() -> None:
     """Run and print."""
     parser = command_line("relocalize", __doc__, whole=True)
     parser.add_argument(
-        "--nodes", type=int, nargs="+", default=[1000, 10_000], help="sizes of the fleet's map"
+        "--nodes", type=at_least(REAL), nargs="+", default=[1000, 10_000], help="sizes of the fleet's map"
     )
-    parser.add_argument("--queries", type=int, default=200, help="of each kind (default 200)")
+    parser.add_argument("--queries", type=at_least(4), default=200, help="of each kind (default 200)")
     parser.add_argument("--ceilings", nargs="*", default=["near"], choices=list(KINDS), help="kinds of views")
     parser.add_argument("--no-peer", action="store_true", help="without the bag of words")
     arguments = parser.parse_args()
-    if min(arguments.nodes) < REAL or arguments.queries < 4:
-        parser.error(f"at least {REAL} nodes and 4 queries are needed")
     console = Console(stderr=arguments.json)
     sizes, real = sorted(set(arguments.nodes)), min(REAL, min(arguments.nodes))
     with Progress(console=console) as bar:

@@ -23,7 +23,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.command_line import command_line, figure_table
+from benchmarks.command_line import at_least, command_line, figure_table
 from benchmarks.process_usage import peak_mb, used_by
 from benchmarks.relocalize.distractors import gather
 from benchmarks.relocalize.places import TruePlace, mapped, mapped_sites
@@ -111,11 +111,9 @@ def _ask(bus: ZenohBus, query: Query) -> RelocalizeAnswer | None:
 def main() -> None:
     """Run and print."""
     parser = command_line("relocalize_start", __doc__)
-    parser.add_argument("--nodes", type=int, default=10_000, help="in the store (default 10000)")
+    parser.add_argument("--nodes", type=at_least(REAL), default=10_000, help="in the store (default 10000)")
     parser.add_argument("--store", type=Path, help="folder for the store, which is kept there and used again")
     arguments = parser.parse_args()
-    if arguments.nodes < REAL:
-        parser.error(f"at least {REAL} nodes are needed")
     console, seed = Console(stderr=arguments.json), arguments.seed
     found: dict[str, Any] = {}
     with tempfile.TemporaryDirectory(prefix="mapweave-start") as temporary, Progress(console=console) as bar:

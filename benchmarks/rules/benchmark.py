@@ -34,7 +34,7 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.command_line import command_line, failing_in_one_line
+from benchmarks.command_line import at_least, command_line, failing_in_one_line
 from benchmarks.merge_sim.benchmark import SCENARIOS, SEEDS_APART
 from benchmarks.relocalize.fleet import Bench
 from benchmarks.relocalize.score import figures, wrong_by_kind
@@ -79,22 +79,23 @@ def places(seed: int, count: int, progress: Progress) -> dict[str, dict[str, Any
 def main() -> None:
     """Measure and print."""
     parser = command_line("rules", __doc__)
-    parser.add_argument("--fleets", type=int, default=0, metavar="N", help="of each share of false links")
-    parser.add_argument("--twins", type=int, default=0, metavar="N", help="pairs of robots")
-    parser.add_argument("--singles", type=int, default=0, metavar="N", help="pairs of robots with one link")
+    parser.add_argument(
+        "--fleets", type=at_least(0), default=0, metavar="N", help="of each share of false links"
+    )
+    parser.add_argument("--twins", type=at_least(0), default=0, metavar="N", help="pairs of robots")
+    parser.add_argument(
+        "--singles", type=at_least(0), default=0, metavar="N", help="pairs of robots with one link"
+    )
     parser.add_argument("--g2o", type=Path, nargs="*", default=[], metavar="FILE", help="planar pose graphs")
     parser.add_argument("--trials", nargs="+", default=[], choices=list(SCENARIOS), metavar="SCENARIO")
-    parser.add_argument("--runs", type=int, default=1, help="of each scenario (default 1)")
-    parser.add_argument("--places", type=int, default=0, metavar="N", help="real ones on the map")
+    parser.add_argument("--runs", type=at_least(1), default=1, help="of each scenario (default 1)")
+    parser.add_argument("--places", type=at_least(0), default=0, metavar="N", help="real ones on the map")
     parser.add_argument(
-        "--loops", type=int, default=0, metavar="N", help="robots of each share of false loops"
+        "--loops", type=at_least(0), default=0, metavar="N", help="robots of each share of false loops"
     )
-    parser.add_argument("--pairs", type=int, default=0, metavar="N", help="of nodes, of each kind")
-    parser.add_argument("--drives", type=int, default=0, metavar="N", help="of each fault")
+    parser.add_argument("--pairs", type=at_least(0), default=0, metavar="N", help="of nodes, of each kind")
+    parser.add_argument("--drives", type=at_least(0), default=0, metavar="N", help="of each fault")
     arguments = parser.parse_args()
-    counts = ("fleets", "twins", "singles", "places", "loops", "pairs", "drives")
-    if min(getattr(arguments, name) for name in counts) < 0 or arguments.runs < 1:
-        parser.error("--runs must be at least 1, all other numbers at least 0")
     console = Console(stderr=True)
     found: dict[str, Any] = {"seed": arguments.seed}
     with failing_in_one_line("rules"):

@@ -21,7 +21,7 @@ import numpy as np
 from rich.console import Console
 from rich.progress import track
 
-from benchmarks.command_line import command_line, figure_table
+from benchmarks.command_line import at_least, command_line, figure_table
 from benchmarks.servo.planner import shortest_length
 from benchmarks.servo.rivals import CONTROLLERS
 from benchmarks.servo.world import LEAST_VISIBLE, ROBOT, PoseFilter, Task, Unicycle, draw_task
@@ -119,11 +119,11 @@ def summary(outcomes: list[ServoOutcome]) -> dict[str, float]:
 def main() -> None:
     """Run and print."""
     parser = command_line("servo", __doc__)
-    parser.add_argument("--trials", type=int, default=200, help="starts drawn (default 200)")
-    parser.add_argument("--jobs", type=int, default=1, help="processes; more than cores spoils tick_ms")
+    parser.add_argument("--trials", type=at_least(1), default=200, help="starts drawn (default 200)")
+    parser.add_argument(
+        "--jobs", type=at_least(1), default=1, help="processes; more than cores spoils tick_ms"
+    )
     arguments = parser.parse_args()
-    if min(arguments.trials, arguments.jobs) < 1:
-        parser.error("--trials and --jobs must be at least 1")
     console = Console(stderr=arguments.json)
     with ProcessPoolExecutor(arguments.jobs) as pool:
         results = pool.map(

@@ -12,7 +12,6 @@ promises of the way.
 
 import json
 import os
-import sys
 import tempfile
 from dataclasses import dataclass
 from pathlib import Path
@@ -24,7 +23,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from benchmarks.command_line import command_line
+from benchmarks.command_line import command_line, failing_in_one_line
 from benchmarks.trust.building import MappedBuilding, mapped_office
 from benchmarks.trust.lying_server import LIES, LyingServer
 from mapweave.agent.navigation.answer_trial import LONGEST_ROUTE, MORE_WAY, ROUTES
@@ -32,7 +31,6 @@ from mapweave.agent.observation import Command
 from mapweave.agent.settings import AgentSettings
 from mapweave.agent.synchronization import LockstepWaiting
 from mapweave.fleet import send_order
-from mapweave.hybridmap.errors import InvalidValue, MapweaveError
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.mission_order import MissionKind, MissionOrder
 from mapweave.hybridmap.pose import Pose2
@@ -211,17 +209,14 @@ def main() -> None:
     arguments = parser.parse_args()
     cv2.setNumThreads(1)
     console = Console(stderr=arguments.json, width=180)
-    try:
-        if not arguments.lying > 0.0:
-            raise InvalidValue("a seed of 0 or more, and lies that last longer than 0 s")
+    if not arguments.lying > 0.0:
+        parser.error("--lying must be longer than 0 s")
+    with failing_in_one_line("trust"):
         building = mapped_office(arguments.seed, arguments.rooms)
         outcomes = []
         for name in arguments.lies:
             outcomes.append(drive(building, name, arguments.seed, arguments.lying))
             console.print(outcomes[-1])
-    except MapweaveError as error:
-        print(f"trust: {error}", file=sys.stderr)
-        raise SystemExit(1) from None
     console.print(_table(outcomes, arguments.seed))
     if arguments.json:
         print(json.dumps({"seed": arguments.seed, **summary(outcomes)}))

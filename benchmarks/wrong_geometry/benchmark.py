@@ -15,7 +15,7 @@ from itertools import product
 from rich.console import Console
 from rich.progress import Progress
 
-from benchmarks.command_line import command_line, figure_table
+from benchmarks.command_line import at_least, command_line, figure_table
 from benchmarks.rules.switches import Switch, switched_off
 from mapweave.merge.outlier_rejection.wrong_geometry import WrongGeometrySearch
 from synthetic.wrong_geometry import (
@@ -57,13 +57,15 @@ def main() -> None:
     """Run and print."""
     parser = command_line("wrong_geometry", __doc__, "of the first fleet")
     faults = [str(one) for one in OdometryFault if one is not OdometryFault.NONE]
-    parser.add_argument("--runs", type=int, default=3, help="fleets of each kind and scene (default 3)")
+    parser.add_argument(
+        "--runs", type=at_least(1), default=3, help="fleets of each kind and scene (default 3)"
+    )
     parser.add_argument("--kinds", nargs="+", default=faults, choices=faults)
     parser.add_argument("--scenes", nargs="+", default=["room", "house"], choices=list(SCENES))
-    parser.add_argument("--queries", type=int, default=24, help="of lost robots, each fleet (default 24)")
+    parser.add_argument(
+        "--queries", type=at_least(1), default=24, help="of lost robots, each fleet (default 24)"
+    )
     arguments = parser.parse_args()
-    if min(arguments.runs, arguments.queries) < 1:
-        parser.error("--runs and --queries must be at least 1")
     console = Console(stderr=arguments.json)
     with Progress(console=console) as progress:
         found = measured(

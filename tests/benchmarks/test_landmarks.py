@@ -69,7 +69,7 @@ def test_a_missing_folder_is_reported_in_one_line(content: str, tmp_path, monkey
         cv2.imwrite(str(folder / "b.png"), np.full((240, 320), 128, np.uint8))
     with pytest.raises(SystemExit) as error:
         run(monkeypatch, "--images", str(folder), "--places", "0")
-    assert error.value.code == 2
+    assert error.value.code == 1
     output = capsys.readouterr().err.strip().splitlines()
     assert output[-1].startswith("landmarks: ")
     assert str(folder) in output[-1]
