@@ -14,7 +14,7 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.relocalization.aliased_landmarks import (
     EXPLAINED_PX,
-    AliasedLandmarks,
+    alias,
     same_place,
     unchanged,
     unexplained,
@@ -70,7 +70,7 @@ class AliasCache:
 
     def __init__(self, recognition: RecognitionSettings) -> None:
         """Take when a place counts as recognised."""
-        self._aliased, self._recognition = AliasedLandmarks(recognition), recognition
+        self._recognition = recognition
         self._entries: dict[NodeId, _Entry] = {}
 
     def forget(self) -> None:
@@ -118,17 +118,17 @@ class AliasCache:
         entry = self._entries.get(node.id)
         # What is gone, or is of a map that people have retired, is parted from nothing.
         parted = entry is not None and any(
-            between(alias, node.id) is None and node_of(alias) is not None for alias in entry.same
+            between(other, node.id) is None and node_of(other) is not None for other in entry.same
         )
         if entry is None or parted or not unchanged(entry.node, node):
             entry = self._search(node, index, node_of, between)
         alike = []
-        for alias in list(entry.found.values()):
-            aliased, mapped = node_of(alias.other.id), between(alias.other.id, node.id)
-            if aliased is None or not unchanged(alias.other, aliased):
+        for found in entry.found.values():
+            aliased, mapped = node_of(found.other.id), between(found.other.id, node.id)
+            if aliased is None or not unchanged(found.other, aliased):
                 continue
-            if mapped is None or not same_place(mapped, alias.other_from_node.mean):
-                alike.append(alias)
+            if mapped is None or not same_place(mapped, found.other_from_node.mean):
+                alike.append(found)
         return alike
 
     def _search(
@@ -159,20 +159,20 @@ class AliasCache:
                 if left < s.least_inliers:
                     same.append(candidate_id)
                     continue
-            likeness = self._aliased.compare(candidate, node)
+            likeness = alias(candidate, node, s)
             if likeness is not None:
                 aliases[candidate_id] = AliasedNode(
                     candidate, likeness.node_from_robot, likeness.pairs[:, 1], likeness.pairs[:, 0]
                 )
         entry = _Entry(node, aliases, tuple(same))
         self._entries[node.id] = entry
-        for alias in aliases.values():
-            alias_entry = self._entries.get(alias.other.id)
+        for found in aliases.values():
+            other_entry = self._entries.get(found.other.id)
             if (
-                alias_entry is not None
-                and unchanged(alias_entry.node, alias.other)
-                and node.id not in alias_entry.found
+                other_entry is not None
+                and unchanged(other_entry.node, found.other)
+                and node.id not in other_entry.found
             ):
-                more = {**alias_entry.found, node.id: alias.turned_round(node)}
-                self._entries[alias.other.id] = replace(alias_entry, found=more)
+                more = {**other_entry.found, node.id: found.turned_round(node)}
+                self._entries[found.other.id] = replace(other_entry, found=more)
         return entry

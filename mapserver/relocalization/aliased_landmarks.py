@@ -5,7 +5,6 @@ happen to be landmarks there, or because they leave the pose open. Two nodes com
 best landmarks, with depths.
 """
 
-from collections import OrderedDict
 from dataclasses import replace
 from typing import Any
 
@@ -19,9 +18,6 @@ from mapweave.hybridmap.pose import Pose2, wrap_angle
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.recognition import Recognition, RecognitionSettings, register
 
-REMEMBERED = 20_000
-"""Pairs of nodes whose verdict is kept, the last ones asked about."""
-
 VAGUE: dict[str, Any] = {"least_cells": 2, "most_rival": 1.0}
 """Looser thresholds for an alias: a poster seen from near fills few cells, and its copy in the next room is
 an alias all the same."""
@@ -34,25 +30,15 @@ NEAR_M, NEAR_HEADING = 0.5, 0.35
 other, m and rad."""
 
 
-class AliasedLandmarks:
-    """Tells whether one node is recognised in another; remembered as long as both stay what they are."""
+def alias(a: Node, b: Node, settings: RecognitionSettings) -> Recognition | None:
+    """`a_from_b` and the common landmarks of two nodes that look alike, or None if they do not match.
 
-    def __init__(self, settings: RecognitionSettings) -> None:
-        """Take when a place counts as recognised; a likeness may leave open where exactly it is seen from."""
-        self._settings = replace(settings, **VAGUE)
-        self._kept: OrderedDict[tuple[NodeId, NodeId], tuple[Node, Node, Recognition | None]] = OrderedDict()
-
-    def compare(self, a: Node, b: Node) -> Recognition | None:
-        """`a_from_b` and the common landmarks, or None if they do not match."""
-        key = a.id, b.id
-        cached = self._kept.get(key)
-        if cached is not None and unchanged(cached[0], a) and unchanged(cached[1], b):
-            return cached[2]
-        recognition = register(a, b, self._settings, np.random.default_rng(0))
-        self._kept[key] = a, b, recognition
-        while len(self._kept) > REMEMBERED:
-            self._kept.popitem(last=False)
-        return recognition
+    Args:
+        a: one node.
+        b: another.
+        settings: when a place counts as recognised; an alias may leave open where exactly it is seen from.
+    """
+    return register(a, b, replace(settings, **VAGUE), np.random.default_rng(0))
 
 
 def unchanged(first: Node, second: Node) -> bool:

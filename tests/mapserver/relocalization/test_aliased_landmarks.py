@@ -3,15 +3,14 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
-from mapweave.mapserver.relocalization.aliased_landmarks import AliasedLandmarks, unexplained
+from mapweave.mapserver.relocalization.aliased_landmarks import unexplained
 from mapweave.mapserver.relocalization.place_hypotheses import hidden, is_lonely
-from mapweave.registration.recognition import Recognition, RecognitionSettings, recognise
+from mapweave.registration.recognition import Recognition, recognise
 from synthetic.world import CAMERA, Sensing, room, take_node, take_view
 
 NOTHING = np.zeros((0, 2))
@@ -22,22 +21,6 @@ WORLD = room(0, 0, 5, 4, 500, np.random.default_rng(1))
 
 def node(number: int, at: Pose2, seed: int):
     return take_node(WORLD, NodeId("r0", 1, number), at, HERE, np.random.default_rng(seed))
-
-
-def test_a_comparison_of_nodes_is_cached(monkeypatch):
-    first, twin = node(1, AT, 2), node(2, AT @ Pose2(0.1, -0.05, 0.1), 3)
-    doubles = AliasedLandmarks(RecognitionSettings())
-    likeness = doubles.compare(twin, first)
-    assert likeness is not None
-
-    def never(*_: object) -> None:
-        raise AssertionError("found out already")
-
-    with monkeypatch.context() as patched:
-        patched.setattr("mapweave.mapserver.relocalization.aliased_landmarks.register", never)
-        assert doubles.compare(twin, first) is likeness
-        with pytest.raises(AssertionError, match="already"):
-            doubles.compare(twin, replace(first, stamp_ns=first.stamp_ns + 1))  # changed
 
 
 def test_matches_that_a_pose_explains():
