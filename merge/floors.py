@@ -23,8 +23,8 @@ if TYPE_CHECKING:
 
     from mapweave.merge.pose_graph.links import Link
     from mapweave.merge.pose_graph.merged_map import MergedMap
+    from mapweave.merge.pose_graph.verdicts import MapPair
 
-MapPair = tuple[MapId, MapId]
 MOST_NAMED = 4
 """Of the maps of a part that comes apart, so many are named."""
 

@@ -52,8 +52,9 @@ from mapweave.merge.outlier_rejection.pairwise_consistency import loop_distances
 from mapweave.merge.outlier_rejection.shuffled_maps import is_shuffled
 from mapweave.merge.pose_graph.component_solver import ComponentSolver
 from mapweave.merge.pose_graph.fragments import Fragment
-from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.links import Link, thinned
 from mapweave.merge.pose_graph.merged_map import WrongGeometry
+from mapweave.merge.pose_graph.verdicts import MapPair
 from mapweave.merge.settings import ConsistencySettings
 from mapweave.registration.pose_arrays import PoseGaussians
 
@@ -70,8 +71,6 @@ SAME_XY, SAME_HEADING = 0.5, math.radians(20.0)
 
 UNSOLVABLE = (ArithmeticError, RuntimeError, ValueError)
 """What solvers raise for a map whose numbers they cannot take. Nothing is found out about it then."""
-MapPair = tuple[MapId, MapId]
-"""Two maps, the smaller id first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -177,7 +176,7 @@ class WrongGeometrySearch:
             return
         inside = [link for link in links if link.a in first.graph.rows and link.b in second.graph.rows]
         if len(inside) >= self._s.least_links:
-            some = thinned(inside)
+            some = thinned(inside, MOST_LINKS)
             best = link_sets(some, first, second, self._s)[0]
             self._ties[pair] = _Tie(tuple(inside), tuple(best), len(best) / len(some))
 
@@ -209,7 +208,7 @@ class WrongGeometrySearch:
         across = [
             link if link.a.map == map_id else link.turned()
             for partner in agreeing
-            for link in thinned(self._ties[min(map_id, partner), max(map_id, partner)].links)
+            for link in thinned(self._ties[min(map_id, partner), max(map_id, partner)].links, MOST_LINKS)
         ]
         across = [link for link in across if link.b in graph.rows]
         every = {k: node for which in (map_id, *agreeing) for k, node in maps[which].nodes.items()}
@@ -229,13 +228,6 @@ def _in_turns(maps: Sequence[MapId]) -> list[MapId]:
         turns.append((before[map_id.agent], k))
         before[map_id.agent] += 1
     return [maps[k] for _, k in sorted(turns)]
-
-
-def thinned(links: Sequence[Link]) -> list[Link]:
-    """Keep `MOST_LINKS` of them at most, by id: the order in which they were found has no effect."""
-    ordered = sorted(links, key=lambda link: link.key)
-    chosen = np.unique(np.linspace(0, len(ordered) - 1, MOST_LINKS).round().astype(np.int64))
-    return [ordered[int(k)] for k in chosen]
 
 
 def link_sets(

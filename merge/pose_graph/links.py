@@ -144,6 +144,13 @@ def refuse_edge(edge: Edge, reason: str) -> RefusedLink:
     return replace(refuse(link_of(edge), reason), edge=edge.id)
 
 
+def thinned(links: Sequence[Link], most: int) -> list[Link]:
+    """Keep so many links at most, evenly by id: the order in which they were found has no effect."""
+    ordered = sorted(links, key=lambda link: link.key)
+    chosen = np.unique(np.linspace(0, len(ordered) - 1, most).round().astype(np.int64))
+    return [ordered[k] for k in chosen.tolist()]
+
+
 def place_distinct(links: Sequence[Link]) -> bool:
     """Whether links that agree identify a place together."""
     aliased = sum(link.aliased for link in links)

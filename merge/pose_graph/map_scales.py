@@ -33,12 +33,11 @@ from mapweave.hybridmap.node import Edge, Node
 from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
 from mapweave.merge.pose_graph.factors import LOOP_FLOOR, believable
 from mapweave.merge.pose_graph.fragments import Fragment
-from mapweave.merge.pose_graph.links import Link
+from mapweave.merge.pose_graph.links import Link, thinned
+from mapweave.merge.pose_graph.verdicts import MapPair
 from mapweave.registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
 from mapweave.registration.recognition import by_scales
 
-MapPair = tuple[MapId, MapId]
-"""Two maps, the smaller id first."""
 Logs = tuple[float, float]
 """Logarithms of factors of the two ends of a link."""
 Used = tuple[Fragment | Link, ...]
@@ -155,7 +154,7 @@ class MapScales:
             entry = known.get(pair)
             if exact or entry is None or not entry[1] <= len(some) < ENOUGH_MORE * entry[1]:
                 first, second = largest[pair[0]], largest[pair[1]]
-                used = thinned(some)
+                used = thinned(some, MOST_LINKS)
                 key: Used = (first, second, *used)
                 if entry is None or not _same(entry[0], key):
                     by_scale = [self._by_scales(link, maps) for link in used]
@@ -210,13 +209,6 @@ class MapScales:
         if known is None or known[0] is not a or known[1] is not b:
             known = self._derivatives[link] = a, b, by_scales(a, b, link.shared, link.a_from_b.mean)
         return known[2]
-
-
-def thinned(links: Sequence[Link]) -> list[Link]:
-    """Keep `MOST_LINKS` of them at most, by id: the order in which they were found has no effect."""
-    ordered = sorted(links, key=lambda link: link.key)
-    chosen = np.unique(np.linspace(0, len(ordered) - 1, MOST_LINKS).round().astype(np.int64))
-    return [ordered[k] for k in chosen.tolist()]
 
 
 def _same(first: Used, second: Used) -> bool:

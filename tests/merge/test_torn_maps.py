@@ -10,8 +10,9 @@ from mapweave.hybridmap.pose import Pose2
 from mapweave.mapserver.merging import copies as copied_nodes
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.merge.merging import merge_maps
-from mapweave.merge.outlier_rejection.wrong_geometry import is_torn, thinned
+from mapweave.merge.outlier_rejection.wrong_geometry import MOST_LINKS, is_torn
 from mapweave.merge.pose_graph.fragments import Fragment
+from mapweave.merge.pose_graph.links import thinned
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import ConsistencySettings
 from mapweave.scenarios.liar.lies import LieInputs, altered, altered_places, bodies, chain
@@ -93,7 +94,7 @@ def test_nodes_that_are_a_little_off_are_of_no_other_place(fleet: FaultyFleet, s
     )
     (own,), (theirs,) = placed.graphs, fixed.graphs
     pieces = Fragment(own.anchor, own, ()), Fragment(theirs.anchor, theirs, ())
-    across = thinned([link for link in links if not link.within])
+    across = thinned([link for link in links if not link.within], MOST_LINKS)
     nodes = [merged.maps[ODD].nodes[node] for node in own.nodes]
     assert is_torn(across, *pieces, nodes, ConsistencySettings()) is torn
 
