@@ -20,11 +20,11 @@ from mapweave.mapserver.merging.merge_adoption import MergeAdoption
 from mapweave.mapserver.merging.merge_handover import MOST_WORDS, MergeHandover
 from mapweave.mapserver.merging.merge_intake import MergeIntake
 from mapweave.mapserver.merging.merge_retry import SHORT, MergeRetry
-from mapweave.mapserver.merging.merge_sharing import MergeSharing
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.merger_counters import MergerCounters
 from mapweave.mapserver.merging.node_comparisons import Compare, compare
 from mapweave.mapserver.merging.pruning_record import PruningRecord
+from mapweave.mapserver.merging.stored_merges import StoredMerges
 from mapweave.mapserver.merging.unmerged import Unmerged
 from mapweave.mapserver.merging.verification_cache_keeper import VerificationCacheKeeper
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
@@ -62,7 +62,7 @@ class MergeWorker:
         compare: Compare = compare,
         observe: Callable[[float], None] = lambda seconds: None,
         pruning: PruningRecord | None = None,
-        sharing: MergeSharing | None = None,
+        stored: StoredMerges | None = None,
         retry: MergeRetry | None = None,
         choice_key: bytes = b"",
     ) -> None:
@@ -78,16 +78,16 @@ class MergeWorker:
             compare: compares nodes.
             observe: called with the time that a merge has taken, s.
             pruning: prunes what has been superseded for long; None: nothing is.
-            sharing: hands merges over to other servers, or from them; None: this one merges for itself.
+            stored: hands merges over to other servers, or from them; None: this one merges for itself.
             retry: says when merging is tried again for which there was too little memory.
             choice_key: see `Merger`.
         """
         self._schedule = schedule
-        self._sharing = sharing
-        self._handover = MergeHandover(sharing, schedule.monotonic) if sharing else None
+        self._stored = stored
+        self._handover = MergeHandover(stored, schedule.monotonic) if stored else None
         # Until it is known which server leads this one follows.
-        self._adoption = MergeAdoption(sharing, pruning, schedule.monotonic) if sharing else None
-        self._following, self._alone = sharing is not None, ""
+        self._adoption = MergeAdoption(stored, pruning, schedule.monotonic) if stored else None
+        self._following, self._alone = stored is not None, ""
         self._own_merges = 0
         self._waiting_for: list[threading.Event] = []
         self._keeper, self._pruning = keeper, pruning
@@ -343,9 +343,9 @@ class MergeWorker:
 
     def _look(self) -> None:
         """Lead or follow, as the store says."""
-        if self._adoption is None or self._handover is None or self._sharing is None:
+        if self._adoption is None or self._handover is None or self._stored is None:
             return
-        if self._sharing.store.leads:
+        if self._stored.store.leads:
             self._handover.lead()
             if self._following:
                 self._adopt()

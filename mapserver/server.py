@@ -165,7 +165,7 @@ class MapServer:
             clock, MERGE_SHARE, places, s.merge,
             keeper=findings, history=self._history, compare=self._cluster.compare,
             observe=self._metrics.merged, pruning=pruning,
-            sharing=around.sharing, retry=around.retry, choice_key=around.choice_key,
+            stored=around.stored, retry=around.retry, choice_key=around.choice_key,
         )  # fmt: skip
         self._constraints = ConstraintRecord(self._store, self._base)
         self._annotations = AnnotationRecord(self._store, self._base.annotations)

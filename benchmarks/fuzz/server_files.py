@@ -20,7 +20,7 @@ from mapweave.hybridmap.map_event import MapEvent, MapEventKind
 from mapweave.mapserver.checksummed_file import DIGEST
 from mapweave.mapserver.http import last_shown
 from mapweave.mapserver.http.serving import json_bytes
-from mapweave.mapserver.merging import restart_record_file, shared_merge, verification_cache_file
+from mapweave.mapserver.merging import merge_encoding, restart_record_file, verification_cache_file
 from mapweave.mapserver.merging.restart_record import RestartRecord
 from mapweave.mapserver.merging.verification_cache import PRINT_BYTES, RecentComparisons, VerificationCache
 from mapweave.merge.map_maintenance.superseding_log import Changes, SupersedingLog
@@ -36,7 +36,7 @@ VIEWED = Camera(64, 48, 60.0, 60.0, 32.0, 24.0, 0.25, 0.0)
 CHECKSUMMED: dict[bytes, Callable[[bytes], object]] = {
     restart_record_file.MAGIC: lambda data: restart_record_file.load(data, MADE_BY),
     verification_cache_file.MAGIC: lambda data: verification_cache_file.load(data, MADE_BY),
-    shared_merge.MAGIC: lambda data: shared_merge.SharedMerge.read(data, MADE_BY),
+    merge_encoding.MAGIC: lambda data: merge_encoding.EncodedMerge.read(data, MADE_BY),
 }
 """Files with a digest at their end, by their first line."""
 
@@ -56,13 +56,13 @@ def checksummed_samples(samples: Samples) -> list[bytes]:
     verdicts = {link.pair: link for link in merged.links} | {one.pair: one for one in merged.refused}
     verdicts = {pair: one for pair, one in verdicts.items() if all(n in record.recent.prints for n in pair)}
     cache = VerificationCache(record.recent.prints, dict.fromkeys(verdicts, 0.5), verdicts)
-    head = shared_merge.MergeHead.of(
+    head = merge_encoding.MergeHead.of(
         "s0", {map_id: (7, bytes(32)) for map_id in merged.maps}, None, [bytes(32)], merged
     )
     files = (
         restart_record_file.packed(record, MADE_BY),
         verification_cache_file.packed(cache, MADE_BY),
-        shared_merge.packed(head, record, merged, verdicts.get, MADE_BY),
+        merge_encoding.packed(head, record, merged, verdicts.get, MADE_BY),
     )
     return [
         bytes([k]) + bytes(file)[len(magic) : -DIGEST]

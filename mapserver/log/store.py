@@ -35,7 +35,7 @@ PRUNING_MARK = "pruning_mark"
 """A random number that is drawn with each change of that record."""
 MERGE, MERGE_MARK = "merge", "merge_mark"
 """The newest merge, for servers that do not merge themselves, and a digest of it; see
-mapweave.mapserver.merging.merge_sharing."""
+mapweave.mapserver.merging.stored_merges."""
 CHOICE_KEY = "choice key"
 """Likewise: decides which of many things are looked at, so that robots cannot. It never leaves the store."""
 MERGE_TROUBLE = "merge_trouble"

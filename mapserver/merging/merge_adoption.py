@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from mapweave.hybridmap.change import Change, NodePut
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.hybridmap.ids import MapId
-from mapweave.mapserver.merging.merge_sharing import MergeSharing, adopted
+from mapweave.mapserver.merging.merge_encoding import EncodedMerge
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.pruning_record import PruningRecord
-from mapweave.mapserver.merging.shared_merge import SharedMerge
+from mapweave.mapserver.merging.stored_merges import StoredMerges, adopted
 from mapweave.mapserver.merging.verification_cache import VerificationCache, fingerprint_of
 from mapweave.mapserver.merging.verification_cache_keeper import made_by
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -47,7 +47,7 @@ SILENT = 60.0
 class _Read:
     """A merge that was handed over, with what comparisons had found."""
 
-    merge: SharedMerge
+    merge: EncodedMerge
     findings: VerificationCache
 
 
@@ -60,18 +60,18 @@ class MergeAdoption:
 
     def __init__(
         self,
-        sharing: MergeSharing,
+        stored: StoredMerges,
         pruning: PruningRecord | None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         """Nothing is adopted yet.
 
         Args:
-            sharing: reads what was handed over.
+            stored: reads what was handed over.
             pruning: what was pruned, of the same store.
             clock: the time, s.
         """
-        self._sharing, self._pruning, self._clock = sharing, pruning, clock
+        self._stored, self._pruning, self._clock = stored, pruning, clock
         self._held: list[tuple[int, Change]] = []
         self._mark: bytes | None = None
         self._read_at = -math.inf
@@ -104,9 +104,9 @@ class MergeAdoption:
         """
         if waited < LATE:
             return ""
-        leader = self._sharing.store.leader or "another server"
+        leader = self._stored.store.leader or "another server"
         try:
-            if trouble := self._sharing.trouble:
+            if trouble := self._stored.trouble:
                 return f"{leader} leads, and says: {trouble}"
         except InvalidFile:  # the store is away, which is said elsewhere
             return ""
@@ -130,7 +130,7 @@ class MergeAdoption:
     def promising(self, merger: Merger) -> bool:
         """Whether a server that merges itself may follow again: there is a merge that it has not tried."""
         try:
-            mark = self._sharing.mark
+            mark = self._stored.mark
         except InvalidFile:
             return False
         if self._clock() < self._again_at or mark in (None, self._mark):
@@ -157,7 +157,7 @@ class MergeAdoption:
             The merged map; None if there is none that is new and can be used.
         """
         try:
-            mark = self._sharing.mark
+            mark = self._stored.mark
         except InvalidFile:  # it is away: nothing new comes either, and that is no time without a leader
             self._since = self._clock()
             return None
@@ -178,7 +178,7 @@ class MergeAdoption:
             self._held = rest
             merger.copy_maps()
             wanted = {which: print_ for which, _, print_ in merge.head.maps}
-            if self._sharing.prints(merger) != wanted or not self._same_pruning(merge):
+            if self._stored.prints(merger) != wanted or not self._same_pruning(merge):
                 same = all(last.get(which, 0) == sequence for which, sequence, _ in merge.head.maps)
                 self._fail(
                     (OTHER_MAPS if same else NOT_YET).format(merge.head.by), PATIENCE if same else FIRST
@@ -222,7 +222,7 @@ class MergeAdoption:
         held, self._held = self._held, []
         return [change for _, change in held]
 
-    def _same_pruning(self, merge: SharedMerge) -> bool:
+    def _same_pruning(self, merge: EncodedMerge) -> bool:
         return self._pruning is None or (self._pruning.mark or b"") == merge.head.mark
 
     def _fail(self, reason: str, wait: float) -> None:
@@ -239,12 +239,12 @@ class MergeAdoption:
             self._fail(NONE, FIRST)
             return
         try:
-            merge = self._sharing.read(mark, words)
-            self._newest = _Read(merge, self._sharing.findings(merge.head.parts, words))
+            merge = self._stored.read(mark, words)
+            self._newest = _Read(merge, self._stored.findings(merge.head.parts, words))
         except InvalidFile as error:
             self._fail(f"the merge that was handed over {error}", PATIENCE)
 
-    def _covered(self, merge: SharedMerge) -> tuple[list[Change], list[tuple[int, Change]]]:
+    def _covered(self, merge: EncodedMerge) -> tuple[list[Change], list[tuple[int, Change]]]:
         """Of what was held back what is in a merge, in order, and the rest with its numbers."""
         last = {which: sequence for which, sequence, _ in merge.head.maps}
         nodes = merge.record.recent.prints

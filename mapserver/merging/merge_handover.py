@@ -5,8 +5,8 @@ import math
 from collections.abc import Callable, Mapping
 
 from mapweave.hybridmap.ids import MapId
-from mapweave.mapserver.merging.merge_sharing import MergeSharing
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.stored_merges import StoredMerges
 
 log = logging.getLogger(__name__)
 
@@ -20,23 +20,23 @@ MOST_WORDS = 1000
 class MergeHandover:
     """Only the merging thread may call it."""
 
-    def __init__(self, sharing: MergeSharing, clock: Callable[[], float]) -> None:
+    def __init__(self, stored: StoredMerges, clock: Callable[[], float]) -> None:
         """Nothing is handed over yet.
 
         Args:
-            sharing: writes into the store that the servers share.
+            stored: writes into the store that the servers share.
             clock: the time, s.
         """
-        self._sharing, self._clock = sharing, clock
+        self._stored, self._clock = stored, clock
         self._term, self._merges = 0, 0
         self._next_at = -math.inf
         self._trouble = ""
 
     def lead(self) -> None:
         """This server leads: what others have written before is not gone on with."""
-        if self._term != self._sharing.store.term:
-            self._term, self._merges = self._sharing.store.term, -1
-            self._sharing.begin()
+        if self._term != self._stored.store.term:
+            self._term, self._merges = self._stored.store.term, -1
+            self._stored.begin()
 
     def write(
         self, merger: Merger, last: Mapping[MapId, int], pruning: bytes | None, outdated: bool, trouble: str
@@ -53,9 +53,9 @@ class MergeHandover:
         Returns:
             How long to wait until it is time, s; None: nothing is left to do.
         """
-        if not self._sharing.store.followed:
+        if not self._stored.store.followed:
             return None
-        self._sharing.tell(trouble or self._trouble)
+        self._stored.tell(trouble or self._trouble)
         merges = merger.counters.merges
         if merges == self._merges:
             return None
@@ -64,13 +64,13 @@ class MergeHandover:
             return self._next_at - began
         if not outdated:
             try:
-                self._sharing.write(merger, last, pruning)
+                self._stored.write(merger, last, pruning)
                 self._trouble = ""
             except Exception as error:  # the next merge is the next chance
                 log.exception("a merge is not handed over")
                 words = f"a merge cannot be handed over ({type(error).__name__}: {error})"
                 self._trouble = words[:MOST_WORDS]
-            self._sharing.tell(trouble or self._trouble)
+            self._stored.tell(trouble or self._trouble)
             self._merges = merges
             took = self._clock() - began
             if took > QUICK:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from mapweave.mapserver.log.store import CHOICE_KEY, Store
 from mapweave.mapserver.merging.merge_retry import MergeRetry
-from mapweave.mapserver.merging.merge_sharing import MergeSharing
+from mapweave.mapserver.merging.stored_merges import StoredMerges
 
 
 @dataclass(frozen=True, eq=False)
@@ -16,12 +16,12 @@ class MergeSurroundings:
     """What a server's merges depend on besides what robots and people send.
 
     Attributes:
-        sharing: hands merges over to other servers, or from them; None: this one merges for itself.
+        stored: hands merges over to other servers, or from them; None: this one merges for itself.
         retry: says when merging is tried again for which there was too little memory.
         choice_key: decides which pairs of views are held against their map's way.
     """
 
-    sharing: MergeSharing | None
+    stored: StoredMerges | None
     retry: MergeRetry
     choice_key: bytes
 
@@ -35,8 +35,8 @@ class MergeSurroundings:
             path: beside which it is kept that something is merged.
             clock: only grows, s.
         """
-        sharing = MergeSharing(store, name) if store.shared else None
-        return MergeSurroundings(sharing, MergeRetry(path, clock), store.secret(CHOICE_KEY))
+        stored = StoredMerges(store, name) if store.shared else None
+        return MergeSurroundings(stored, MergeRetry(path, clock), store.secret(CHOICE_KEY))
 
     @staticmethod
     def repeatable(store: Store, name: str, path: Path, clock: Callable[[], float]) -> MergeSurroundings:

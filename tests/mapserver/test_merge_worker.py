@@ -21,16 +21,16 @@ from mapweave.mapserver.answers import Answers
 from mapweave.mapserver.log.store import Store
 from mapweave.mapserver.map_history import MapHistory
 from mapweave.mapserver.merge_worker import MergeWorker
-from mapweave.mapserver.merging.merge_sharing import MergeSharing
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.stored_merges import StoredMerges
 from mapweave.mapserver.retrieval.place_database import PlaceDatabase
 from mapweave.mapserver.schedule import LiveSchedule, LockstepSchedule
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from synthetic.maps import changes_of, map_tours, numbered
 from synthetic.world import World, room, take_map, take_view
 from tests.mapserver.merging.test_restart_record import drives
-from tests.mapserver.merging.test_shared_merge import Leader, Results, hash_of
-from tests.mapserver.merging.test_shared_merge import numbered as numbered_log
+from tests.mapserver.merging.test_stored_merges import Leader, Results, hash_of
+from tests.mapserver.merging.test_stored_merges import numbered as numbered_log
 from tests.waiting import eventually
 
 
@@ -70,7 +70,7 @@ def test_it_is_not_settled_while_it_merges(monkeypatch):
 
 @pytest.mark.parametrize(
     ("where", "method"),
-    [(MergeSharing, "read"), (PlaceDatabase, "leave_out"), (Answers, "of"), (MapHistory, "follow")],
+    [(StoredMerges, "read"), (PlaceDatabase, "leave_out"), (Answers, "of"), (MapHistory, "follow")],
 )
 def test_a_follower_that_fails_with_a_merge_goes_on_alone_and_follows_again(
     where: type, method: str, tmp_path
@@ -80,7 +80,7 @@ def test_a_follower_that_fails_with_a_merge_goes_on_alone_and_follows_again(
     results, followed = Results(), Results()
     followed.leads, followed.values = False, results.values
     leader = Leader(results, tmp_path / "s0")
-    worker = MergeWorker(LiveSchedule(), 1.0, sharing=MergeSharing(cast(Store, followed), "s1"))
+    worker = MergeWorker(LiveSchedule(), 1.0, stored=StoredMerges(cast(Store, followed), "s1"))
     adoption, real = worker._adoption, getattr(where, method)
     assert adoption is not None
 

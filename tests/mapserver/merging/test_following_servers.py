@@ -31,8 +31,8 @@ from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.store import MERGE, MERGE_MARK
 from mapweave.mapserver.map_files import map_file_of
 from mapweave.mapserver.merging import merge_adoption
-from mapweave.mapserver.merging.merge_sharing import PART
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.stored_merges import PART
 from mapweave.mapserver.server import MapServer, ServerSettings
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import ExclusionSettings, MergeSettings
@@ -43,7 +43,7 @@ from mapweave.wire.memory import MemoryBus, MemoryHub
 from mapweave.wire.messages import encode
 from synthetic.maps import LOG_ID
 from tests.mapserver.merging.test_restart_record import decided, drives
-from tests.mapserver.merging.test_shared_merge import numbered
+from tests.mapserver.merging.test_stored_merges import numbered
 from tests.quick import first_quick
 from tests.waiting import eventually
 

@@ -7,8 +7,8 @@ from typing import Any, cast
 import pytest
 
 from mapweave.mapserver.merging.merge_handover import SHARE, MergeHandover
-from mapweave.mapserver.merging.merge_sharing import MergeSharing
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.stored_merges import StoredMerges
 from mapweave.mapserver.merging.unmerged import MOST, STEP, Unmerged
 from tests.clock import Clock
 
@@ -49,7 +49,7 @@ def followed(clock: Clock) -> Followed:
 
 @pytest.fixture
 def handover(followed: Followed, clock: Clock) -> MergeHandover:
-    one = MergeHandover(cast(MergeSharing, followed), clock)
+    one = MergeHandover(cast(StoredMerges, followed), clock)
     one.lead()
     return one
 

@@ -8,7 +8,7 @@ from mapweave.merge.pose_graph.component import Component
 from mapweave.storage.map_file import read_map_file, write_map_file
 from synthetic.maps import changes_of, merger_of
 from synthetic.wrong_geometry import ODD, SCENES, OdometryFault, draw_fleet
-from tests.mapserver.merging.test_shared_merge import Follower, Leader, Results, assert_same, numbered
+from tests.mapserver.merging.test_stored_merges import Follower, Leader, Results, assert_same, numbered
 from tests.merge.pose_graph.test_map_scales import longer
 
 SEED, FACTOR = 9413, 1.04

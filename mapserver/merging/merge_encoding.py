@@ -1,6 +1,6 @@
 """A merge that the server that leads hands over to the others: all of a merged map but the maps themselves.
 
-What comparing nodes has found is beside it, in parts (mapweave.mapserver.merging.merge_sharing): most links
+What comparing nodes has found is beside it, in parts (mapweave.mapserver.merging.stored_merges): most links
 and refusals are named here by their nodes only. Poses, factors and covariances are the same bit by bit.
 
 header (JSON), head (MessagePack), restart record, agents, reasons (JSON), nodes, components, factors, links,
@@ -138,7 +138,7 @@ def packed(
 
 
 @dataclass(frozen=True, eq=False)
-class SharedMerge:
+class EncodedMerge:
     """A merge as it was handed over.
 
     Attributes:
@@ -152,17 +152,17 @@ class SharedMerge:
     arrays: tuple[NDArray[Any], ...] = field(repr=False)
 
     @staticmethod
-    def read(data: bytes, made_by: str) -> SharedMerge:
+    def read(data: bytes, made_by: str) -> EncodedMerge:
         """Read the bytes of `packed`.
 
         Raises:
             InvalidFile: they are damaged, or of another version or other settings.
         """
 
-        def read(parts: Iterator[NDArray[Any]]) -> SharedMerge:
+        def read(parts: Iterator[NDArray[Any]]) -> EncodedMerge:
             head = decode(next(parts).tobytes(), MergeHead, LIMIT)
             record = restart_record_file.load(next(parts).tobytes(), made_by)
-            return SharedMerge(head, record, tuple(parts))
+            return EncodedMerge(head, record, tuple(parts))
 
         return read_checksummed(data, MAGIC, _header(made_by), read, "is no merge of this version")
 

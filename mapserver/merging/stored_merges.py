@@ -14,9 +14,9 @@ from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.mapserver.log.store import MERGE, MERGE_MARK, MERGE_TROUBLE, Store
 from mapweave.mapserver.merging import verification_cache_file
+from mapweave.mapserver.merging.merge_encoding import EncodedMerge, MergeHead, map_print, packed
 from mapweave.mapserver.merging.merger import Merger
 from mapweave.mapserver.merging.restart_record import RestartRecord
-from mapweave.mapserver.merging.shared_merge import MergeHead, SharedMerge, map_print, packed
 from mapweave.mapserver.merging.verification_cache import RecentComparisons, VerificationCache
 from mapweave.mapserver.merging.verification_cache_keeper import made_by
 from mapweave.merge.pose_graph.merged_map import MergedMap
@@ -31,7 +31,7 @@ LEVEL = 1
 """Of zlib: half the bytes in a tenth of the time that level 9 takes."""
 
 
-class MergeSharing:
+class StoredMerges:
     """The merges in one store. Only the merging thread may call it.
 
     Attributes:
@@ -108,7 +108,7 @@ class MergeSharing:
             self.store.publish({MERGE_TROUBLE: trouble.encode()})
             self._trouble = trouble
 
-    def read(self, mark: bytes, words: str) -> SharedMerge:
+    def read(self, mark: bytes, words: str) -> EncodedMerge:
         """The merge of a mark.
 
         Args:
@@ -118,7 +118,7 @@ class MergeSharing:
         Raises:
             InvalidFile: it is damaged, or of another version or other settings.
         """
-        return SharedMerge.read(_whole(self.store.result(MERGE), mark), words)
+        return EncodedMerge.read(_whole(self.store.result(MERGE), mark), words)
 
     def findings(self, marks: tuple[bytes, ...], words: str) -> VerificationCache:
         """What comparisons have found.
@@ -152,14 +152,14 @@ class MergeSharing:
         return {which: print_ for which, (_, print_) in self._prints.items()}
 
 
-def adopted(shared: SharedMerge, findings: VerificationCache, merger: Merger) -> MergedMap:
+def adopted(merge: EncodedMerge, findings: VerificationCache, merger: Merger) -> MergedMap:
     """A merge that was handed over, of the maps as this server has them.
 
     Raises:
         InvalidFile: it does not fit them.
     """
     try:
-        return shared.merged(merger.kept, findings.verdicts, merger.pruning.pruned)
+        return merge.merged(merger.kept, findings.verdicts, merger.pruning.pruned)
     except (KeyError, IndexError, StopIteration, ValueError, TypeError) as error:
         raise InvalidFile(
             f"the merge does not fit what was compared ({type(error).__name__}: {error})"

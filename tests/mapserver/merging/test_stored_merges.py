@@ -21,10 +21,10 @@ from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.content_hash import content_hash
 from mapweave.mapserver.log.store import MERGE, MERGE_MARK, Store
 from mapweave.mapserver.map_files import map_file_of
-from mapweave.mapserver.merging import merge_adoption, merge_sharing, verification_cache_keeper
+from mapweave.mapserver.merging import merge_adoption, stored_merges, verification_cache_keeper
 from mapweave.mapserver.merging.merge_adoption import MergeAdoption
-from mapweave.mapserver.merging.merge_sharing import PART, MergeSharing
 from mapweave.mapserver.merging.merger import Merger
+from mapweave.mapserver.merging.stored_merges import PART, StoredMerges
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.merge.settings import ExclusionSettings, MergeSettings
 from tests.mapserver.merging.test_restart_record import Log, Server, decided, drives
@@ -56,7 +56,7 @@ class Leader(Server):
     """What the merging thread of a server that leads does; it has files of its own, too."""
 
     def __init__(self, results: Results, path: Path, name: str = "s0") -> None:
-        self.sharing, self.last = MergeSharing(cast(Store, results), name), dict[MapId, int]()
+        self.stored, self.last = StoredMerges(cast(Store, results), name), dict[MapId, int]()
         super().__init__(path, ())
         self.path = path
 
@@ -67,7 +67,7 @@ class Leader(Server):
 
     def merge(self) -> MergedMap:
         merged = super().merge()
-        self.sharing.write(self.merger, self.last, None)
+        self.stored.write(self.merger, self.last, None)
         return merged
 
     def restarted(self, changes: list[Change]) -> MergedMap:
@@ -82,7 +82,7 @@ class Follower:
     def __init__(self, results: Results, merging: MergeSettings | None = None) -> None:
         self.now, self.results = 0.0, results
         self.merger = Merger(settings=merging)
-        self.adoption = MergeAdoption(MergeSharing(cast(Store, results), "s1"), None, lambda: self.now)
+        self.adoption = MergeAdoption(StoredMerges(cast(Store, results), "s1"), None, lambda: self.now)
         self.merged = MergedMap.empty()
         self.last: dict[MapId, int] = {}
         self.taken = 0
@@ -178,7 +178,7 @@ def test_a_follower_has_the_leaders_map_and_goes_on_from_it(
     """It misses merges, hears changes early, and takes over at last; beside it a leader that goes on."""
     results, changes = Results(), numbered(drives(seed))
     with pytest.MonkeyPatch.context() as patch, TemporaryDirectory() as folder:
-        patch.setattr(merge_sharing, "FULL", full)
+        patch.setattr(stored_merges, "FULL", full)
         leader, follower = Leader(results, Path(folder) / "s0"), Follower(results)
         done = heard = 0
         for k, step in enumerate(steps):
