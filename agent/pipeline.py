@@ -297,7 +297,7 @@ class Pipeline:
             node_from_robot=IDENTITY if fix is None else fix.node_from_robot.mean,
             legs=0 if self._navigator is None else self._navigator.legs,
             lost=self.lost,
-            astray=self._map_making.resuming,
+            relocalizing=self._map_making.resuming,
             given_up=navigator is not None and navigator.given_up,
             progress=0.0 if navigator is None else navigator.progress,
             located=not isinstance(self._mission, GoTo) and self._map_making.located,

@@ -54,7 +54,7 @@ class Status:
         node_from_robot: pose in that node's frame.
         legs: nodes on the first route of the drive, beginning and goal included.
         lost: whether it has given up localizing on its own map: a new map must be begun.
-        astray: whether it searches for a place of its own map; `map_from_robot` is then meaningless.
+        relocalizing: whether it searches for a place of its own map; `map_from_robot` is then meaningless.
         located: whether `map_from_robot` comes from this observation.
         given_up: whether it stands, since the goal cannot be reached; `detail` is the reason.
         progress: share of the present route that is driven.
@@ -76,7 +76,7 @@ class Status:
     node_from_robot: Pose2 = IDENTITY
     legs: Number = 0
     lost: bool = False
-    astray: bool = False
+    relocalizing: bool = False
     located: bool = False
     given_up: bool = False
     progress: Share = 0.0

@@ -120,7 +120,7 @@ def replay(robot: Replay, description: RobotDescription, truth: Truth, lever: fl
             along = moved.apply(first_from_map) @ first_from_map.inverse()
             left = [along @ pose for pose in mapped[:begun]]
             mapped = left + [moved.apply(pose) for pose in mapped[begun:]]
-        if not status.astray and not pipeline.lost and status.doing != "standing still":
+        if not status.relocalizing and not pipeline.lost and status.doing != "standing still":
             here = first_from_map @ status.map_from_robot
             used += 1
         pose = truth.at(observation.stamp_ns)

@@ -70,7 +70,7 @@ def mapped(description: RobotDescription, drive: Drive) -> dict[str, float]:
             pipeline = Pipeline(MapId("map", number), description, calibration=calibration)
             pipeline, first_from_map = _pipeline(pipeline, Carried()), here
         status = pipeline.step(observation).status
-        if not status.astray and not pipeline.lost and status.doing != "standing still":
+        if not status.relocalizing and not pipeline.lost and status.doing != "standing still":
             here, used = first_from_map @ status.map_from_robot, used + 1
         believed.append(here)
         by_wheels.append(reckoned)

@@ -112,7 +112,7 @@ class Reports:
                     lives.append(0)
                 lives[-1] = report.traffic
             # A robot that reports that it is lost has no estimate.
-            if status.mission in ("explore", "carried") and status.nodes and not status.astray:
+            if status.mission in ("explore", "carried") and status.nodes and not status.relocalizing:
                 pose = status.map_from_robot
                 by_stamp = self._poses.setdefault(MapId(robot, report.epoch), {})
                 by_stamp[report.stamp_ns] = (pose.x, pose.y, pose.heading)

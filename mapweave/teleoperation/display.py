@@ -21,7 +21,7 @@ def lines(name: str, report: AgentStatus, command: Command, silence: float, usag
     """
     status, pose = report.status, report.status.map_from_robot
     where = f"x {pose.x:z.2f} m  y {pose.y:z.2f} m  heading {math.degrees(pose.heading):z.0f} deg"
-    if status.astray:
+    if status.relocalizing:
         where = "not localized on its map"
     elif not status.nodes:
         where = f"no map yet  {where}"
