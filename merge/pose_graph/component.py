@@ -14,8 +14,8 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.merge.pose_graph.factors import Factors, RelativePose, Rows
 from mapweave.merge.pose_graph.optimization import ANCHOR_SIGMA, optimized
-from mapweave.merge.pose_graph.solved_graph import PoseGraph, factorized
-from mapweave.registration.pose_arrays import PoseGaussians, adjoints, compose_poses, inverse_poses
+from mapweave.merge.pose_graph.solved_graph import PoseGraph, factorized, relative_covariances
+from mapweave.registration.pose_arrays import PoseGaussians, compose_poses, inverse_poses
 
 if TYPE_CHECKING:
     from scipy import sparse
@@ -134,12 +134,9 @@ class Component(PoseGraph):
         right[columns, np.arange(len(columns))] = 1.0
         joint = factorized(information).solve(right)[columns]
         joint = (0.5 * (joint + joint.T)).reshape(len(seats), 3, len(seats), 3)
-        first, second = np.split(which, 2)
-        ad = -adjoints(inverse_poses(means))
-        cross = ad @ joint[first, :, second, :]
-        out = ad @ joint[first, :, first, :] @ ad.transpose(0, 2, 1) + joint[second, :, second, :]
         joined = piece[order[i]] == piece[order[j]]
-        return out + cross + cross.transpose(0, 2, 1), joined
+        first, second = np.split(which, 2)
+        return relative_covariances(joint, first, second, means), joined
 
     def _within(self, rows: Rows, order: Rows) -> Factors:
         """Measurements with both ends among the rows."""
@@ -171,7 +168,7 @@ def pieces(part: Factors, count: int) -> Rows:
     from scipy.sparse.csgraph import connected_components
 
     links = sparse.coo_matrix((np.ones(len(part)), (part.a, part.b)), shape=(count, count))
-    out: Rows = connected_components(links, directed=False)[1]
+    out: Rows = connected_components(links, directed=False)[1].astype(np.int64)
     return out
 
 

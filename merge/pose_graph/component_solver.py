@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.merge.pose_graph.component import Component
+from mapweave.merge.pose_graph.component import Component, pieces
 from mapweave.merge.pose_graph.factors import Factors, Rows
 from mapweave.merge.pose_graph.fragments import Fragment, fragment_by_node
 from mapweave.merge.pose_graph.links import Link
@@ -150,9 +150,6 @@ class ComponentSolver:
 
     def _move_on(self, index: Rows, whole: bool) -> None:
         """Let other links hold, and optimise what that changes."""
-        from scipy import sparse
-        from scipy.sparse.csgraph import connected_components
-
         difference = np.setxor1d(index, self._active, assume_unique=True)
         settled = not len(difference) and self._settled
         if settled and not (whole and any(map(_unsettled, self._graphs.values()))):
@@ -160,9 +157,7 @@ class ComponentSolver:
         factors = Factors.together([self._own, self._table.take(index)])
         self._touched[self._table.a[difference]] = self._touched[self._table.b[difference]] = True
         self._ever |= self._touched
-        count = len(self._nodes)
-        ties = sparse.coo_matrix((np.ones(len(factors), np.int8), (factors.a, factors.b)), (count, count))
-        labels = connected_components(ties, directed=False)[1].astype(np.int64)
+        labels = pieces(factors, len(self._nodes))
         self._lay_together(index)
         graphs: dict[int, PoseGraph] = {}
         for label, (rows, inside) in enumerate(_parts(labels, factors)):
@@ -184,14 +179,14 @@ class ComponentSolver:
     def _lay_together(self, index: Rows) -> None:
         """Move components that links join: a smaller one to a larger, by the best link between them."""
         between = self._labels[self._table.a[index]] != self._labels[self._table.b[index]]
-        pieces: nx.Graph = nx.Graph()
+        tied: nx.Graph = nx.Graph()
         for k in index[between].tolist():
             ends = int(self._labels[self._table.a[k]]), int(self._labels[self._table.b[k]])
-            edge, weight = pieces.get_edge_data(*ends), self._links[k].weight
+            edge, weight = tied.get_edge_data(*ends), self._links[k].weight
             if edge is None or weight > edge["weight"]:
-                pieces.add_edge(*ends, weight=weight, link=k)
+                tied.add_edge(*ends, weight=weight, link=k)
         sizes = np.bincount(self._labels)
-        tree = nx.maximum_spanning_tree(pieces)
+        tree = nx.maximum_spanning_tree(tied)
         for part in sorted(map(sorted, nx.connected_components(tree))):
             root = max(part, key=lambda label: (sizes[label], -label))
             for parent, label in nx.bfs_edges(tree, root):

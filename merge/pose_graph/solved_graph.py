@@ -119,13 +119,24 @@ class PoseGraph:
         """The same of (K,) rows: poses `i_from_j`."""
         means = compose_poses(inverse_poses(self.means[i]), self.means[j])
         involved, where = np.unique(np.concatenate([i, j]), return_inverse=True)
-        joint = self._joint(involved)
-        i, j = np.split(where, 2)
-        # (start @ ds)^-1 (end @ de) = start_from_end @ (de - Ad(end_from_start) ds) to first order.
-        ad = -adjoints(inverse_poses(means))
-        cross = ad @ joint[i, :, j, :]
-        covariances = ad @ joint[i, :, i, :] @ ad.transpose(0, 2, 1) + joint[j, :, j, :]
-        return PoseGaussians(means, covariances + cross + cross.transpose(0, 2, 1))
+        first, second = np.split(where, 2)
+        return PoseGaussians(means, relative_covariances(self._joint(involved), first, second, means))
+
+
+def relative_covariances(joint: Array, i: NDArray[np.int64], j: NDArray[np.int64], i_from_j: Array) -> Array:
+    """(K, 3, 3) covariances of the relative poses of K pairs of nodes.
+
+    Args:
+        joint: (N, 3, N, 3) covariance of nodes.
+        i: (K,) of these.
+        j: (K,) of these.
+        i_from_j: (K, 3) relative poses.
+    """
+    # (start @ ds)^-1 (end @ de) = start_from_end @ (de - Ad(end_from_start) ds) to first order.
+    ad = -adjoints(inverse_poses(i_from_j))
+    cross = ad @ joint[i, :, j, :]
+    covariances: Array = ad @ joint[i, :, i, :] @ ad.transpose(0, 2, 1) + joint[j, :, j, :]
+    return covariances + cross + cross.transpose(0, 2, 1)
 
 
 def factorized(information: sparse.spmatrix) -> Any:
