@@ -31,7 +31,7 @@ from mapweave.mapserver.own_maps import maps_of, marginal_links
 from mapweave.mapserver.plan_images import kept_images, recorded_images
 from mapweave.storage.atomic_file import State, state_of, unchanged_since
 from mapweave.storage.database_reader import MAGIC as SQLITE
-from mapweave.storage.database_reader import reading
+from mapweave.storage.database_reader import cut_off, is_without_log, reading
 from mapweave.storage.file_format import of_format
 from mapweave.storage.map_file import MAGIC, MapFile, read_map_file, write_map_file
 from mapweave.storage.os_errors import unreadable
@@ -43,6 +43,7 @@ if TYPE_CHECKING:
 
 Value = TypeVar("Value")
 UNREAD = "pages that cannot be read: how many changes they had is not known"
+NO_LOG = "holds no map yet: what was written is in {}, beside it where it was made; copy both"
 OTHER = "is neither a map file nor an agent's journal nor a server's store"
 
 
@@ -225,7 +226,10 @@ def source_of(path: Path, live: bool = False) -> MapSource:
                 for name in ("application_id", "user_version")
             )
     except sqlite3.Error as error:
-        raise InvalidFile(f"{path}: cannot be read ({error})") from None
+        raise InvalidFile(f"{path}: cannot be read ({cut_off(path) or error})") from None
+    if not kind and is_without_log(path):
+        log = path.with_name(path.name + "-wal")
+        raise InvalidFile(f"{path}: {NO_LOG.format(log.name)}")
     if kind == journal.APPLICATION_ID:
         if version != journal.VERSION:
             raise InvalidFile(f"{path}: agent journal {of_format(version, journal.VERSION)}")
@@ -243,7 +247,7 @@ def _of_journal(path: Path) -> OpenedMap:
     changes = tuple(body for retained in kept.values() for body in retained.contents)
     complaints: dict[MapId | None, str] = {m: one.complaint for m, one in kept.items() if one.complaint}
     if not salvaged.whole:
-        complaints[None] = f"{path} had {UNREAD}"
+        complaints[None] = f"{path} had {_unread(path)}"
     return OpenedMap(
         path, MapSource.JOURNAL, MapFile("agent", _title(kept), changes), tuple(kept), complaints
     )
@@ -290,6 +294,12 @@ def _of_salvaged(
     return OpenedMap(path, MapSource.STORE, content, maps, {None: complaint} if complaint else {}, standing)
 
 
+def _unread(path: Path | str) -> str:
+    """What of a damaged file could not be read, in words."""
+    cut = cut_off(path) if isinstance(path, Path) else ""
+    return f"{UNREAD}; the file is {cut}" if cut else UNREAD
+
+
 def _title(maps: Collection[MapId]) -> str:
     return str(*maps) if len(maps) == 1 else f"{len(maps)} maps"
 
@@ -311,5 +321,5 @@ def _lost(path: Path | str, salvaged: Salvage, unread: int) -> str:
     if salvaged.whole and not lost:
         return ""
     damaged = counted(lost, "damaged change") if lost else "no damaged change"
-    pages = "" if salvaged.whole else f", and {UNREAD}"
+    pages = "" if salvaged.whole else f", and {_unread(path)}"
     return f"{path} had {damaged}{pages}"

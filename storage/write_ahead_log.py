@@ -40,7 +40,7 @@ def lost_commits(database: Path) -> int:
     whole = magic | 1 == MAGIC | 1 and struct.pack(">2I", *state) == data[24:32]
     if not whole:
         # The page size is that of the database's own header, and the salts are those of the first frame.
-        page = _page_size(database)
+        page = page_size(database)
         size = FRAME + page
     salts = data[16:24] if whole else data[HEADER + 8 : HEADER + 16]
     lost = 0
@@ -62,7 +62,8 @@ def _checksum(data: bytes, order: str, state: tuple[int, int]) -> tuple[int, int
     return first, second
 
 
-def _page_size(database: Path) -> int:
+def page_size(database: Path) -> int:
+    """Bytes of a page, by the header of the file; 512, the least there is, if it does not say."""
     with database.open("rb") as file:
         (size,) = struct.unpack(">H", file.read(18)[16:18].rjust(2, b"\0"))
     return 1 << 16 if size == 1 else max(int(size), 512)

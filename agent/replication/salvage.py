@@ -5,14 +5,15 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 from mapweave.agent.replication.journal import body_of, entry_of, key_holds
 from mapweave.agent.replication.log_entry import LogEntry
 from mapweave.agent.replication.retained_map import RetainedMap
 from mapweave.hybridmap.errors import InvalidFile, InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId, check_name
-from mapweave.storage.database_reader import reading
+from mapweave.storage.database_reader import cut_off, reading
+from mapweave.storage.page_scan import rows_of_pages
 from mapweave.storage.write_ahead_log import lost_commits
 from mapweave.wire.codec import element_of
 from mapweave.wire.keys import check_epoch
@@ -20,6 +21,7 @@ from mapweave.wire.keys import check_epoch
 MOST_LOOKUPS = 1_000_000
 """Changes that are looked up one by one, some ten seconds: a damaged number may be any."""
 COLUMNS = "SELECT epoch, sequence, element, put, stamp_ns, body, crc FROM change"
+COLUMN_COUNT = 7
 
 Row = tuple[int, int, int, int, int, bytes, int]
 
@@ -44,10 +46,16 @@ def salvage(path: Path) -> SalvagedJournal:
         InvalidFile: nothing in it can be read, or an agent uses it.
     """
     with reading(path, "agent journal") as connection:
+        if _read(connection, "SELECT 1 FROM sqlite_master")[1]:
+            # The description of one table is damaged: with this SQLite reads the others all the same.
+            connection.execute("PRAGMA writable_schema=ON")
         owners, owner_error = _read(connection, "SELECT agent FROM owner")
         maps, maps_error = _read(connection, "SELECT epoch FROM map ORDER BY epoch")
         rows, rows_error = _changes(connection, [epoch for (epoch,) in maps if _is_epoch(epoch)])
     error = owner_error or maps_error or rows_error
+    if rows_error:
+        rows = _of_pages(path) | rows
+    error = error and (cut_off(path) or error)
     agent = _agent(rows.values(), owners)
     if not agent:
         raise InvalidFile(f"{path}: nothing can be read ({error or 'this journal has no owner'})")
@@ -101,6 +109,12 @@ def _changes(connection: sqlite3.Connection, epochs: Iterable[int]) -> tuple[dic
     for number in islice(missing, MOST_LOOKUPS):
         rows |= _by_number(_read(connection, query, *number)[0])
     return rows, error
+
+
+def _of_pages(path: Path) -> dict[tuple[int, int], Row]:
+    """Changes that are whole in pages to which no others lead any more."""
+    found = (cast(Row, row) for row in rows_of_pages(path, COLUMN_COUNT) if _is_row(row))
+    return _by_number(row for row in found if key_holds(row[:5], row[6]) and body_of(row[5], row[6]))
 
 
 def _by_number(found: Iterable[Row]) -> dict[tuple[int, int], Row]:

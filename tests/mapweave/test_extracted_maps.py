@@ -12,11 +12,13 @@ from mapweave import HybridMap, MapId, NodeId, read_map_file
 from mapweave.agent.replication import salvage
 from mapweave.agent.replication.journal import Journal
 from mapweave.cli import main
-from mapweave.exit_status import NO
+from mapweave.exit_status import FAILED, NO
+from mapweave.hybridmap.change import NodePut
 from mapweave.hybridmap.errors import InvalidFile
 from mapweave.mapserver.log.postgres_store import PostgresStore
 from mapweave.mapserver.log.sqlite_store import SqliteStore
 from synthetic.maps import write_store
+from tests.agent.replication.test_damaged_journal import MAP, log_of
 from tests.mapweave.command_line import complaint
 from tests.mapweave.test_cli_files import one_node
 
@@ -179,3 +181,45 @@ def test_a_journal_of_which_nothing_can_be_read_is_one_line(tmp_path, capfd):
     data = path.read_bytes()
     path.write_bytes(data[:4096] + bytes(len(data) - 4096))
     assert "nothing can be read (" in complaint(capfd, "map", "extract", path, "-o", tmp_path / "out")
+
+
+@pytest.mark.parametrize("share", [0.95, 0.75, 0.5, 0.3])
+def test_of_a_journal_that_is_cut_off_all_whole_changes_come_back(share, tmp_path, capfd):
+    """SQLite opens no file that is shorter than its header says: nothing came back."""
+    path, log = tmp_path / "r0.sqlite", log_of(80)
+    with closing(Journal(path, "r0")) as journal:
+        journal.open_map(1)
+        for body in log:
+            journal.append(MAP, [body], 0)
+        written = [row for _, row in journal.rows(MAP, 1, journal.head(MAP))]
+    whole = path.read_bytes()
+    cut = whole[: int(share * len(whole))]
+    path.write_bytes(cut)
+    # A node lies in up to two pages, in some order: it is whole if its first and last bytes are there.
+    nodes = [row for row, body in zip(written, log, strict=True) if isinstance(body, NodePut)]
+    there = sum(row[20:60] in cut and row[-60:] in cut for row in nodes)
+    assert main(["map", "extract", str(path), "-o", str(tmp_path / "out")]) == FAILED
+    assert f"the file is cut off: {len(cut)} of {len(whole)} bytes are there" in capfd.readouterr().err
+    found = sum(
+        isinstance(body, NodePut) for body in read_map_file(tmp_path / "out" / "r0.1.mapweave").changes
+    )
+    assert 0.8 * share * len(nodes) < there
+    # The last node was retired.
+    assert there - 1 <= found < len(nodes)
+    assert path.read_bytes() == cut, "the file is as it was"
+
+
+def test_of_a_file_that_ends_in_its_header_or_lacks_its_log_it_is_said_what_is_missing(tmp_path, capfd):
+    path = journal_with(tmp_path / "r0.sqlite", 1)
+    whole = path.read_bytes()
+    path.write_bytes(whole[:1000])
+    cut = f"nothing can be read (cut off: 1000 of {len(whole)} bytes are there)"
+    assert cut in complaint(capfd, "map", "extract", path)
+    path.unlink()
+    with closing(Journal(path, "r0")) as journal:
+        journal.open_map(1)
+        killed = path.read_bytes()
+    alone = tmp_path / "copy" / "r0.sqlite"
+    alone.parent.mkdir()
+    alone.write_bytes(killed)
+    assert "what was written is in r0.sqlite-wal" in complaint(capfd, "map", "extract", alone)
