@@ -67,6 +67,17 @@ def test_an_example_without_its_extra_ends_in_one_line(name: str, tmp_path):
     assert (ran.returncode, ran.stdout) == (MISSING_EXTRA, "")
 
 
+def test_watching_a_fleet_without_a_router_ends_in_one_line(tmp_path):
+    """It was a traceback."""
+    endpoint = f"tcp/127.0.0.1:{free_port()}"
+    ran = subprocess.run(
+        [sys.executable, EXAMPLES / "watch_fleet.py", endpoint],
+        cwd=tmp_path, capture_output=True, text=True, timeout=60, check=False,
+    )  # fmt: skip
+    assert re.fullmatch(rf"no router at {re.escape(endpoint)}: start `mapweave server`, .*\n", ran.stderr)
+    assert (ran.returncode, ran.stdout) == (1, "")
+
+
 @pytest.mark.slow
 @needs_simulator
 def test_they_run(tmp_path, opened):
