@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
-from mapweave.commands.answer import add_json, print_said
+from mapweave.commands.answer import add_json, print_answer, print_said
 from mapweave.commands.map_input import SOURCES, map_source, merge_progress, opened
 from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_network, add_reason, key_holder, network_of, settings_of
@@ -85,10 +84,8 @@ def print_entries(arguments: argparse.Namespace, title: str, kind: type[Body], n
 
     with record_of(arguments) as record:
         entries = [entry for entry, _ in record.annotations().in_force(kind)]
-    if arguments.json:
-        print(json.dumps({title: [json_values(entry) for entry in entries]}))
-    else:
-        print("\n".join(entry.words for entry in entries) or none)
+    values = {title: [json_values(entry) for entry in entries]}
+    print_answer(arguments, values, [entry.words for entry in entries] or [none])
     return 0
 
 

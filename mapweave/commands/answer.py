@@ -3,6 +3,7 @@
 import argparse
 import json
 import sys
+from collections.abc import Iterable
 
 
 def add_json(parser: argparse.ArgumentParser) -> None:
@@ -10,12 +11,14 @@ def add_json(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--json", action="store_true", help="print one JSON object")
 
 
+def print_answer(arguments: argparse.Namespace, values: object, lines: Iterable[str]) -> None:
+    """Print lines, which are made only for people, or with `--json` one object with values."""
+    print(json.dumps(values) if arguments.json else "\n".join(lines))
+
+
 def print_said(arguments: argparse.Namespace, *said: str, **values: object) -> None:
     """Print what was done: lines, or with `--json` one object with these words, as `said`, and values."""
-    if arguments.json:
-        print(json.dumps({"said": "; ".join(said), **values}))
-    else:
-        print("\n".join(said))
+    print_answer(arguments, {"said": "; ".join(said), **values}, said)
 
 
 def print_note(arguments: argparse.Namespace, words: str) -> None:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import hashlib
-import json
 import sys
 import time
 from collections.abc import Sequence
@@ -19,7 +18,7 @@ from mapweave.commands.annotating import (
     record_of,
     two_numbers,
 )
-from mapweave.commands.answer import print_said
+from mapweave.commands.answer import print_answer, print_said
 from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.errors import InvalidValue
 
@@ -147,32 +146,26 @@ def run_list(arguments: argparse.Namespace) -> int:
     with record_of(arguments) as record:
         said = record.annotations()
         entries = [entry for entry, _ in (*said.in_force(Closure), *said.in_force(Preference))]
-        notes = [] if arguments.json else [_without_effect(record, entry) for entry in entries]
-    if arguments.json:
-        print(json.dumps({"annotations": [json_values(entry) for entry in entries]}))
-        return 0
-    now_ns = time.time_ns()
-    for entry, note in zip(entries, notes, strict=True):
-        body = entry.body
-        state = "" if not isinstance(body, Closure) or body.holds(now_ns) else ", not now"
-        print(f"{entry.words}{state}{note}")
-    if not entries:
-        print("nothing is closed, preferred or avoided")
+        lines = [] if arguments.json else [_listed(record, entry) for entry in entries]
+    values = {"annotations": [json_values(entry) for entry in entries]}
+    print_answer(arguments, values, lines or ["nothing is closed, preferred or avoided"])
     return 0
 
 
-def _without_effect(record: Fleet | OfflineRecord, entry: Annotation) -> str:
-    """That something has no effect while a node of it takes no part in the map, and why; or nothing."""
+def _listed(record: Fleet | OfflineRecord, entry: Annotation) -> str:
+    """One line; it has no effect while a node of it takes no part in the map, which says why."""
     from mapweave.hybridmap.annotation import Closure, Preference
     from mapweave.hybridmap.query import ResolveRequest
     from mapweave.mapserver.annotation_effects import nodes_of
 
-    assert isinstance(entry.body, Closure | Preference), "of these kinds"
+    body, note = entry.body, ""
+    assert isinstance(body, Closure | Preference), "of these kinds"
     try:
-        record.resolve(ResolveRequest(tuple(map(str, nodes_of(entry.body)))))
+        record.resolve(ResolveRequest(tuple(map(str, nodes_of(body)))))
     except InvalidValue as error:
-        return f"; without effect: {error}"
-    return ""
+        note = f"; without effect: {error}"
+    state = "" if not isinstance(body, Closure) or body.holds(time.time_ns()) else ", not now"
+    return f"{entry.words}{state}{note}"
 
 
 def _withdraw(arguments: argparse.Namespace, kind: str) -> int:

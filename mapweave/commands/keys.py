@@ -1,13 +1,12 @@
 """`mapweave keys`: who belongs to a fleet, and what each may do."""
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.answer import add_json, print_said
+from mapweave.commands.answer import add_json, print_answer, print_said
 from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.errors import Refused
 
@@ -163,7 +162,7 @@ def _token(arguments: argparse.Namespace) -> int:
     _check_days(arguments.days)
     token = KeyFolder(arguments.keys).token(arguments.name, arguments.days)
     print(f"the token of {arguments.name}, which is shown this once:", file=sys.stderr)
-    print(json.dumps({"name": arguments.name, "token": token}) if arguments.json else token)
+    print_answer(arguments, {"name": arguments.name, "token": token}, [token])
     return 0
 
 
@@ -182,23 +181,22 @@ def _list(arguments: argparse.Namespace) -> int:
         one.name: [token for token in read_tokens(arguments.keys) if token.name == one.name]
         for one in catalogue.identities
     }
-    if arguments.json:
-        rows = [
-            {"name": one.name, "role": one.role, "state": one.state, "issued": one.issued,
-             "expires": one.expires,
-             "tokens": [{"issued": token.issued, "expires": token.expires} for token in tokens[one.name]]}
-            for one in catalogue.identities
-        ]  # fmt: skip
-        print(json.dumps({"fleet": catalogue.fleet, "profile": catalogue.profile, "identities": rows}))
-        return 0
-    print(f"fleet {catalogue.fleet}, profile {catalogue.profile}")
+    rows = [
+        {"name": one.name, "role": one.role, "state": one.state, "issued": one.issued,
+         "expires": one.expires,
+         "tokens": [{"issued": token.issued, "expires": token.expires} for token in tokens[one.name]]}
+        for one in catalogue.identities
+    ]  # fmt: skip
+    values = {"fleet": catalogue.fleet, "profile": catalogue.profile, "identities": rows}
+    lines = [f"fleet {catalogue.fleet}, profile {catalogue.profile}"]
     width = max(len(one.name) for one in catalogue.identities)
     for one in catalogue.identities:
         until = f", until {one.expires[:10]}" if one.expires and not one.revoked else ""
-        print(f"{one.name:<{width}}  {one.role:<8}  {one.state}{until}")
+        lines.append(f"{one.name:<{width}}  {one.role:<8}  {one.state}{until}")
         for token in tokens[one.name]:
             ends = "expired" if token.expired else f"until {token.expires[:10]}"
-            print(f"{'':<{width}}  token of {token.issued[:10]}, {ends}")
+            lines.append(f"{'':<{width}}  token of {token.issued[:10]}, {ends}")
+    print_answer(arguments, values, lines)
     return 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -12,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.annotating import add_plan_option, record_of
-from mapweave.commands.answer import add_json, print_said
+from mapweave.commands.answer import add_json, print_answer, print_said
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.commands.network import add_network, add_reason, add_timeout
 from mapweave.commands.plan import plan_of
@@ -311,10 +310,6 @@ def run_undo(arguments: argparse.Namespace) -> int:
             constrain(arguments, record, about)
             return 0
     known = ManualConstraints(made)
-    if arguments.json:
-        print(json.dumps(constraint_values(known)))
-        return 0
-    holding = known.in_force
-    lines = [f"{k:4}  {event_words(c)}" for k, c in enumerate(made, 1) if c in holding]
-    print("\n".join(lines) or "no manual constraint holds")
+    lines = [f"{k:4}  {event_words(c)}" for k, c in enumerate(made, 1) if c in known.in_force]
+    print_answer(arguments, constraint_values(known), lines or ["no manual constraint holds"])
     return 0

@@ -1,10 +1,9 @@
 """`mapweave map diff`: what is different between two maps."""
 
 import argparse
-import json
 from typing import Any
 
-from mapweave.commands.answer import add_json
+from mapweave.commands.answer import add_json, print_answer
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.exit_status import DONE, NO
 
@@ -39,12 +38,9 @@ def run(arguments: argparse.Namespace) -> int:
     same = content_hash(files[0]) == content_hash(files[1])
     found = difference(*maps)
     said = decided(*files)
-    lines = [*found.words(), *said]
-    if arguments.json:
-        print(json.dumps({"same": same, **found.values(), "decided": said}))
-    elif same:
-        print("the maps are the same")
-    else:
+    lines = ["the maps are the same"] if same else [*found.words(), *said]
+    if not lines:
         which = in_content(*files) or "refusals"
-        print("\n".join(lines or [f"landmarks or edges differ, and nothing that follows: {which}"]))
+        lines = [f"landmarks or edges differ, and nothing that follows: {which}"]
+    print_answer(arguments, {"same": same, **found.values(), "decided": said}, lines)
     return DONE if same else NO

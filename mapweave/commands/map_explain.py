@@ -1,12 +1,11 @@
 """`mapweave map explain`: why nodes or maps are linked, or are not."""
 
 import argparse
-import json
 from typing import Any
 
 from mapweave.commands import values
 from mapweave.commands.annotating import record_of
-from mapweave.commands.answer import add_json
+from mapweave.commands.answer import add_json, print_answer
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.commands.network import add_network
 from mapweave.commands.usage import UsageError
@@ -66,5 +65,5 @@ def run(arguments: argparse.Namespace) -> int:
         assert isinstance(explanation, FleetExplanation), "no route was asked for"
         lines = [line for item in explanation.maps for line in maps_words(item)]
         lines = [*lines, *explanation.accusations] or ["there are no two maps"]
-    print(json.dumps(values) if arguments.json else "\n".join(lines))
+    print_answer(arguments, values, lines)
     return 0

@@ -1,12 +1,11 @@
 """`mapweave map extract`: the robots' own maps of a journal, store or map file as map files."""
 
 import argparse
-import json
 import sys
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.answer import add_json
+from mapweave.commands.answer import add_json, print_answer
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.exit_status import DONE, FAILED, NO
 from mapweave.hybridmap.counted import counted
@@ -59,14 +58,11 @@ def run(arguments: argparse.Namespace) -> int:
             "map": str(map_id), "path": str(path) if nodes or edges else None, "nodes": nodes, "edges": edges,
             "complaint": opened.complaints.get(map_id, ""),
         })  # fmt: skip
-    if arguments.json:
-        print(json.dumps({"maps": rows, "lost": lost}))
-    else:
-        for row in rows:
-            words = f"{counted(row['nodes'], 'node')}, {counted(row['edges'], 'edge')}"
-            print(f"{row['path'] or row['map']}: {words if row['path'] else 'empty, not written'}")
-        if not rows:
-            print(f"{opened.path}: holds no map")
+    lines = []
+    for row in rows:
+        words = f"{counted(row['nodes'], 'node')}, {counted(row['edges'], 'edge')}"
+        lines.append(f"{row['path'] or row['map']}: {words if row['path'] else 'empty, not written'}")
+    print_answer(arguments, {"maps": rows, "lost": lost}, lines or [f"{opened.path}: holds no map"])
     complaints = [*filter(None, (*(row["complaint"] for row in rows), lost))]
     for complaint in complaints:
         print(f"mapweave: {complaint}", file=sys.stderr)

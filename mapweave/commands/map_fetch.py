@@ -1,11 +1,10 @@
 """`mapweave map fetch`: the merged map of a running server into a map file."""
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.answer import add_json
+from mapweave.commands.answer import add_json, print_answer
 from mapweave.commands.missions import fleet_of
 from mapweave.commands.network import add_network
 
@@ -34,8 +33,6 @@ def run(arguments: argparse.Namespace) -> int:
     with fleet_of(arguments) as fleet, working("fetching the map"):
         content, data = fleet.map_and_bytes()
     write_whole(arguments.out, data)
-    if arguments.json:
-        print(json.dumps({"file": str(arguments.out), "title": content.title, "bytes": len(data)}))
-    else:
-        print(f"{arguments.out}: {content.title}, {len(data) / 1e6:.1f} MB")
+    values = {"file": str(arguments.out), "title": content.title, "bytes": len(data)}
+    print_answer(arguments, values, [f"{arguments.out}: {content.title}, {len(data) / 1e6:.1f} MB"])
     return 0

@@ -1,10 +1,10 @@
 """`mapweave map history`: joins, splits and manual constraints, with dates."""
 
 import argparse
-import json
 from typing import Any
 
 from mapweave.commands.annotating import record_of
+from mapweave.commands.answer import print_answer
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.commands.network import add_network
 from mapweave.commands.usage import UsageError
@@ -37,12 +37,10 @@ def run(arguments: argparse.Namespace) -> int:
         raise UsageError(f"--most {arguments.most}: give 1 or more")
     with record_of(arguments) as record:
         events = History(tuple(record.history()))
-    if arguments.json:
-        print(json.dumps(json_values(events)))
-        return 0
     listed = events.history
     left_out = len(listed) - arguments.most
     lines = [f"({left_out} older ones: --most)"] if left_out > 0 else []
     lines += [f"{time_of(h.stamp_ns)} UTC  {h.kind:11}  {h.words}" for h in listed[-arguments.most :]]
-    print("\n".join(lines) if lines else "no joins, splits, manual constraints, annotations or commands yet")
+    nothing = "no joins, splits, manual constraints, annotations or commands yet"
+    print_answer(arguments, json_values(events), lines or [nothing])
     return 0

@@ -1,12 +1,11 @@
 """`mapweave map import`: a pose graph of others, optimised as the merge optimises."""
 
 import argparse
-import json
 import math
 from pathlib import Path
 from typing import Any
 
-from mapweave.commands.answer import add_json
+from mapweave.commands.answer import add_json, print_answer
 from mapweave.commands.usage import UsageError
 from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile
@@ -60,11 +59,9 @@ def run(arguments: argparse.Namespace) -> int:
         "chi2_before": before,
         "chi2": graph.chi2(poses),
     }
-    if arguments.json:
-        print(json.dumps(outcome))
-    else:
-        print(
-            f"{arguments.out}: {len(poses)} vertices, {counted(len(graph.edges), 'edge')}, "
-            f"chi-square {outcome['chi2_before']:.6g} before, {outcome['chi2']:.6g} now"
-        )
+    words = (
+        f"{arguments.out}: {len(poses)} vertices, {counted(len(graph.edges), 'edge')}, "
+        f"chi-square {outcome['chi2_before']:.6g} before, {outcome['chi2']:.6g} now"
+    )
+    print_answer(arguments, outcome, [words])
     return 0

@@ -1,10 +1,10 @@
 """`mapweave map merge`: map files become one, without a server."""
 
 import argparse
-import json
 from pathlib import Path
 from typing import Any
 
+from mapweave.commands.answer import print_answer
 from mapweave.commands.map_input import SOURCES, map_source, merge_progress, opened
 from mapweave.commands.network import settings_of
 
@@ -45,22 +45,18 @@ def run(arguments: argparse.Namespace) -> int:
     write_map_file(arguments.out, map_file_of(merged, parts.history, parts.annotations, parts.images))
     joined = joinings((), merged)
     apart = [explanation.reason for explanation in explain_fleet(merged, 20) if not explanation.joined]
-    if arguments.json:
-        outcome = {
-            "out": str(arguments.out),
-            "nodes": len(merged.poses),
-            "maps": [str(explanation) for explanation in merged.maps],
-            "components": len(merged.components),
-            "links": sum(not link.within for link in merged.links),
-            "loops": sum(link.within for link in merged.links),
-            "refused": sum(refusal.link is not None for refusal in merged.refused),
-            "notes": list(parts.notes),
-            "joined": list(joined),
-            "apart": apart,
-        }
-        print(json.dumps(outcome))
-    else:
-        print(f"{arguments.out}: {merged.summary()}")
-        for words in (*parts.notes, *joined, *apart):
-            print(f"  {words}")
+    outcome = {
+        "out": str(arguments.out),
+        "nodes": len(merged.poses),
+        "maps": [str(explanation) for explanation in merged.maps],
+        "components": len(merged.components),
+        "links": sum(not link.within for link in merged.links),
+        "loops": sum(link.within for link in merged.links),
+        "refused": sum(refusal.link is not None for refusal in merged.refused),
+        "notes": list(parts.notes),
+        "joined": list(joined),
+        "apart": apart,
+    }
+    more = [f"  {words}" for words in (*parts.notes, *joined, *apart)]
+    print_answer(arguments, outcome, [f"{arguments.out}: {merged.summary()}", *more])
     return 0

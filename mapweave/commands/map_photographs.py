@@ -1,13 +1,12 @@
 """`mapweave map from-photos`: a map from photographs of a stretch, taken by hand."""
 
 import argparse
-import json
 import time
 from pathlib import Path
 from typing import Any
 
 from mapweave.commands import values
-from mapweave.commands.answer import add_json
+from mapweave.commands.answer import add_json, print_answer
 from mapweave.commands.map_input import merge_progress
 from mapweave.commands.network import add_network, add_timeout, connect, network_of, reach, settings_of
 from mapweave.hybridmap.errors import NotConnected
@@ -72,12 +71,12 @@ def run(arguments: argparse.Namespace) -> int:
                 raise NotConnected(f"no server {network.server} at {where} took the map: see {journal}")
         finally:
             bus.close()
-    if arguments.json:
-        outcome = {"out": str(arguments.out), "map": str(map_id), "landmarks": landmarks}
-        print(json.dumps({**outcome, "sent": arguments.send}))
-    else:
-        print(
-            f"{arguments.out}: map {map_id}, {len(images)} nodes with {min(landmarks)} to {max(landmarks)} "
-            f"landmarks; its scale is known to a third"
-        )
+    outcome = {
+        "out": str(arguments.out), "map": str(map_id), "landmarks": landmarks, "sent": arguments.send,
+    }  # fmt: skip
+    words = (
+        f"{arguments.out}: map {map_id}, {len(images)} nodes with {min(landmarks)} to {max(landmarks)} "
+        f"landmarks; its scale is known to a third"
+    )
+    print_answer(arguments, outcome, [words])
     return 0

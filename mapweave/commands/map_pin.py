@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import argparse
-import json
 import math
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.annotating import add_plan_option, add_record_options, record_of
-from mapweave.commands.answer import print_said
+from mapweave.commands.answer import print_answer, print_said
 from mapweave.commands.plan import plan_place
 from mapweave.commands.usage import UsageError
 from mapweave.hybridmap.errors import InvalidValue
@@ -79,20 +78,14 @@ def _list(arguments: argparse.Namespace) -> int:
         pins = sorted(record.annotations().in_force(Pin), key=lambda item: item[0].stamp_ns)
         placed = None if arguments.plan is None else record.plans().plan(arguments.plan)
         at = [None if placed is None else _on_plan(record, pin.node, placed) for _, pin in pins]
-    if arguments.json:
-        values = [json_values(entry) for entry, _ in pins]
-        if placed is not None:
-            values = [
-                {**one, "plan_from_node": json_values(pose)} for one, pose in zip(values, at, strict=True)
-            ]
-        print(json.dumps({"pins": values}))
-        return 0
+    values, lines = [], []
     for (entry, pin), pose in zip(pins, at, strict=True):
+        on_plan = {} if placed is None else {"plan_from_node": json_values(pose)}
+        values.append({**json_values(entry), **on_plan})
         where = pin.words if placed is None else plan_place(placed, pose)
         said = f" ({entry.because})" if entry.because else ""
-        print(f"{pin.node} {where}{said}, by {entry.who or 'a person'}")
-    if not pins:
-        print("nothing is pinned: mapweave map pin NODE")
+        lines.append(f"{pin.node} {where}{said}, by {entry.who or 'a person'}")
+    print_answer(arguments, {"pins": values}, lines or ["nothing is pinned: mapweave map pin NODE"])
     return 0
 
 

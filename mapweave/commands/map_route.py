@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from itertools import pairwise
 from pathlib import Path
@@ -11,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
 from mapweave.commands.annotating import add_near, add_plan_option, record_of
-from mapweave.commands.answer import add_json
+from mapweave.commands.answer import add_json, print_answer
 from mapweave.commands.map_input import SOURCES, map_source
 from mapweave.commands.network import add_network
 from mapweave.exit_status import DONE, NO
@@ -97,7 +96,7 @@ def run(arguments: argparse.Namespace) -> int:
             draw_route(arguments.draw, record.map(), explanation)
             values["picture"] = str(arguments.draw)
             lines.append(f"  picture   {arguments.draw}")
-    print(json.dumps(values) if arguments.json else "\n".join(lines))
+    print_answer(arguments, values, lines)
     if arguments.draw is not None and not explanation.found:
         print(f"{arguments.draw} is not drawn: there is no way", file=sys.stderr)
     return DONE if explanation.found else NO

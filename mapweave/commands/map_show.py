@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 from collections import Counter
 from collections.abc import Mapping
@@ -11,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
+from mapweave.commands.answer import print_answer
 from mapweave.commands.map_input import SOURCES, map_source, merged_with_progress, opened
 from mapweave.hybridmap.counted import counted
 from mapweave.hybridmap.errors import InvalidFile
@@ -130,13 +130,10 @@ def run(arguments: argparse.Namespace) -> int:
             # A map may lie where nothing can be written; its summary is what most want to know.
             summary.pop("drawn", None)
             print(f"mapweave: {error}; give -o PNG, or --no-picture", file=sys.stderr)
-    if arguments.json:
-        print(json.dumps(summary))
-    else:
-        for key, value in summary.items():
-            if value is None:
-                continue  # a database has no size of a file
-            print(f"{key.replace('_', ' '):26} {_text(value)}")
+    # A database has no size of a file.
+    known = {key: value for key, value in summary.items() if value is not None}
+    lines = (f"{key.replace('_', ' '):26} {_text(value)}" for key, value in known.items())
+    print_answer(arguments, summary, lines)
     return 0
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 from typing import TYPE_CHECKING, Any
 
 from mapweave.commands import values
@@ -14,7 +13,7 @@ from mapweave.commands.annotating import (
     area_fields,
     record_of,
 )
-from mapweave.commands.answer import print_said
+from mapweave.commands.answer import print_answer, print_said
 from mapweave.commands.usage import UsageError, arguments_read
 from mapweave.hybridmap.errors import InvalidValue
 
@@ -92,18 +91,13 @@ def run_list(arguments: argparse.Namespace) -> int:
 
     with record_of(arguments) as record:
         places = [(entry, *_where(record, entry)) for entry, _ in record.annotations().in_force(Place)]
-    if arguments.json:
-        values = [{**json_values(entry), "at": at, "note": note} for entry, at, note in places]
-        print(json.dumps({"places": values}))
-        return 0
-    width = max((len(entry.name) for entry, _, _ in places), default=0)
+    width, lines = max((len(entry.name) for entry, _, _ in places), default=0), []
     for entry, _, note in places:
         said = f" ({entry.because})" if entry.because else ""
-        print(f"{entry.name:<{width}}  {entry.body.words}{said}, by {entry.who or 'a person'}")
-        if note:
-            print(f"{'':<{width}}  {note}")
-    if not places:
-        print("no place has a name yet: mapweave place add NAME NODE")
+        lines.append(f"{entry.name:<{width}}  {entry.body.words}{said}, by {entry.who or 'a person'}")
+        lines += [f"{'':<{width}}  {note}"] if note else []
+    values = {"places": [{**json_values(entry), "at": at, "note": note} for entry, at, note in places]}
+    print_answer(arguments, values, lines or ["no place has a name yet: mapweave place add NAME NODE"])
     return 0
 
 

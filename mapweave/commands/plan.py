@@ -17,7 +17,7 @@ from mapweave.commands.annotating import (
     record_of,
     two_numbers,
 )
-from mapweave.commands.answer import print_said
+from mapweave.commands.answer import print_answer, print_said
 from mapweave.commands.network import settings_of
 from mapweave.commands.usage import UsageError
 from mapweave.hybridmap.errors import InvalidFile
@@ -153,10 +153,8 @@ def run_show(arguments: argparse.Namespace) -> int:
     with record_of(arguments) as record:
         plans = record.plans()
         shown = plans.plans if arguments.name is None else (plans.plan(arguments.name),)
-        if arguments.json:
-            print(json.dumps(json_values(PlacedPlans(shown))))
-        else:
-            print("\n".join(line for placed in shown for line in plan_words(placed)) or "there is no plan")
+        lines = [line for placed in shown for line in plan_words(placed)] or ["there is no plan"]
+        print_answer(arguments, json_values(PlacedPlans(shown)), lines)
         if arguments.picture is not None:
             if len(shown) != 1:
                 raise UsageError("name the plan to draw: mapweave plan show NAME -o PNG")

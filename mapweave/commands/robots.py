@@ -1,10 +1,9 @@
 """`mapweave robots`: list the drivers."""
 
 import argparse
-import json
 from typing import Any
 
-from mapweave.commands.answer import add_json
+from mapweave.commands.answer import add_json, print_answer
 
 
 def add_to(commands: Any) -> None:
@@ -25,14 +24,11 @@ def run(arguments: argparse.Namespace) -> int:
     from mapweave.extras import extra_of, how_to_install
 
     robots = listing()
-    if arguments.json:
-        listed = [
-            {"name": r.name, "robots": r.line, "missing": r.missing or None, "error": r.error or None}
-            for r in robots
-        ]
-        print(json.dumps({"drivers": listed}))
-        return 0
-    width = max(len(robot.name) for robot in robots)
+    listed = [
+        {"name": r.name, "robots": r.line, "missing": r.missing or None, "error": r.error or None}
+        for r in robots
+    ]
+    width, lines = max(len(robot.name) for robot in robots), []
     for robot in robots:
         line = robot.line
         if robot.missing:
@@ -42,5 +38,6 @@ def run(arguments: argparse.Namespace) -> int:
                 line = f"needs the extra {extra!r}: {how_to_install(extra)}"
         elif robot.error:
             line = f"cannot be loaded: {robot.error}"
-        print(f"{robot.name:<{width}}  {line}")
+        lines.append(f"{robot.name:<{width}}  {line}")
+    print_answer(arguments, {"drivers": listed}, lines)
     return 0
