@@ -109,6 +109,7 @@ class Troubles:
             log.info("over after %.0f s: %s", now - one.since, one.words)
 
 
+NO_REPORT = "the robot's base reports nothing"
 NO_ANSWER = "no map server answered"
 FAILED = "failed"
 """In place of the certainty of an answer."""
@@ -163,7 +164,7 @@ class FleetClient(BusClient):
         self._status = Status("starting", "nothing sensed yet", 0, 0, Pose2(), False)
         self._stamp_ns = self._skipped = 0
         self._battery: float | None = None
-        self._silent = ""
+        self._silent, self._silent_since = "", math.inf
         self._troubles = Troubles()
         self._missions = missions
         self._unsent, self._placed, self._failure = unsent, placed, failure
@@ -212,12 +213,20 @@ class FleetClient(BusClient):
             skipped: images that were skipped so far.
             silent: why the robot's base does not answer; empty while it does.
         """
-        self._status, self._silent = status, silent
+        self._status, self._silent, self._silent_since = status, silent, math.inf
         self._stamp_ns, self._battery, self._skipped = stamp_ns, battery, skipped
         mission = self._missions.report
         self._troubles.mission(None if mission is None else (mission.order.id, mission.state))
         if publish:
             self._bus.publish(self._keys.agent_status(self._agent), encode(self.status()))
+
+    def base_silent(self, seconds: float) -> None:
+        """Publish that the base has not reported for some time, s, while the loop waits for it.
+
+        The status is that of its last report. Over with the next `report`; called from any thread.
+        """
+        self._silent_since = time.monotonic() - seconds
+        self._bus.publish(self._keys.agent_status(self._agent), encode(self.status()))
 
     def stands(self, why: str) -> None:
         """Publish that the robot stands, and why, while nothing is sensed: the status of before is old."""
@@ -253,8 +262,9 @@ class FleetClient(BusClient):
         """The status as others receive it; from any thread."""
         traffic = self._bus.traffic if isinstance(self._bus, TrafficMeter) else 0
         # What fails now comes before a question that once had no answer, and first what the robot drives by.
-        failure = one_line(self._silent or self._failure())
-        trouble, age = (failure, 0.0) if failure else self._troubles.newest()
+        silent = max(time.monotonic() - self._silent_since, 0.0)
+        failure = one_line(NO_REPORT if silent else self._silent or self._failure())
+        trouble, age = (failure, silent) if failure else self._troubles.newest()
         status = self._status
         return AgentStatus(
             replace(status, doing=one_line(status.doing), detail=one_line(status.detail)),

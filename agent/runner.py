@@ -67,6 +67,7 @@ class Runner:
         self._print = print_line
         self._clock, self._recorded = clock, recorded
         self._previous: tuple[int, float] | None = None
+        self._waits_since: float | None = None
         self._faulty = ""
         self._pipeline = pipeline
         self._fleet = fleet
@@ -152,7 +153,11 @@ class Runner:
         """
         first, tick = self._ticks, robot.describe().tick
         while not (stop.is_set() or self._pipeline.lost):
-            observation = robot.sense()
+            self._waits_since = self._clock()
+            try:
+                observation = robot.sense()
+            finally:
+                self._waits_since = None
             if observation is None:
                 break
             observation = _kept(observation)
@@ -166,6 +171,12 @@ class Runner:
             self.busy = self._clock() - began
             self._previous = observation.stamp_ns, self.busy
         return self._ticks - first
+
+    @property
+    def waiting(self) -> float:
+        """How long the loop has waited for an observation, s; 0 while it works on one. From any thread."""
+        since = self._waits_since
+        return 0.0 if since is None else self._clock() - since
 
     def _count_skipped(self, stamp_ns: int, tick: float) -> None:
         """Count the images that came while the tick before took too long.

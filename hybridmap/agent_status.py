@@ -121,8 +121,9 @@ class AgentStatus:
         placed: nodes of its map of which it knows where they lie in the merged map.
         mission: the mission that holds, and what has become of it.
         battery: charge, if the driver tells it.
-        last_error: why its base does not answer, else why nothing is saved or taken at present, else why its
-            questions to the fleet have no answer, in words; empty once that is over.
+        last_error: why its base does not answer, or that it reports nothing, else why nothing is saved or
+            taken at present, else why its questions to the fleet have no answer, in words; empty once that is
+            over.
         error_age: for how long the last of these has been so, s.
         skipped: images that it has skipped because a tick took too long.
         drive: who drives it by hand, or has last since its agent began; None without a drive.

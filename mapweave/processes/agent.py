@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from mapweave.agent.base_watch import watching
 from mapweave.agent.calibration.correction import declaring, geometry_of
 from mapweave.agent.calibration.online import OnlineCalibration
 from mapweave.agent.drivers.robot import Robot
@@ -387,8 +389,11 @@ class Agent:
 
     def run(self, robot: Robot, stop: threading.Event) -> None:
         """Loop until the driver has no more observations or `stop` is set."""
+        # In lock-step a base waits for other robots, which is no failure.
+        live = not self._options.recorded and isinstance(self._options.synchronization, FreeRunning)
         while True:
-            self.runner.run(robot, stop)
+            with watching(lambda: self.runner.waiting, self._fleet.base_silent) if live else nullcontext():
+                self.runner.run(robot, stop)
             if stop.is_set() or not self.pipeline.lost:
                 return
             self.begin_new_map(stop, lambda: robot.act(Command(0.0, 0.0)))
