@@ -92,18 +92,6 @@ class FieldOfView:
         """(...) rad, room left at poses (..., 3) x m, y m, heading rad, in goal."""
         return self._least(self.rooms(poses))
 
-    def slack_table(self, x: Array, y: Array, headings: Array) -> Array:
-        """(H, ...) rad, slack at positions x, y (...) for each of the headings (H,): bearings computed once.
-
-        With a camera ahead of the axle the bearings depend on the heading too, and nothing is saved.
-        """
-        if self._mount_forward == 0.0:
-            direction, width = self._from_above(x, y)
-            gamma = direction - headings.reshape(-1, *([1] * (x.ndim + 1)))
-            gamma -= 2.0 * math.pi * np.round(gamma / (2.0 * math.pi))
-            return self._least(width - np.abs(gamma))
-        return np.stack([self.slack(np.stack([x, y, np.full_like(x, h)], axis=-1)) for h in headings])
-
     def spread(self, most: int) -> FieldOfView:
         """A stricter, faster field: at most `most` landmarks, evenly over the bearings at the goal."""
         if self.count <= most:

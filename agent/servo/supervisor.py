@@ -12,7 +12,7 @@ from mapweave.agent.servo.leg_controller import LegController, SpeedLimits, clip
 from mapweave.agent.servo.margins import FIELD_MARGIN, LEAST_MARGIN, MIN_VISIBLE, TURN_GAIN
 from mapweave.agent.servo.obstacles import ObstacleMemory
 from mapweave.agent.servo.plan import LEG_PRICE, TURN_PRICE, ServoPlan, Surroundings, arc, cost_of, sample
-from mapweave.agent.servo.planner import needs_thought, quick_plan, thorough_plan
+from mapweave.agent.servo.planner import find_plan
 from mapweave.agent.servo.polar import Polar, continued, polar_of
 from mapweave.agent.servo.recovery import Recovery
 from mapweave.agent.servo.rollout import roll_out
@@ -69,7 +69,7 @@ class Servo:
             points_in_goal: (N, 3) m, landmarks in the goal's robot frame; rows with NaN are ignored.
 
         Returns:
-            Whether a way is known already; if not, `command` makes a longer search with the robot at rest.
+            Whether a way is known.
         """
         self.switches = 0
         self._visibility = Visibility(self._description.camera)
@@ -83,10 +83,9 @@ class Servo:
         self._in_dead_zone = False
         self._settled = 0
         self._recovery = Recovery(self._limits)
-        self._wait, self._patience, self._thinking = 0, 2, False
+        self._wait, self._patience = 0, 2
         self._visibility.update(goal_from_robot, points_in_goal, None)
         self._choose(goal_from_robot, self._surroundings(goal_from_robot))
-        self._thinking = False
         return self._law is not None or self._plan is not None
 
     @property
@@ -106,7 +105,7 @@ class Servo:
         pose = Pose2(goal_from_robot.x, goal_from_robot.y, wrap_angle(goal_from_robot.heading))
         if math.hypot(pose.x, pose.y) <= DEAD_ZONE:
             return False
-        plan = quick_plan(self._surroundings(pose), pose)
+        plan = find_plan(self._surroundings(pose), pose)
         if plan is None:
             return False
         self._plan, self._leg, self._follower = plan, 0, None
@@ -150,8 +149,6 @@ class Servo:
                 self._choose(pose, surroundings)
             if self._law is not None:
                 return self._drive_law(pose, surroundings)
-            if self._thinking:
-                return self._step(Command(), "driving", "standing still to think the way over")
             if self._plan is None:
                 break
             step = self._drive_leg(pose, surroundings)
@@ -196,22 +193,14 @@ class Servo:
                 self._take_law(law, pose)
 
     def _choose(self, pose: Pose2, around: Surroundings) -> None:
-        """Find a way from here: the cheaper of laws and plan, laws favoured.
-
-        A long search is made only after a tick of standing still: the wheels do not turn while it takes.
-        """
+        """Find a way from here: the cheaper of laws and plan, laws favoured."""
         if self._wait > 0:
             self._wait -= 1
             return
         if math.hypot(pose.x, pose.y) < 1e-9 or self._visibility.field.count < MIN_VISIBLE:
             return
-        search = thorough_plan if self._thinking else quick_plan
-        plan = search(around, pose)
+        plan = find_plan(around, pose)
         law = self._best_law(polar_of(pose), around, plan.cost if plan else math.inf)
-        if law is None and not self._thinking and needs_thought(plan):
-            self._thinking = True
-            return
-        self._thinking = False
         if law is not None:
             self._take_law(law, pose)
         elif plan is not None:

@@ -198,7 +198,7 @@ def test_nodes_are_found_where_they_are_expected_only(walls, node):
 
 def test_a_servo_that_gets_no_nearer_gives_way_to_a_drive_around(node, monkeypatch):
     """A robot waited at an obstacle until its patience ended, and the drive around had none left."""
-    standing = ServoStep(Command(), "driving", None, "standing still to think the way over")
+    standing = ServoStep(Command(), "driving", None, "leg 1 of 2")
 
     monkeypatch.setattr(Servo, "command", lambda *_: standing)
     follower = follower_at_the_goal(node)

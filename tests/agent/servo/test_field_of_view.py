@@ -1,6 +1,5 @@
 """The slack against brute-force projection."""
 
-import math
 from collections.abc import Callable
 from dataclasses import replace
 
@@ -45,18 +44,6 @@ def test_slack_changes_no_faster_than_the_heading(
     turned = np.array([pose_vector[0], pose_vector[1], pose_vector[2] + turn])
     difference = field.slack(turned) - field.slack(np.array(pose_vector))
     assert abs(float(difference)) <= abs(turn) + 1e-9
-
-
-@pytest.mark.parametrize("forward", [0.0, 0.12])
-def test_the_table_is_the_slack_pose_by_pose(robot: RobotDescription, forward: float):
-    points = np.random.default_rng(2).uniform([1, -2, 0], [5, 2, 0.5], (8, 3))
-    field = FieldOfView(points, replace(robot.camera, mount_forward=forward))
-    x, y = np.meshgrid(np.linspace(-1, 0.5, 4), np.linspace(-1, 1, 3), indexing="ij")
-    headings = np.linspace(-math.pi, math.pi, 9)
-    table = field.slack_table(x, y, headings)
-    for k, heading in enumerate(headings):
-        one_by_one = field.slack(np.stack([x, y, np.full(x.shape, heading)], axis=-1))
-        assert table[k] == pytest.approx(one_by_one, abs=1e-9)
 
 
 def test_fewer_landmarks_are_a_stricter_field(robot: RobotDescription):

@@ -161,35 +161,3 @@ def test_landmarks_without_depth_are_ignored(robot: RobotDescription):
     step = servo.command(Pose2(-1.0, 0.2, 0.0), points, np.ones(17, dtype=bool), NOTHING)
     assert step.state in ("driving", "turning")
     assert not servo.start(Pose2(-1.0, 0.2, 0.0), np.full((9, 3), np.nan))
-
-
-@pytest.mark.slow
-def test_a_long_search_is_made_at_rest(robot: RobotDescription, simulate: Callable[..., Any], monkeypatch):
-    import mapweave.agent.servo.supervisor as module
-
-    searched: list[int] = []
-    run_steps: list[Any] = []
-    thorough = module.thorough_plan
-
-    def counting(*arguments: Any) -> Any:
-        searched.append(len(run_steps))
-        return thorough(*arguments)
-
-    servo = Servo(robot)
-    command = servo.command
-
-    def recording(*arguments: Any) -> Any:
-        step = command(*arguments)
-        run_steps.append(step)
-        return step
-
-    monkeypatch.setattr(module, "thorough_plan", counting)
-    monkeypatch.setattr(servo, "command", recording)
-    points = np.array([[x, y, 0.3] for x in (3.0, 4.0) for y in np.linspace(-2.0, 2.0, 9)])
-    wall = np.column_stack([np.full(25, -0.9), np.linspace(-0.6, 0.6, 25)])
-    run = simulate(servo, Pose2(-1.9, 0.0, 0.0), points, np.random.default_rng(6), obstacles=wall)
-    assert run.parked
-    assert run.least_distance >= robot.radius
-    assert searched
-    for tick in searched:
-        assert run_steps[tick - 1].command.forward == run_steps[tick - 1].command.turn == 0.0
