@@ -13,7 +13,7 @@ from benchmarks.relocalize.score import ScoredAnswer
 from mapweave.hybridmap.descriptor import root_sift
 from mapweave.hybridmap.query import RelocalizeAnswer
 from mapweave.mapserver.relocalization.candidates import MOST_COMPARED, RetrievedNodes
-from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, is_lonely
+from mapweave.mapserver.relocalization.place_hypotheses import NodeMatch, is_one_thing
 from mapweave.mapserver.relocalization.relocalizer import Relocalizer
 from mapweave.mapserver.relocalization.view_registration import Registration
 from mapweave.registration.matching import match_vectors, squared_distances
@@ -68,8 +68,8 @@ class Exhaustive:
             rng = np.random.default_rng(zlib.crc32(str(place.node.id).encode()))
             verdict = examine_matches(place.node, view, pairs, self._settings, rng)
             if isinstance(verdict, Recognition):
-                lonely = is_lonely(place.node, view, verdict)
-                sightings.append(NodeMatch(place.node.id, verdict, lonely=lonely))
+                one_thing = is_one_thing(place.node, view, verdict)
+                sightings.append(NodeMatch(place.node.id, verdict, one_thing=one_thing))
         most = np.argsort(-counts, kind="stable")[:RIVALS].tolist()
         ranked = [(self._place_of(k).node.id, float(counts[k])) for k in most]
         matches = self._relocalizer.registration.refined(view, sightings)

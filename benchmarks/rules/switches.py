@@ -16,7 +16,7 @@ from mapweave.agent.mapping import image_acceptance
 from mapweave.agent.mapping.kidnap_detection import FrameOverlap, KidnapDetector
 from mapweave.agent.mapping.odometry_consistency import OdometryConsistency
 from mapweave.hybridmap.pose import Array
-from mapweave.mapserver.relocalization import verdict, view_registration
+from mapweave.mapserver.relocalization import verdict
 from mapweave.mapserver.relocalization.aliased_regions import AliasedRegions
 from mapweave.mapserver.relocalization.place_hypotheses import PlaceHypothesis
 from mapweave.mapserver.relocalization.verdict import HypothesisSelector
@@ -132,7 +132,6 @@ RECOGNITION_RULES: Mapping[str, tuple[Switch, ...]] = {
 """Rules on the registration of nodes, and of views, with nodes."""
 PLACE_RULES: Mapping[str, tuple[Switch, ...]] = {
     "aliased regions": ((AliasedRegions, "counterpart", lambda *_: None),),
-    "lonely recognition": ((view_registration, "is_lonely", lambda *_: False),),
     "one weak node": ((verdict, "ALONE", 0),),
     "rivals": ((HypothesisSelector, "_rivals", _first),),
 }

@@ -37,12 +37,12 @@ class NodeMatch:
     Attributes:
         node: which.
         recognition: how.
-        lonely: it rests on one thing, and nothing is seen of what should be visible around that.
+        one_thing: it rests on one thing, and nothing is seen of what should be visible around that.
     """
 
     node: NodeId
     recognition: Recognition
-    lonely: bool = False
+    one_thing: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +67,7 @@ class PlaceHypothesis:
         return self.matches[0]
 
 
-def is_lonely(node: Node, view: View, recognition: Recognition) -> bool:
+def is_one_thing(node: Node, view: View, recognition: Recognition) -> bool:
     """Whether a recognition rests on one thing, and nothing is seen of what should be visible around it.
 
     A thing can be moved with all its landmarks. Then landmarks away from it, each with the same detection

@@ -81,7 +81,7 @@ def similar_places(verdict: Verdict, least_features: int) -> tuple[SimilarPlace,
 
 
 def _weakness(match: NodeMatch) -> str:
-    if match.lonely:
+    if match.one_thing:
         return "all landmarks that agree are on one thing, and nothing of what should be around it is seen"
     agree = f"{match.recognition.inliers} landmarks agree"
     return f"{agree}; {ALONE} are needed, or a second node that confirms it"

@@ -85,7 +85,7 @@ class HypothesisSelector:
         places = self.places(registration)
         rivals = self._rivals(places)
         outcome = self._refusal(registration, places, rivals)
-        weak = outcome is Outcome.ONE_WEAK_NODE and not places[0].best.lonely
+        weak = outcome is Outcome.ONE_WEAK_NODE and not places[0].best.one_thing
         if outcome is not None and not weak:
             return Verdict(outcome, registration, places, rivals)
         ranked = [node for node, _ in registration.candidates.ranked]
@@ -113,7 +113,7 @@ class HypothesisSelector:
                 Outcome.ONE_WEAK_NODE,
                 len(matches) == 1 and matches[0].recognition.inliers < ALONE,
             ),
-            (Outcome.ONE_THING, all(match.lonely for match in matches)),
+            (Outcome.ONE_THING, all(match.one_thing for match in matches)),
         )
         return next((outcome for outcome, holds in reasons if holds), None)
 

@@ -12,7 +12,7 @@ from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.relocalization.aliased_landmarks import EXPLAINED_PX, between, unexplained
 from mapweave.mapserver.relocalization.candidates import RetrievedNodes
-from mapweave.mapserver.relocalization.place_hypotheses import ALONE, SLIGHT, NodeMatch, is_lonely
+from mapweave.mapserver.relocalization.place_hypotheses import ALONE, SLIGHT, NodeMatch, is_one_thing
 from mapweave.merge.pose_graph.merged_map import MergedMap
 from mapweave.registration.matching import match
 from mapweave.registration.pose_refinement import refine_pose
@@ -77,7 +77,7 @@ class ViewRegistration:
             seed = zlib.crc32(view.codes.tobytes(), zlib.crc32(str(node_id).encode()))
             result = examine_matches(node, view, pairs, self._settings, np.random.default_rng(seed))
             if isinstance(result, Recognition):
-                matches.append(NodeMatch(node_id, result, lonely=is_lonely(node, view, result)))
+                matches.append(NodeMatch(node_id, result, one_thing=is_one_thing(node, view, result)))
                 best_score = max(best_score, score)
             else:
                 refusals.append((node_id, result))

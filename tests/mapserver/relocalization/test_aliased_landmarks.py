@@ -9,7 +9,7 @@ from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.hybridmap.query import View
 from mapweave.mapserver.relocalization.aliased_landmarks import unexplained
-from mapweave.mapserver.relocalization.place_hypotheses import hidden, is_lonely
+from mapweave.mapserver.relocalization.place_hypotheses import hidden, is_one_thing
 from mapweave.registration.recognition import Recognition, recognise
 from synthetic.world import CAMERA, Sensing, room, take_node, take_view
 
@@ -49,7 +49,7 @@ def test_matches_on_one_thing_count_as_isolated_only_if_the_rest_is_missing():
         seen = View(pixels, np.zeros((len(pixels), 32), np.uint8), camera)
         pairs = np.column_stack([landmarks, np.arange(len(landmarks))])
         result: Recognition = replace(recognition, node_from_robot=HERE, pairs=pairs, evidence=evidence)
-        return is_lonely(one, seen, result)
+        return is_one_thing(one, seen, result)
 
     spread = float(np.sqrt(np.linalg.eigvalsh(np.cov(points[near][:, :2].T))[-1]))
     assert spread < 0.35
