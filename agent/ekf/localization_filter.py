@@ -11,14 +11,15 @@ from mapweave.agent.ekf.gating import GATE_PROBABILITY, pixel_gate
 from mapweave.agent.ekf.inverse_depth import project_anchored, rays_of_points
 from mapweave.agent.ekf.iterated import LandmarkMeasurements, iterated_update
 from mapweave.agent.ekf.landmark_estimates import Ids, NodeLandmarks
-from mapweave.agent.ekf.localization_state import NEAREST_SCALE, LocalizationState, turning
+from mapweave.agent.ekf.localization_state import NEAREST_SCALE, LocalizationState
+from mapweave.agent.ekf.measurement_model import slots_of
 from mapweave.agent.ekf.motion import WIDEST_SLOPE, WheelNoise, move_pose
 from mapweave.agent.ekf.update_report import Health, UpdateReport
 from mapweave.agent.observation import Odometry
 from mapweave.agent.settings import FilterSettings
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import InvalidValue
-from mapweave.hybridmap.pose import Array, Pose2, PoseGaussian
+from mapweave.hybridmap.pose import Array, PoseGaussian
 from mapweave.registration.planar_pose import PlanarPoseSettings, solve_planar_pose
 
 ITERATIONS = 4
@@ -89,19 +90,25 @@ class LocalizationFilter:
         Raises:
             InvalidValue: shapes that do not belong together, or an id twice.
         """
+        n = len(ids)
+        if points_in_node.shape != (n, 3) or covariances.shape != (n, 3, 3):
+            raise InvalidValue("localization: ids, points and covariances do not belong together")
+        if len(np.unique(ids)) != n:
+            raise InvalidValue("localization: a landmark can be given only once")
         self._settings = settings or FilterSettings()
         self._side_slip = side_slip
-        self.ids: Ids = np.zeros(0, np.int64)
         self._camera = camera
         self._wheels = WheelNoise(axle, wheel_noise)
         self._focal = np.array([camera.fx, camera.fy])
         self._centre = np.array([camera.cx, camera.cy])
-        self._state = LocalizationState.of_prior(prior)
         self._bad = 0
         self._bad_reason = ""
         self._rng = np.random.default_rng(0)
-        self._insert(ids, points_in_node, covariances, np.zeros((len(ids), 3, 3)))
-        self._state = self._state.of_unknown_scale(scale_share)
+        rays, by_point = rays_of_points(points_in_node, camera.mount_forward, camera.mount_height)
+        fit = _anchorable(rays) & np.isfinite(covariances).all(axis=(1, 2))
+        own = by_point[fit] @ covariances[fit] @ np.swapaxes(by_point[fit], 1, 2)
+        self.ids: Ids = np.asarray(ids, np.int64)[fit]
+        self._state = LocalizationState.of_prior(prior, rays[fit], own).of_unknown_scale(scale_share)
 
     def predict(self, odometry: Odometry) -> None:
         """Move by one step of the wheels. The landmarks do not move in the node's frame."""
@@ -157,31 +164,10 @@ class LocalizationFilter:
             health, reason = Health.FEW, f"{kept} of {len(slots)} landmarks agree"
         return self._judge(UpdateReport(accepted, innovations_px, fit.mean_nis, health, reason))
 
-    def add(self, ids: Ids, points_in_robot: Array, covariances_in_robot: Array) -> NDArray[np.bool_]:
-        """Add landmarks that are new to the map, as they are known from the robot's present pose.
-
-        Args:
-            ids: (N,) new ids.
-            points_in_robot: (N, 3) m, in the robot's present frame.
-            covariances_in_robot: (N, 3, 3) m^2, in the robot's present frame.
-
-        Returns:
-            (N,) which were added: those that lie ahead of the node, where they can be anchored.
-
-        Raises:
-            InvalidValue: shapes that do not belong together, or an id twice.
-        """
-        pose = Pose2.from_vector(self._state.pose_vector)
-        points, turn = pose.apply(points_in_robot), turning(pose)
-        by_pose = np.zeros((len(points), 3, 3))
-        by_pose[:, 0, 0] = by_pose[:, 1, 1] = 1.0
-        by_pose[:, 0, 2] = pose.y - points[:, 1]
-        by_pose[:, 1, 2] = points[:, 0] - pose.x
-        return self._insert(ids, points, turn @ covariances_in_robot @ turn.T, by_pose)
-
     def remove(self, ids: Ids) -> None:
         """Forget landmarks; ids that are not there are ignored."""
-        self._keep(~among(self.ids, ids))
+        kept = ~among(self.ids, ids)
+        self._state, self.ids = self._state.kept(kept), self.ids[kept]
 
     @property
     def state(self) -> LocalizationState:
@@ -206,11 +192,13 @@ class LocalizationFilter:
         sigma = math.sqrt(float(np.linalg.eigvalsh(self._state.covariance[:2, :2])[-1]))
         return f"position known to {sigma:.1f} m only" if sigma > WIDEST_SIGMA else ""
 
-    def predict_pixels(self) -> Array:
-        """(N, 2) px where landmarks are expected now; NaN if behind the camera."""
+    def predict_pixels(self, ids: Ids) -> Array:
+        """(N, 2) px where landmarks are expected now; NaN if behind the camera, or if the filter has none."""
         projected = project_anchored(self._state.pose_vector, self._state.rays, self._camera.mount_forward)
         ahead = (projected.scale > NEAREST_SCALE)[:, None]
-        return np.where(ahead, self._centre + self._focal * projected.rays[:, :2], np.nan)
+        pixels = np.where(ahead, self._centre + self._focal * projected.rays[:, :2], np.nan)
+        # The last row is of those that are not held, whose slot is -1.
+        return np.append(pixels, [[np.nan, np.nan]], axis=0)[slots_of(self.ids, ids)]
 
     def landmarks_in_node(self) -> NodeLandmarks:
         """All landmarks as they are known now."""
@@ -258,25 +246,9 @@ class LocalizationFilter:
         self._bad_reason = report.reason
         return report
 
-    def _insert(self, ids: Ids, points: Array, covariances: Array, by_pose: Array) -> NDArray[np.bool_]:
-        n = len(ids)
-        if points.shape != (n, 3) or covariances.shape != (n, 3, 3):
-            raise InvalidValue("localization: ids, points and covariances do not belong together")
-        if among(ids, self.ids).any() or len(np.unique(ids)) != n:
-            raise InvalidValue("localization: a landmark can be added only once")
-        rays, by_point = rays_of_points(points, self._camera.mount_forward, self._camera.mount_height)
-        fit = self._anchorable(rays) & np.isfinite(covariances).all(axis=(1, 2))
-        by_point = by_point[fit]
-        own = by_point @ covariances[fit] @ np.swapaxes(by_point, 1, 2)
-        self._state = self._state.grown(rays[fit], own, by_point @ by_pose[fit])
-        self.ids = np.concatenate([self.ids, np.asarray(ids, np.int64)[fit]])
-        return fit
 
-    def _anchorable(self, rays: Array) -> NDArray[np.bool_]:
-        near = rays[:, 2] * NEAREST > 1.0
-        aside = ~(np.abs(rays[:, 0]) <= WIDEST_SLOPE)
-        return np.asarray((rays[:, 2] > 0) & ~near & ~aside, np.bool_)
-
-    def _keep(self, mask: NDArray[np.bool_]) -> None:
-        self._state = self._state.kept(mask)
-        self.ids = self.ids[mask]
+def _anchorable(rays: Array) -> NDArray[np.bool_]:
+    """(N,) which landmarks the node's camera sees ahead of it, not too near and not far aside."""
+    near = rays[:, 2] * NEAREST > 1.0
+    aside = ~(np.abs(rays[:, 0]) <= WIDEST_SLOPE)
+    return np.asarray((rays[:, 2] > 0) & ~near & ~aside, np.bool_)

@@ -23,7 +23,7 @@ class LocalizationState:
         pose_vector: (3,) [x m, y m, heading rad], node_from_robot.
         rays: (n, 3) [a, b, w 1/m] at the node. The paper's two numbers a landmark, here a and w, are
             estimated; b is known as the map gives it, and only its uncertainty is considered.
-        first: (n, 3) the rays when they were added. All Jacobians are taken there: at estimates that
+        first: (n, 3) the rays as the map gives them. All Jacobians are taken there: at estimates that
             change from image to image the filter would gain information that no image has (first-estimates
             Jacobians, Huang, Mourikis and Roumeliotis 2010).
         covariance: (3 + 3n, 3 + 3n) of [pose, (a, b, w) of each landmark], additive errors.
@@ -35,11 +35,20 @@ class LocalizationState:
     covariance: Array
 
     @staticmethod
-    def of_prior(prior: PoseGaussian) -> LocalizationState:
-        """A pose and no landmarks."""
-        turn = turning(prior.mean)
-        none = np.zeros((0, 3))
-        return LocalizationState(prior.mean.vector, none, none, turn @ prior.covariance @ turn.T)
+    def of_prior(prior: PoseGaussian, rays: Array, covariances: Array) -> LocalizationState:
+        """A pose, and landmarks that know nothing of it.
+
+        Args:
+            prior: node_from_robot.
+            rays: (n, 3) [a, b, w 1/m] at the node.
+            covariances: (n, 3, 3) of these.
+        """
+        n, turn = len(rays), turning(prior.mean)
+        covariance = np.zeros((3 + 3 * n, 3 + 3 * n))
+        covariance[:3, :3] = turn @ prior.covariance @ turn.T
+        index = np.arange(n)
+        covariance[3:, 3:].reshape(n, 3, n, 3)[index, :, index, :] = covariances
+        return LocalizationState(prior.mean.vector, rays, rays, covariance)
 
     @property
     def pose(self) -> PoseGaussian:
@@ -91,29 +100,6 @@ class LocalizationState:
         covariance = self.covariance - root @ root.T
         covariance[4::3, 4::3] = self.covariance[4::3, 4::3]
         return LocalizationState(pose_vector, rays, self.first, covariance)
-
-    def grown(self, rays: Array, covariances: Array, by_pose: Array) -> LocalizationState:
-        """The state with further landmarks.
-
-        Args:
-            rays: (N, 3) [a, b, w 1/m] at the node.
-            covariances: (N, 3, 3) of their own errors, independent of the state.
-            by_pose: (N, 3, 3) how the pose's error enters them in addition.
-        """
-        size, n = len(self.covariance), len(rays)
-        lever = by_pose.reshape(3 * n, 3)
-        grown = np.zeros((size + 3 * n, size + 3 * n))
-        grown[:size, :size] = self.covariance
-        grown[size:, :size] = lever @ self.covariance[:3]
-        grown[:size, size:] = grown[size:, :size].T
-        # The pose's share is common to all new landmarks, their own is not.
-        grown[size:, size:] = lever @ self.covariance[:3, :3] @ lever.T
-        own = grown[size:, size:].reshape(n, 3, n, 3)
-        index = np.arange(n)
-        own[index, :, index, :] += covariances
-        return LocalizationState(
-            self.pose_vector, np.concatenate([self.rays, rays]), np.concatenate([self.first, rays]), grown
-        )
 
     def of_unknown_scale(self, share: float) -> LocalizationState:
         """The state where all lengths may be off together by a share of them."""

@@ -134,13 +134,6 @@ class NodeLocalizer:
 
     def _expected(self) -> Array:
         """(N, 2) px where the tracks should be now, in the tracks' order."""
-        predicted = self._filter.predict_pixels()
-        order = np.argsort(self._filter.ids)
-        ids = self._filter.ids[order]
-        expected = np.full((len(self._tracks.ids), 2), np.nan)
-        if len(ids):
-            place = np.clip(np.searchsorted(ids, self._tracks.ids), 0, len(ids) - 1)
-            hit = ids[place] == self._tracks.ids
-            expected[hit] = predicted[order[place[hit]]]
-            expected[~self._description.camera.contains(expected)] = np.nan
+        expected = self._filter.predict_pixels(self._tracks.ids)
+        expected[~self._description.camera.contains(expected)] = np.nan
         return expected

@@ -12,6 +12,7 @@ from synthetic.mapping_run import AXLE, CAMERA, WHEEL_NOISE
 
 AHEAD = Camera(320, 240, 277.0, 277.0, 160.0, 120.0, mount_height=0.3, mount_forward=0.1)
 NOWHERE = (1.0, 1.0)
+NO_LANDMARKS = np.zeros((0, 3)), np.zeros((0, 3, 3))
 
 
 class World:
@@ -35,9 +36,9 @@ class World:
         self.covariances[:, [1, 2], [1, 2]] += (0.7 * known / 277.0)[:, None] ** 2
         self.true = Pose2(-0.3, 0.1, 0.1)
 
-    def filter(self, prior: PoseGaussian, take: slice = slice(None)) -> LocalizationFilter:
+    def filter(self, prior: PoseGaussian) -> LocalizationFilter:
         return LocalizationFilter(
-            self.camera, AXLE, WHEEL_NOISE, prior, self.ids[take], self.mapped[take], self.covariances[take]
+            self.camera, AXLE, WHEEL_NOISE, prior, self.ids, self.mapped, self.covariances
         )
 
     def near(self) -> PoseGaussian:
@@ -121,27 +122,6 @@ def test_the_error_of_the_maps_own_pixels_is_not_averaged_away():
     assert np.mean(nees) < 6.5
 
 
-def test_landmarks_met_on_the_way():
-    world = World(2)
-    filter_ = world.filter(world.near(), take=slice(0, 12))
-    world.drive(filter_, 30)
-    in_robot = world.true.inverse()
-    covariances = np.broadcast_to(np.diag([0.05, 0.01, 0.01]) ** 2, (13, 3, 3))
-    noise = world.rng.normal(size=(13, 3)) * [0.05, 0.01, 0.01]
-    new = in_robot.apply(world.points[12:]) + noise
-    assert filter_.add(world.ids[12:], new, covariances).all()
-    rows = 3 + 3 * np.arange(12, 25)
-    # The pose's error is in the new landmarks too.
-    assert np.abs(filter_.state.covariance[rows, 1]).min() > 0
-    world.drive(filter_, 100)
-    known = filter_.landmarks_in_node()
-    error = known.points[12:] - world.points[12:]
-    assert np.einsum("ni,nij,nj->n", error, np.linalg.inv(known.covariances[12:]), error).mean() < 6.0
-    assert filter_.pose.mahalanobis2(world.true) < 16.3
-    behind = filter_.add(np.array([77]), np.array([[-5.0, 0.0, 0.3]]), covariances[:1])
-    assert not behind.any()
-
-
 def test_seeing_nothing_grows_the_covariance_and_ends_health():
     world = World(5)
     filter_ = world.filter(world.near())
@@ -206,9 +186,17 @@ def test_wrong_tracks_do_not_move_the_pose():
 
 def test_ids_come_only_once():
     world = World(9)
+    world.ids[1] = world.ids[0]
+    with pytest.raises(InvalidValue, match="only once"):
+        world.filter(world.near())
+
+
+def test_a_landmark_that_the_node_cannot_have_seen_is_left_out():
+    world = World(9)
+    world.mapped[3] = -5.0, 0.0, 0.3
     filter_ = world.filter(world.near())
-    with pytest.raises(InvalidValue):
-        filter_.add(np.array([0]), world.mapped[:1], world.covariances[:1])
+    assert set(filter_.ids) == set(np.delete(world.ids, 3))
+    assert np.isnan(filter_.predict_pixels(world.ids[3:4])).all()
 
 
 def test_prior_keeps_its_convention():
@@ -217,7 +205,7 @@ def test_prior_keeps_its_convention():
         Pose2(1.0, 2.0, 2.2), np.array([[0.04, 0.01, 0.0], [0.01, 0.02, 0.003], [0.0, 0.003, 0.01]])
     )
     np.testing.assert_allclose(
-        LocalizationState.of_prior(prior).pose.covariance, prior.covariance, atol=1e-15
+        LocalizationState.of_prior(prior, *NO_LANDMARKS).pose.covariance, prior.covariance, atol=1e-15
     )
 
 
