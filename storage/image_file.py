@@ -1,5 +1,6 @@
 """Images on disk, as recordings and people bring them. Their size is read before they are decoded."""
 
+import logging
 import re
 import struct
 from os import PathLike
@@ -13,6 +14,10 @@ from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.atomic_file import read_whole
 from mapweave.storage.os_errors import reason_of
 
+log = logging.getLogger(__name__)
+
+DEPTHS = (10, 12, 14, 16)
+"""Bits of cameras whose images have 16 bits a pixel."""
 MAX_PIXELS = 50_000_000
 """Larger images are refused before they are decoded; phones take up to 50 megapixels."""
 MAX_SEGMENTS = 1024
@@ -29,8 +34,39 @@ PNM = re.compile(rb"P[1-6](?:\s|#[^\r\n]*[\r\n])+(\d{1,9})\s(?:\s|#[^\r\n]*[\r\n
 """As the decoder reads it. What stands between the numbers must match in one way, or this takes for ever."""
 
 
+class UsedBits:
+    """How many bits of 16 the images of one camera use: sensors of 10, 12 or 14 bits fill the lower ones.
+
+    It grows with the brightest pixel so far, and never shrinks, so that an image after a brighter one is as
+    dark as it is. The first images of a drive may be brighter than the same later.
+    """
+
+    def __init__(self, source: str) -> None:
+        """Begin with the fewest.
+
+        Args:
+            source: of the images, for the log.
+        """
+        self._source, self._bits = source, 0
+
+    def eight(self, image: NDArray[np.uint16]) -> NDArray[np.uint8]:
+        """(H, W) the upper eight of the bits that are used."""
+        needed = int(image.max(initial=0)).bit_length()
+        bits = next(depth for depth in DEPTHS if depth >= needed)
+        if bits > self._bits:
+            self._bits = bits
+            if bits < DEPTHS[-1]:
+                log.info(
+                    "%s: of 16 bits the images use %d; the upper 8 of these are read", self._source, bits
+                )
+        return np.asarray(image >> (self._bits - 8), np.uint8)
+
+
 def read_grey(
-    path: str | PathLike[str], camera: Camera | None = None, source: str = "the camera"
+    path: str | PathLike[str],
+    camera: Camera | None = None,
+    source: str = "the camera",
+    used: UsedBits | None = None,
 ) -> NDArray[np.uint8]:
     """Read an image.
 
@@ -38,6 +74,7 @@ def read_grey(
         path: of a PNG, JPEG, PGM or BMP file.
         camera: that took it, if known.
         source: the source of the size, for the error.
+        used: of the recording that it is one of: then of 16 bits those that are used are read.
 
     Returns:
         (H, W) grey.
@@ -52,7 +89,7 @@ def read_grey(
     except OSError as error:
         raise DeviceError(f"{path}: not an image that can be read ({reason_of(error)})") from None
     try:
-        image = decode_grey(data)
+        image = decode_grey(data, used)
     except InvalidValue as error:
         raise DeviceError(f"{path}: not an image that can be read ({error})") from None
     if camera is not None and image.shape != (camera.height, camera.width):
@@ -64,11 +101,12 @@ def read_grey(
     return image
 
 
-def decode_grey(data: bytes) -> NDArray[np.uint8]:
+def decode_grey(data: bytes, used: UsedBits | None = None) -> NDArray[np.uint8]:
     """Decode an image.
 
     Args:
         data: a whole PNG, JPEG, PGM or BMP file.
+        used: of the camera that it is from; None: of 16 bits a pixel the upper eight are read.
 
     Returns:
         (H, W) grey, upright if the file has the camera's orientation.
@@ -79,13 +117,16 @@ def decode_grey(data: bytes) -> NDArray[np.uint8]:
     import cv2
 
     check_cost(data)
+    flag = cv2.IMREAD_GRAYSCALE if used is None else cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH
     try:
-        image = cv2.imdecode(np.frombuffer(to_end(data), np.uint8), cv2.IMREAD_GRAYSCALE)
+        image = cv2.imdecode(np.frombuffer(to_end(data), np.uint8), flag)
     except cv2.error:
         # OpenCV raises for some broken input and returns nothing for other.
         image = None
     if image is None:
         raise InvalidValue("the image is damaged")
+    if used is not None and image.dtype == np.uint16:
+        return used.eight(np.asarray(image, np.uint16))
     return np.asarray(image, np.uint8)
 
 

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from mapweave.agent.drivers.camera import StampedImage
 from mapweave.agent.drivers.clock import RemoteClock, of_monotonic_ns
 from mapweave.agent.drivers.wheeled import STALE
-from mapweave.agent.ros_messages.images import grey_of
+from mapweave.agent.ros_messages.images import GreyImages
 from mapweave.agent.ros_messages.values import TF_TYPE, FixedTransforms, Mount, stamp_of
 from mapweave.hybridmap.errors import DeviceError, MapweaveError
 from mapweave.wire.ros2.messages import decode
@@ -160,6 +160,7 @@ class Ros2Camera:
     def __init__(self, topic: NewestMessage) -> None:
         """Take the topic; the node stays another's."""
         self._topic = topic
+        self._images = GreyImages(topic.name)
         self._seen = 0
         self._complaint = ""
 
@@ -174,7 +175,7 @@ class Ros2Camera:
             try:
                 received = self._topic.newest()
                 assert received is not None
-                image: NDArray[np.uint8] = grey_of(received.message)
+                image: NDArray[np.uint8] = self._images.read(received.message)
             except MapweaveError as error:
                 if str(error) != self._complaint:
                     self._complaint = str(error)

@@ -28,7 +28,7 @@ from mapweave.agent.recordings.recording import (
     names_of,
 )
 from mapweave.agent.recordings.wheel_data import WheelModel, wheels_of
-from mapweave.agent.ros_messages.images import grey_of
+from mapweave.agent.ros_messages.images import GreyImages
 from mapweave.agent.ros_messages.values import (
     BASES,
     CAMERA_TYPE,
@@ -451,7 +451,7 @@ def _mount(opened: Bag, frame: str) -> Mount | None:
 def _sequential(opened: Bag, topic: str) -> Callable[[int], NDArray[np.uint8]]:
     """Reads images in ascending order quickly; going back begins the bag again."""
     messages: Iterator[tuple[int, Any]] | None = None
-    at = 0
+    at, images = 0, GreyImages(topic)
 
     def read(k: int) -> NDArray[np.uint8]:
         nonlocal messages, at
@@ -461,7 +461,7 @@ def _sequential(opened: Bag, topic: str) -> Callable[[int], NDArray[np.uint8]]:
             at += 1
             if at == k + 1:
                 try:
-                    return grey_of(message)
+                    return images.read(message)
                 except MapweaveError as error:
                     raise DeviceError(f"{opened.path}: image {k} of {topic}: {error}") from None
         raise DeviceError(f"{opened.path}: {topic} has no image {k}")

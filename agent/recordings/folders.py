@@ -17,7 +17,7 @@ from mapweave.agent.recordings.recording import Images, Recording, Stamps, stamp
 from mapweave.agent.recordings.table_file import named_columns, read_text
 from mapweave.hybridmap.camera import Camera
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
-from mapweave.storage.image_file import read_grey
+from mapweave.storage.image_file import UsedBits, read_grey
 from mapweave.vision.lens import NO_DISTORTION, LensModel, lens_of
 
 Intrinsics = tuple[float, float, float, float]
@@ -186,7 +186,8 @@ def _folder(
 
 
 def _images(paths: Sequence[Path], stamps_ns: Stamps, camera: Camera | None = None) -> Images:
-    return Images(stamps_ns, lambda k: read_grey(paths[k], camera, "camera.toml"))
+    used = UsedBits(paths[0].parent.name)
+    return Images(stamps_ns, lambda k: read_grey(paths[k], camera, "camera.toml", used))
 
 
 def _camera(images: Sequence[Path], intrinsics: Intrinsics) -> Camera:

@@ -3,10 +3,11 @@
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 
-from mapweave.agent.ros_messages.images import CHANNELS, grey_of
+from mapweave.agent.ros_messages.images import CHANNELS, GreyImages, grey_of
 from mapweave.hybridmap.errors import DeviceError
 
 
@@ -55,3 +56,35 @@ def test_of_an_image_in_yuv_the_brightness_is_read(encoding: str, first: int):
     data[first::2] = np.arange(12)
     grey = grey_of(image(encoding=encoding, step=8, data=data))
     np.testing.assert_array_equal(grey, np.arange(12).reshape(3, 4))
+
+
+def deep(pixels: Any, big: bool) -> SimpleNamespace:
+    data = np.asarray(pixels, ">u2" if big else "<u2").view(np.uint8).ravel()
+    return image(encoding="16UC1", step=8, data=data, is_bigendian=int(big))
+
+
+@pytest.mark.parametrize("big", [False, True])
+@pytest.mark.parametrize("bits", [10, 12, 14, 16])
+def test_of_16_bits_those_that_the_camera_uses_are_read(bits: int, big: bool, caplog):
+    """By their upper byte, images of 12 bits were called dark."""
+    caplog.set_level("INFO")
+    bright = np.linspace(0, 2**bits - 1, 12).astype(int).reshape(3, 4)
+    images = GreyImages("/image")
+    np.testing.assert_array_equal(images.read(deep(bright, big)), bright >> (bits - 8))
+    # A lamp that is switched off is not made up for, and a brighter image shows that there are more bits.
+    assert images.read(deep(bright // 8, big)).max() == 31
+    assert images.read(deep(np.full((3, 4), 65535), big)).min() == 255
+    assert images.read(deep(bright, big)).max() == (2**bits - 1) >> 8
+    assert [f"/image: of 16 bits the images use {bits}" in line for line in caplog.messages] == [True] * (
+        bits < 16
+    )
+
+
+def test_of_a_png_of_16_bits_and_of_a_mosaic_likewise():
+    bright = np.linspace(0, 4095, 36).astype(np.uint16).reshape(6, 6)
+    png = cv2.imencode(".png", bright)[1].tobytes()
+    read = GreyImages("/image").read(SimpleNamespace(format="mono16; png compressed", data=png))
+    np.testing.assert_array_equal(read, bright >> 4)
+    flat = np.full(36, 3200, "<u2").view(np.uint8)
+    mosaic = image(encoding="bayer_rggb16", width=6, height=6, step=12, data=flat)
+    np.testing.assert_array_equal(GreyImages("/image").read(mosaic), 200)
