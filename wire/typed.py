@@ -263,17 +263,12 @@ def _schema(kind: Any) -> Any:
 @cache
 def _fields(kind: Any) -> type[msgspec.Struct]:
     """Return the fields of a dataclass as a struct; those with a default may be missing in a message."""
-    return msgspec.defstruct(kind.__name__, _declared(kind), kw_only=True)
-
-
-def _declared(kind: Any) -> list[tuple[str, Any, Any]]:
-    """Name, type for msgspec and default of each field of a dataclass."""
     hints, declared = get_type_hints(kind, include_extras=True), []
     for field in fields(kind):
         given: dict[str, Any] = {"default": field.default, "default_factory": field.default_factory}
         default = msgspec.field(**{name: value for name, value in given.items() if value is not MISSING})
         declared.append((field.name, _schema(hints[field.name]), default))
-    return declared
+    return msgspec.defstruct(kind.__name__, declared, kw_only=True)
 
 
 def _convert(plain: Any, kind: Any) -> Any:
@@ -308,66 +303,8 @@ def _reader(opaque: Any) -> Callable[[Any], Any]:
 
 
 def _dataclass_reader(kind: Any) -> Callable[[Any], Any]:
-    """What reads a dataclass: with those within at once; where that fails, one by one, to name the field."""
-    struct, make = _fields(kind), _nested(kind)
-
-    def read(plain: Any) -> Any:
-        try:
-            return make.build(_convert(plain, make.struct))
-        except (msgspec.ValidationError, MapweaveError, ValueError, TypeError):
-            return kind(**msgspec.structs.asdict(_convert(plain, struct)))
-
-    return read
-
-
-class _Nested(NamedTuple):
-    """How a dataclass is read together with those that are its fields.
-
-    Attributes:
-        struct: of its fields; theirs are structs, too.
-        build: makes the dataclass of such a struct.
-    """
-
-    struct: type[msgspec.Struct]
-    build: Callable[[Any], Any]
-
-
-@cache
-def _nested(kind: Any) -> _Nested:
-    hints, declared = get_type_hints(kind, include_extras=True), []
-    builders: list[tuple[int, Callable[[Any], Any]]] = []
-    for place, (name, _, default) in enumerate(_declared(kind)):
-        members = get_args(hints[name]) if get_origin(hints[name]) in (Union, UnionType) else (hints[name],)
-        (member, *others) = [one for one in members if one is not NoneType]
-        plain: Any = _schema(hints[name])
-        if not others and member is Pose2:
-            plain = FORMS[Pose2].plain
-            builders.append((place, _poses))
-        elif not others and is_dataclass(member) and member not in FORMS:
-            inner: _Nested = _nested(member)  # type: ignore[arg-type]
-            plain = inner.struct
-            builders.append((place, _builder(inner)))
-        if NoneType in members:
-            plain |= None
-        declared.append((name, plain, default))
-    struct = msgspec.defstruct(kind.__name__, declared)
-
-    def build(read: Any) -> Any:
-        values = [*msgspec.structs.astuple(read)]
-        for place, make in builders:
-            values[place] = make(values[place])
-        return kind(*values)
-
-    return _Nested(struct, build)
-
-
-def _poses(read: Any) -> Any:
-    return Pose2(*read) if type(read) is tuple else read
-
-
-def _builder(inner: _Nested) -> Callable[[Any], Any]:
-    """A value that is no struct is the field's default."""
-    return lambda read: inner.build(read) if isinstance(read, inner.struct) else read
+    struct = _fields(kind)
+    return lambda plain: kind(**msgspec.structs.asdict(_convert(plain, struct)))
 
 
 def _tagged(kind: Any, plain: Any) -> Any:

@@ -1,7 +1,7 @@
 """Values of any shape come back, and docs/wire.md names their fields."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from typing import Annotated, Any, Literal
 
@@ -13,19 +13,14 @@ from hypothesis import strategies as st
 from msgspec import Meta
 from numpy.typing import NDArray
 
-from mapweave.hybridmap.agent_status import AgentStatus, Status
 from mapweave.hybridmap.constraint_subject import Ends
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue
 from mapweave.hybridmap.ids import MapId, NodeId
 from mapweave.hybridmap.map_event import MapEvent, MapEventKind
-from mapweave.hybridmap.mission_order import MissionKind, MissionOrder, MissionReport, MissionState
 from mapweave.hybridmap.node import EdgeKind
-from mapweave.hybridmap.portal import PortalMeans, PortalStop, PortalWait
 from mapweave.hybridmap.pose import Pose2
-from mapweave.wire import typed
-from mapweave.wire.messages import LIMITS
 from mapweave.wire.packing import Limit
-from mapweave.wire.typed import decode, encode, packed, value_of
+from mapweave.wire.typed import decode, encode, packed
 
 LIMIT = Limit("sample", 10_000)
 
@@ -139,59 +134,3 @@ def test_arrays_come_back(seed: int, shape: list[int]):
         assert old.dtype == new.dtype and old.shape == new.shape and np.array_equal(old, new)
     with pytest.raises(InvalidValue, match="f8"):
         encode(Arrays(numbers, numbers, numbers, numbers, numbers), LIMIT)  # type: ignore[arg-type]
-
-
-def one_by_one(kind: Any) -> Any:
-    """In place of `_nested`: nothing is read at once."""
-
-    def never(read: Any) -> Any:
-        raise ValueError
-
-    return typed._Nested(typed._fields(kind), never)
-
-
-def outcome(plain: Any, kind: type) -> Any:
-    try:
-        return value_of(plain, kind)
-    except InvalidValue as error:
-        return str(error)
-
-
-ODD = (None, True, -1, 2**70, 0.5, math.nan, 1e7, "x", "running", b"", [], [1, 2, 3], [[]], {}, {"kind": "x"})
-
-
-def changed(plain: Any) -> Iterator[Any]:
-    """Plain data with something else in each of its places in turn, or nothing."""
-    yield from ODD
-    if isinstance(plain, dict):
-        for name, inner in plain.items():
-            yield {key: value for key, value in plain.items() if key != name}
-            yield from ({**plain, name: other} for other in changed(inner))
-    if isinstance(plain, list):
-        for k, inner in enumerate(plain):
-            yield from ([*plain[:k], other, *plain[k + 1 :]] for other in changed(inner))
-
-
-def test_what_is_read_at_once_is_what_is_read_one_by_one(monkeypatch):
-    """The same values, and where there is none the same reason."""
-    node = NodeId("r0", 1, 3)
-    wait = PortalWait(PortalStop("lift", PortalMeans.LIFT, node, node._replace(number=4)))
-    order = MissionOrder("m", "r0", MissionKind.GO, 1, "anna", node, "kitchen", (node, node))
-    report = MissionReport(order, MissionState.RUNNING, portal=wait)
-    status = Status("waiting", "", 7, 0, Pose2(1, 2, 3), False, "goto", fix_node=node, portal=wait)
-    said = AgentStatus(status, 1, "r0", 1, mission=report, battery=0.5)
-    forms = [*changed(packed(said))]
-    at_once = [outcome(form, AgentStatus) for form in forms]
-    assert sum(isinstance(one, AgentStatus) for one in at_once) > 100
-    typed._reader.cache_clear()
-    try:
-        monkeypatch.setattr(typed, "_nested", one_by_one)
-        assert [outcome(form, AgentStatus) for form in forms] == at_once
-    finally:
-        typed._reader.cache_clear()
-
-
-@pytest.mark.parametrize("kind", LIMITS, ids=lambda kind: kind.__name__)
-def test_every_kind_of_message_can_be_read_at_once(kind: type):
-    names = [one.name for one in fields(kind)]
-    assert list(typed._nested(kind).struct.__struct_fields__) == names
