@@ -36,7 +36,6 @@ from mapweave.mapserver.retrieval.coarse_quantizer import (
     Codes,
     Vectors,
     coarse_quantizers,
-    nearest,
 )
 from mapweave.sim.worlds.catalog import make_world
 
@@ -85,9 +84,11 @@ def learned(codes: Codes, families: int) -> CoarseQuantizer:
         codes: (N, 32) in random order.
         families: and centres in each.
     """
+    import faiss
+
     vectors = codes.astype(np.float32)
     heads = _means(vectors[: HEAD_SAMPLE * families], families, HEAD_ROUNDS)
-    family = nearest(vectors, heads.astype(np.float32))
+    family = faiss.knn(vectors, heads.astype(np.float32), 1)[1][:, 0]
     centres = [_means(vectors[family == k], families, ROUNDS) for k in range(families)]
     return CoarseQuantizer(heads, np.concatenate(centres))
 

@@ -23,8 +23,6 @@ SEARCHED = 12
 """Families among whose centres a question finds the nearest, at least."""
 BLOCK = 1 << 17
 """Codes that are widened to floats at once."""
-FEW = 2048
-"""Fewer vectors than these are not parted by families."""
 
 Codes = NDArray[np.uint8]
 Ids = NDArray[np.int64]
@@ -57,19 +55,8 @@ class CoarseQuantizer:
 
     def nearest(self, vectors: Vectors) -> Ids:
         """(N,) which cell each of (N, 32) vectors belongs to."""
-        if len(vectors) < FEW:
-            # The same two searches; family by family costs a call each.
-            cells: Ids = self.searched.search(vectors, 1, params=probing(1))[1][:, 0]
-            return cells
-        families = len(self.heads)
-        family = nearest(vectors, self.heads.astype(np.float32))
-        order = np.argsort(family, kind="stable")
-        out = np.empty(len(vectors), np.int64)
-        for rows in np.split(order, np.flatnonzero(np.diff(family[order])) + 1):
-            start = families * family[rows[0]]
-            own = self.centres[start : start + families].astype(np.float32)
-            out[rows] = start + nearest(vectors[rows], own)
-        return out
+        cells: Ids = self.searched.search(vectors, 1, params=probing(1))[1][:, 0]
+        return cells
 
     def probing(self, count: int) -> Any:
         """Search so many cells, among families that have twice as many."""
@@ -115,13 +102,3 @@ def probing(count: int, within: Any = None) -> Any:
 
     parameters: Any = faiss.SearchParametersIVF
     return parameters(nprobe=count, quantizer_params=within)
-
-
-def nearest(vectors: Vectors, centres: Vectors) -> Ids:
-    """(N,) which of (M, 32) centres is nearest to each of (N, 32) vectors."""
-    import faiss
-
-    if not len(vectors):
-        return np.zeros(0, np.int64)
-    cells: Ids = faiss.knn(vectors, centres, 1)[1][:, 0]
-    return cells
