@@ -164,7 +164,7 @@ class PlaceIndex:
             return rank(squared, ids >> SLOT_BITS, self._nodes, k)
 
     def overlaps(self, node: Node, node_of: Callable[[NodeId], Node | None]) -> dict[NodeId, float]:
-        """Overlaps of a node: shared similar descriptors, see mapweave.merge.pose_graph.candidates.
+        """Overlaps of a node: shared similar descriptors, see mapweave.mapserver.retrieval.voting.
 
         Every overlap is exact. Up to `exact` landmarks all nodes are compared; of a larger fleet those that
         most landmarks vote for, see `query`.

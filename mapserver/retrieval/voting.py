@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from mapweave.mapserver.retrieval.similar_landmarks import comparable, similar
-from mapweave.merge.pose_graph.candidates import overlap
 
 Whole = NDArray[np.int64]
 Real = NDArray[np.float64]
@@ -43,8 +42,10 @@ def votes(squared: NDArray[np.float32], slots: Whole, reach: float) -> tuple[Who
 def overlaps(
     rows: Whole, columns: Whole, squared: NDArray[Any], slots: Whole, alike: float, least: float
 ) -> tuple[Whole, Real]:
-    """How many landmarks a node seems to share with each of many others, see
-    mapweave.merge.pose_graph.candidates.overlap.
+    """How many landmarks a node seems to share with each of many others.
+
+    Each landmark counts once, with its best partner and by how near that is; the smaller of the two sides'
+    sums makes it symmetric.
 
     Args:
         rows: (K,) landmark of the node.
@@ -71,19 +72,13 @@ def pair_overlaps(
     codes: NDArray[np.uint8], others: Sequence[NDArray[np.uint8]], alike: float, least: float
 ) -> list[float]:
     """The same of a node's (N, 32) codes with several others' (M, 32): 0 where it is below the least."""
-    if not others:
-        return []
-    sizes = [len(other) for other in others]
-    ends = np.cumsum(sizes)
-    columns, rows, squared = similar(comparable(np.concatenate(others)), codes, alike)
-    values = []
-    for begin, first, last in zip(ends - sizes, *np.searchsorted(columns, (ends - sizes, ends)), strict=True):
-        value = 0.0
-        # Each hit counts 1 at most.
-        if last - first >= least:
-            value = overlap(rows[first:last], columns[first:last] - begin, squared[first:last], alike)
-        values.append(value if value >= least else 0.0)
-    return values
+    values = np.zeros(len(others))
+    if others:
+        columns, rows, squared = similar(comparable(np.concatenate(others)), codes, alike)
+        owners = np.repeat(np.arange(len(others)), [len(other) for other in others])
+        found, enough = overlaps(rows, columns, squared, owners[columns], alike, least)
+        values[found] = enough
+    return [float(value) for value in values]
 
 
 def _best(which: Whole, side: Whole, weights: Real, count: int) -> Real:

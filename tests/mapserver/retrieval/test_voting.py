@@ -4,8 +4,11 @@ import numpy as np
 import pytest
 
 from mapweave.hybridmap.descriptor import decode
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.pose import Pose2, PoseGaussian
 from mapweave.mapserver.retrieval import voting
-from mapweave.merge.pose_graph.candidates import overlap
+from synthetic.world import room, take_node
+from tests.merge.pose_graph.all_pairs import overlap
 
 
 def test_votes_against_plain_loops():
@@ -65,3 +68,21 @@ def test_overlaps_of_pairs_do_not_depend_on_what_is_compared_at_once(seed: int):
     assert values == [voting.pair_overlaps(codes, [other], 0.5, 3.0)[0] for other in others]
     assert values == pytest.approx([value if value >= 3.0 else 0.0 for value in one_by_one], rel=1e-6)
     assert sum(value > 0 for value in values) > 10
+
+
+def test_overlap_against_a_double_loop():
+    rng = np.random.default_rng(1)
+    world = room(0, 0, 5, 4, 600, rng)
+    here = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
+    a = take_node(world, NodeId("a", 1, 1), Pose2(2, 2, 0), here, rng).landmarks.codes
+    b = take_node(world, NodeId("b", 1, 1), Pose2(2.3, 2, 0.1), here, rng).landmarks.codes
+    first, second = decode(a), decode(b)
+    best_a, best_b = np.zeros(len(first)), np.zeros(len(second))
+    for i in range(len(first)):
+        for j in range(len(second)):
+            weight = 1 - float(((first[i] - second[j]) ** 2).sum()) / 0.25
+            best_a[i], best_b[j] = max(best_a[i], weight), max(best_b[j], weight)
+    expected = min(best_a.sum(), best_b.sum())
+    assert expected > 10
+    assert voting.pair_overlaps(a, [b, b[:0]], 0.5, 3.0) == pytest.approx([expected, 0.0], rel=1e-4)
+    assert voting.pair_overlaps(a, [], 0.5, 3.0) == voting.pair_overlaps(a[:0], [], 0.5, 3.0) == []

@@ -5,12 +5,26 @@ from typing import Any
 
 import networkx as nx
 import numpy as np
+from numpy.typing import NDArray
 
 from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Edge, Node
-from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_HOPS, LEAST_OVERLAP, MOST_PER_MAP, Pair, overlap
+from mapweave.merge.pose_graph.candidates import ALIKE, LEAST_HOPS, LEAST_OVERLAP, MOST_PER_MAP, Pair
 from mapweave.registration.matching import squared_distances
+
+
+def overlap(
+    rows: NDArray[np.int64], columns: NDArray[np.int64], squared: NDArray[Any], alike: float
+) -> float:
+    """Of two nodes alone, from all pairs of similar descriptors; see `voting.overlaps`."""
+    weights = 1.0 - np.asarray(squared, dtype=np.float64) / alike**2
+    sums = []
+    for side in (rows, columns):
+        best = np.zeros(int(side.max(initial=-1)) + 1)
+        np.maximum.at(best, side, weights)
+        sums.append(float(best.sum()))
+    return min(sums)
 
 
 def overlaps(nodes: Collection[Node]) -> dict[Pair, float]:

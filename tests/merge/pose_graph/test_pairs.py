@@ -3,13 +3,12 @@
 import numpy as np
 import pytest
 
-from mapweave.hybridmap.descriptor import decode
 from mapweave.hybridmap.ids import EdgeId, MapId, NodeId
 from mapweave.hybridmap.node import Edge, EdgeKind
 from mapweave.hybridmap.pose import Pose2, PoseGaussian
-from mapweave.merge.pose_graph.candidates import Pair, overlap
+from mapweave.merge.pose_graph.candidates import Pair
 from mapweave.merge.pose_graph.pairs import PairTable
-from synthetic.world import room, take_map, take_node
+from synthetic.world import room, take_map
 from tests.merge.pose_graph.all_pairs import choose_pairs, overlaps
 
 STEP = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
@@ -69,24 +68,6 @@ def test_a_refined_node_is_compared_again():
 
 
 HERE = PoseGaussian.from_sigmas(Pose2(), 0.01, 0.01)
-
-
-def test_overlap_against_a_double_loop():
-    rng = np.random.default_rng(1)
-    world = room(0, 0, 5, 4, 600, rng)
-    a = take_node(world, NodeId("a", 1, 1), Pose2(2, 2, 0), HERE, rng)
-    b = take_node(world, NodeId("b", 1, 1), Pose2(2.3, 2, 0.1), HERE, rng)
-    first, second = decode(a.landmarks.codes), decode(b.landmarks.codes)
-    best_a, best_b = np.zeros(len(first)), np.zeros(len(second))
-    for i in range(len(first)):
-        for j in range(len(second)):
-            weight = 1 - float(((first[i] - second[j]) ** 2).sum()) / 0.25
-            best_a[i], best_b[j] = max(best_a[i], weight), max(best_b[j], weight)
-    table = overlaps([b, a])
-    expected = min(best_a.sum(), best_b.sum())
-    assert expected > 10
-    assert np.isclose(table[a.id, b.id], expected, rtol=1e-4)
-    assert overlap(np.zeros(0, int), np.zeros(0, int), np.zeros(0), 0.5) == 0.0
 
 
 def test_true_overlaps_rank_above_chance_and_neighbours_are_left_out():
