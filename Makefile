@@ -13,8 +13,9 @@ PIP := $(BIN)/python -m pip install --quiet --disable-pip-version-check --no-com
 # Compiles what runs often where it is not compiled yet: no robot and no test waits for it.
 COMPILE := $(BIN)/python -c 'import mapweave.agent.runner; from mapweave.hybridmap import jit; jit.load()'
 
-# pytest keeps what it has read of the tests: else each of its processes reads all of them anew the first time.
-READ_TESTS := $(BIN)/python -m pytest --collect-only --quiet > /dev/null 2>&1
+# pytest keeps what it has read of the tests, and Hypothesis the constants of all modules, once a property has run: else
+# each of pytest's processes reads all of them anew the first time.
+READ_TESTS := $(BIN)/python -m pytest -k test_an_edge_keeps_its_content > /dev/null 2>&1
 
 .PHONY: setup demo test check docs bench slow slow-waits slow-most scenarios sbom audit audit-tools clean
 

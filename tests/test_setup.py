@@ -1,12 +1,15 @@
 """`make setup` and `make audit` where something is missing, with scripts in the place of Python and tools."""
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from tests.wire import test_codec
 
 MAKEFILE = Path(__file__).parents[1] / "Makefile"
 
@@ -84,6 +87,13 @@ def test_settings_of_pip_that_cannot_be_read_are_not_taken_for_a_missing_wheel(c
     (checkout / "misconfigured").touch()
     status, said = setup(checkout)
     assert status != 0 and "could not be loaded" in said and "wheel" not in said, said
+
+
+def test_the_property_that_is_run_once_before_all_tests_is_there():
+    """Without one, each process of pytest looks for the constants of all modules, which takes two seconds."""
+    (name,) = re.findall(r"-m pytest -k (\w+)", MAKEFILE.read_text(encoding="utf-8"))
+    test = vars(test_codec)[name]
+    assert test.is_hypothesis_test
 
 
 def test_what_was_skipped_is_said_in_one_line_for_each_reason():
