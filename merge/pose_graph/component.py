@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.pose import Array, Pose2
-from mapweave.merge.pose_graph.factors import Factors, RelativePose, Rows
+from mapweave.merge.pose_graph.factors import Factors, RelativePose, Rows, believable
 from mapweave.merge.pose_graph.optimization import ANCHOR_SIGMA, optimized
 from mapweave.merge.pose_graph.solved_graph import PoseGraph, factorized, relative_covariances
 from mapweave.registration.pose_arrays import PoseGaussians, compose_poses, inverse_poses
@@ -73,12 +73,7 @@ class Component(PoseGraph):
     @cached_property
     def information(self) -> sparse.csc_matrix:
         """(3N, 3N) sparse, of the right perturbations of all nodes, anchor held."""
-        from scipy import sparse
-
-        held = np.zeros((len(self.nodes), 3))
-        held[self.rows[self.anchor]] = ANCHOR_SIGMA**-2
-        whole = self.factors.information(self.means)
-        return sparse.csc_matrix(whole + sparse.diags(held.ravel()))
+        return self.factors.information(self.means, self.index([self.anchor]), ANCHOR_SIGMA**-2)
 
     def relative_rows(self, i: Rows, j: Rows) -> PoseGaussians:
         """Poses `i_from_j` of (K,) rows, by what was measured around them.
@@ -117,8 +112,6 @@ class Component(PoseGraph):
         Returns:
             (K, 3, 3); and (K,) whether what is around joins a pair: else its covariance means nothing.
         """
-        from scipy import sparse
-
         seats, which = np.unique(np.concatenate([i, j]), return_inverse=True)
         rows = self.factors.around(seats, max(least, AROUND * len(seats)), len(self.nodes))
         order = np.full(len(self.nodes), len(rows))
@@ -126,9 +119,8 @@ class Component(PoseGraph):
         part = self._within(rows, order)
         piece = pieces(part, len(rows))
         # Only differences count: one node of each piece is held.
-        held = np.zeros((len(rows), 3))
-        held[np.unique(piece, return_index=True)[1]] = ANCHOR_SIGMA**-2
-        information = part.information(self.means[rows]) + sparse.diags(held.ravel())
+        held = np.unique(piece, return_index=True)[1]
+        information = part.information(self.means[rows], held, ANCHOR_SIGMA**-2)
         columns = (3 * order[seats][:, None] + np.arange(3)).ravel()
         right = np.zeros((3 * len(rows), len(columns)))
         right[columns, np.arange(len(columns))] = 1.0
@@ -202,8 +194,9 @@ def along_tree(
     """Poses along a minimum spanning tree of uncertainty."""
     graph: nx.Graph = nx.Graph()
     graph.add_node(anchor)
-    for m in measurements:
-        weight = float(m.covariance.trace()) + (100.0 if m.robust else 0.0)
+    covariances = believable(np.array([m.a_from_b.covariance for m in measurements]).reshape(-1, 3, 3))
+    for m, trace in zip(measurements, np.trace(covariances, axis1=1, axis2=2).tolist(), strict=True):
+        weight = trace + (100.0 if m.robust else 0.0)
         edge = graph.get_edge_data(m.a, m.b)
         if m.a != m.b and (edge is None or weight < edge["weight"]):
             graph.add_edge(m.a, m.b, weight=weight, measurement=m)

@@ -140,13 +140,15 @@ class Factors:
             out.append(ring)
         return np.concatenate(out)
 
-    def information(self, means: Array) -> sparse.csc_matrix:
+    def information(self, means: Array, held: Rows, precision: float) -> sparse.csc_matrix:
         """(3N, 3N) of the right perturbations of all nodes.
 
         A residual's derivative is (-Ad(b_from_a), identity), to first order in the residual.
 
         Args:
             means: (N, 3) where the nodes are.
+            held: rows of nodes that are held there.
+            precision: how well, 1/m^2 and 1/rad^2.
         """
         from scipy import sparse
 
@@ -157,7 +159,10 @@ class Factors:
         rows = np.concatenate([self.a, self.a, self.b, self.b])
         columns = np.concatenate([self.a, self.b, self.a, self.b])
         k = np.arange(3)
-        i = np.broadcast_to(3 * rows[:, None, None] + k[:, None], blocks.shape)
-        j = np.broadcast_to(3 * columns[:, None, None] + k, blocks.shape)
-        entries = (blocks.ravel(), (i.ravel(), j.ravel()))
-        return sparse.csc_matrix(sparse.coo_matrix(entries, shape=(3 * len(means), 3 * len(means))))
+        i = np.broadcast_to(3 * rows[:, None, None] + k[:, None], blocks.shape).ravel()
+        j = np.broadcast_to(3 * columns[:, None, None] + k, blocks.shape).ravel()
+        diagonal = (3 * held[:, None] + k).ravel()
+        entries = np.concatenate([blocks.ravel(), np.full(len(diagonal), precision)])
+        # One sum of all entries: in small graphs a sum of two sparse matrices takes as long as all else here.
+        places = np.concatenate([i, diagonal]), np.concatenate([j, diagonal])
+        return sparse.csc_matrix((entries, places), shape=(3 * len(means), 3 * len(means)))
