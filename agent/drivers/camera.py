@@ -28,6 +28,14 @@ SETTLING = 1.0
 """s of automatic exposure before it is locked."""
 STREAM_PATIENCE = 5.0
 """s in which a stream may come back: rpicam-vid ends with the program that it served, and starts again."""
+STREAM_SILENT_MS = 5000.0
+"""Without a byte of a stream after which its connection is given up; OpenCV waits 30 s."""
+MOST_DAMAGED = 10
+"""Images in a row that cannot be decoded before a stream is opened again, which takes a second."""
+DAMAGED_PAUSE = 0.02
+"""s between two of them: a stream that has ended says at once that it has no more."""
+FFMPEG_LEVEL, QUIET = "OPENCV_FFMPEG_LOGLEVEL", "-8"
+"""FFmpeg writes up to thirty lines of its own about each damaged image."""
 FFMPEG_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 """The environment's variable that OpenCV reads when it opens a source."""
 RAW_STREAM = "fflags;nobuffer|analyzeduration;500000"
@@ -107,6 +115,7 @@ class Capture:
         settings, source = self._settings, self._settings.source
         # OpenCV writes lines of its own about devices that are no cameras, beside the error here.
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
+        os.environ.setdefault(FFMPEG_LEVEL, QUIET)
         number = re.fullmatch(r"(?:/dev/video)?(\d+)", source)
         self._is_device = number is not None
         self._is_file = number is None and "://" not in source
@@ -122,7 +131,11 @@ class Capture:
             if raw:
                 os.environ[FFMPEG_OPTIONS] = RAW_STREAM
             # FFmpeg with n threads decodes n frames at once, which delays each by n frames.
-            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, 1])
+            options = [
+                cv2.CAP_PROP_N_THREADS, 1, cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(STREAM_SILENT_MS),
+                cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(STREAM_SILENT_MS),
+            ]  # fmt: skip
+            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, options)
             if raw:
                 del os.environ[FFMPEG_OPTIONS]
         if not capture.isOpened():
@@ -130,6 +143,8 @@ class Capture:
             hint = "is it connected, and not in use by another program?"
             if self._is_file:
                 hint = "it is no video, or one cut off at its start; `mapweave info` says what is in a file"
+            elif not self._is_device:
+                hint = "does its server run, and does a player show images of this address?"
             raise DeviceError(f"camera {source}: cannot be opened; {hint}")
         try:
             # Later frames of another size are scaled to the first one's.
@@ -179,7 +194,7 @@ class Capture:
         """
         capture, settings = self._capture, self._settings
         begin, locked = time.monotonic(), not (settings.lock_exposure and self._is_device)
-        while not self._closing and capture.grab():
+        while not self._closing and self._grabs(capture):
             if self._is_file:
                 # A file plays at its frame rate.
                 ahead = begin + capture.get(cv2.CAP_PROP_POS_MSEC) / 1e3 - time.monotonic()
@@ -195,6 +210,18 @@ class Capture:
             if not locked and time.monotonic() - begin >= SETTLING:
                 locked = True
                 self._lock_exposure()
+
+    def _grabs(self, capture: cv2.VideoCapture) -> bool:
+        """Whether there is another image; damaged ones of a stream are left out."""
+        began = time.monotonic()
+        for _ in range(MOST_DAMAGED):
+            if capture.grab():
+                return True
+            silent = time.monotonic() - began >= STREAM_SILENT_MS / 1e3
+            if self._is_file or self._is_device or self._closing or silent:
+                break
+            time.sleep(DAMAGED_PAUSE)
+        return False
 
     def _stamp_ns(self) -> int:
         """Stamp of the frame that was just grabbed."""

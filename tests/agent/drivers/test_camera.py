@@ -10,12 +10,13 @@ import cv2
 import numpy as np
 import pytest
 
+from mapweave.agent.drivers import camera as camera_module
 from mapweave.agent.drivers.camera import Capture
 from mapweave.agent.drivers.settings import CameraSettings
 from mapweave.hybridmap.errors import DeviceError
 from tests.mjpeg_stream import MjpegStream
 from tests.recordings import write_video
-from tests.waiting import eventually
+from tests.waiting import eventually, free_port
 
 WIDTH, HEIGHT = 64, 48
 RATE = 20.0
@@ -72,11 +73,19 @@ def test_a_known_delay_is_subtracted(clip: str, opened):
 
 
 @pytest.mark.parametrize(
-    ("source", "words"), [("/nowhere/film.avi", "no such file"), ("63", "camera 63: cannot be opened")]
+    ("source", "words"),
+    [("/nowhere/film.avi", "no such file"), ("63", "camera 63: cannot be opened; is it connected")],
 )
 def test_a_source_that_is_not_there(source: str, words: str):
     with pytest.raises(DeviceError, match=words):
         Capture(settings(source))
+
+
+def test_of_a_stream_that_is_not_there_its_server_is_asked_for(monkeypatch):
+    monkeypatch.setattr(camera_module, "STREAM_PATIENCE", 0.0)
+    url = f"http://127.0.0.1:{free_port()}/video"
+    with pytest.raises(DeviceError, match="cannot be opened; does its server run, and does a player show"):
+        Capture(settings(url))
 
 
 class Stream(MjpegStream):
@@ -84,13 +93,18 @@ class Stream(MjpegStream):
 
     def __init__(self) -> None:
         self.number = 0
-        self.stop = threading.Event()
+        self.stop, self.silent, self.damaged = threading.Event(), threading.Event(), False
         super().__init__(self._frame)
 
     def _frame(self) -> bytes | None:
         if self.stop.wait(1 / RATE):
             return None
         self.number += 1
+        if self.silent.is_set():
+            self.stop.wait(20.0)
+            return None
+        if self.damaged and self.number % 5 == 0:
+            return b"no image at all"
         return cv2.imencode(".jpg", np.full((HEIGHT, WIDTH, 3), shade(self.number), np.uint8))[1].tobytes()
 
     def close(self) -> None:
@@ -191,6 +205,33 @@ def test_a_stream_that_ends_is_opened_again(stream: Stream, opened):
     last = camera.newer(0, 0.1)
     assert last is not None
     assert camera.newer(last.stamp_ns, 6.0) is not None
+
+
+def test_damaged_images_of_a_stream_are_left_out(stream: Stream, opened, caplog):
+    """Each of them closed the connection for a second."""
+    stream.damaged = True
+    camera = opened(Capture(settings(stream.url)))
+    frame = camera.newer(0, 5.0)
+    gaps = []
+    for _ in range(40):
+        assert frame is not None
+        before = frame.stamp_ns
+        frame = camera.newer(before, 5.0)
+        assert frame is not None
+        gaps.append((frame.stamp_ns - before) / 1e9)
+    assert max(gaps) < 0.9 and not caplog.messages
+
+
+def test_a_stream_that_falls_silent_is_given_up(stream: Stream, opened, monkeypatch, caplog):
+    """A server that is switched off says nothing: the connection was held for 30 s."""
+    monkeypatch.setattr(camera_module, "STREAM_SILENT_MS", 500.0)
+    camera = opened(Capture(settings(stream.url)))
+    assert camera.newer(0, 5.0) is not None
+    stream.silent.set()
+    eventually(lambda: any("delivers no images; opening it again" in line for line in caplog.messages), 10.0)
+    stream.silent.clear()
+    last = camera.newer(0, 0.1)
+    assert last is not None and camera.newer(last.stamp_ns, 6.0) is not None
 
 
 class Device:
