@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.observation import Command, Observation, RobotDescription
 from mapweave.agent.sensor_health.clock_monitor import AHEAD
+from mapweave.agent.sensor_health.encoder_monitor import AT_REST, SMALL_PX
 from mapweave.agent.vision.image_quality import ImageQuality
 from mapweave.hybridmap.agent_status import Status
 
@@ -27,11 +28,6 @@ PATIENCE = 15.0
 """s without a new node after which the reason is reported; exploring robots need up to 10 s for a node."""
 AGAIN = 60.0
 """s until the same reason is reported again."""
-SMALL_PX = (64, 48)
-"""Size to which images are reduced to see whether they move."""
-AT_REST = 3.0
-"""Mean difference of two reduced images, grey levels, below which nothing has moved. Noise of 8 grey levels
-leaves 2.0; a way of 0.1 m or a turn of 0.1 rad within 4 s leaves 16 and more (office in simulation)."""
 MOVING = (0.1, 0.1)
 """Way, m, or turn, rad, within the window from which wheels have moved, or were commanded to."""
 STANDING = (0.005, 0.005)

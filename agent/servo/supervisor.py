@@ -88,11 +88,6 @@ class Servo:
         self._choose(goal_from_robot, self._surroundings(goal_from_robot))
         return self._law is not None or self._plan is not None
 
-    @property
-    def plan(self) -> ServoPlan | None:
-        """The plan at work, if legs and no law drive."""
-        return self._plan
-
     def come_nearer(self, goal_from_robot: Pose2) -> bool:
         """At the goal, yet not near enough for the caller: drive one more way to it.
 
