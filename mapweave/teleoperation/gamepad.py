@@ -4,7 +4,9 @@ https://docs.kernel.org/input/joydev/joystick-api.html: each event is a `js_even
 (u32), value (s16), type (u8: 1 button, 2 axis, with 0x80 for the state at the opening), number (u8).
 """
 
+import fcntl
 import os
+import stat
 import struct
 from pathlib import Path
 
@@ -19,6 +21,9 @@ TURN_AXIS, FORWARD_AXIS = 0, 1
 """The left stick: to the right and to the back are positive."""
 DEAD_ZONE = 0.1
 """A stick that is let go rests within this share of its way."""
+VERSION_REQUEST = 0x80046A01
+"""JSIOCGVERSION of linux/joystick.h: only the joystick interface answers it."""
+ADVICE = "give its device, --gamepad /dev/input/js1"
 HELP = "the left stick drives, any button stops while it is pressed"
 
 
@@ -47,9 +52,10 @@ class Gamepad:
         try:
             self._fd = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
         except OSError as error:
-            raise DeviceError(
-                f"gamepad {path}: {error.strerror}; connect it, or give its device, --gamepad /dev/input/js1"
-            ) from None
+            raise DeviceError(f"gamepad {path}: {error.strerror}; connect it, or {ADVICE}") from None
+        if not _is_joystick(self._fd):
+            os.close(self._fd)
+            raise DeviceError(f"gamepad {path}: is no joystick device (an event device is none); {ADVICE}")
 
     def fileno(self) -> int:
         """The file descriptor for `select`."""
@@ -91,3 +97,14 @@ class Gamepad:
     def close(self) -> None:
         """Close the device."""
         os.close(self._fd)
+
+
+def _is_joystick(fd: int) -> bool:
+    """Whether an open file gives joystick events; a pipe may give those of another program."""
+    if stat.S_ISFIFO(os.fstat(fd).st_mode):
+        return True
+    try:
+        fcntl.ioctl(fd, VERSION_REQUEST, bytes(4))
+    except OSError:
+        return False
+    return True

@@ -1,6 +1,7 @@
 """Keys and sticks: bytes as terminals and the kernel send them, to shares of the robot's speeds."""
 
 import os
+from pathlib import Path
 
 import pytest
 from hypothesis import given
@@ -77,3 +78,12 @@ def test_the_left_stick_drives_and_a_button_stops(tmp_path, opened):
 def test_a_gamepad_that_is_not_there_is_named(tmp_path):
     with pytest.raises(DeviceError, match=r"gamepad .*js7: No such file"):
         Gamepad(tmp_path / "js7", 0.5)
+
+
+@pytest.mark.parametrize("other", ["/dev/null", __file__])
+def test_a_file_that_is_no_joystick_is_named(other: str):
+    """The bytes of an event device were read as a joystick's: the robot stood, and nothing said why."""
+    with pytest.raises(
+        DeviceError, match=r"is no joystick device \(an event device is none\); give its device"
+    ):
+        Gamepad(Path(other), 0.5)
