@@ -3,7 +3,7 @@
 The questions of `mapweave.sim.ground_truth_messages`, as methods.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
 import numpy as np
@@ -11,6 +11,8 @@ from numpy.typing import NDArray
 
 from mapweave.agent.drivers.messages import AGAIN
 from mapweave.hybridmap.errors import InvalidMessage, InvalidValue, NotConnected
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Node
 from mapweave.hybridmap.pose import Array, Pose2
 from mapweave.sim.floorplan import BuildingPlan
 from mapweave.sim.ground_truth_messages import (
@@ -72,6 +74,17 @@ class SimControl:
         if truth.stamps_ns.tolist() != stamps:
             raise InvalidMessage(f"{len(truth.stamps_ns)} poses are no answer for {len(stamps)} times")
         return [Pose2.from_vector(row) for row in truth.world_from_robot]
+
+    def truth_of(self, nodes: Iterable[Node]) -> dict[NodeId, Pose2]:
+        """`world_from_robot` when each node's image was taken, by the robot that made the node."""
+        by_robot: dict[str, list[Node]] = {}
+        for node in nodes:
+            by_robot.setdefault(node.id.agent, []).append(node)
+        truth: dict[NodeId, Pose2] = {}
+        for robot, own in by_robot.items():
+            poses = self.truth_at(robot, [node.stamp_ns for node in own])
+            truth.update(zip((node.id for node in own), poses, strict=True))
+        return truth
 
     def trajectory(self, robot: str) -> tuple[NDArray[np.int64], Array]:
         """(N,) ns and (N, 3) `world_from_robot` (m, m, rad) of each tick."""

@@ -35,9 +35,7 @@ from benchmarks.explore.start import office
 from mapweave.agent.settings import AgentSettings, ExplorerSettings
 from mapweave.evaluation.map_score import score_map
 from mapweave.hybridmap.hybrid_map import HybridMap
-from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import EdgeKind
-from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.fleet import TICKS_PER_SECOND, TrialStage
 from mapweave.scenarios.local_fleet import LocalFleet
 from mapweave.storage.map_file import unpack_map_file
@@ -95,16 +93,10 @@ def _judged(stage: TrialStage, fleet: LocalFleet) -> Exploration:
     (reply,) = fleet.bus.ask(fleet.keys.any_server_map(), b"", 60.0)
     merged = unpack_map_file(reply.payload)
     whole = HybridMap(merged.changes)
-    truth: dict[NodeId, Pose2] = {}
-    looks: dict[str, list[Look]] = {}
-    for robot in stage.robots:
-        nodes = [node for node in whole.nodes.values() if node.id.agent == robot]
-        poses: list[Pose2] = fleet.control.truth_at(robot, [node.stamp_ns for node in nodes])
-        truth.update(zip([node.id for node in nodes], poses, strict=True))
-        looks[robot] = [
-            Look(node.stamp_ns / 1e9, pose, node.camera.semi_aperture)
-            for node, pose in zip(nodes, poses, strict=True)
-        ]
+    truth = fleet.control.truth_of(whole.nodes.values())
+    looks: dict[str, list[Look]] = {robot: [] for robot in stage.robots}
+    for node in whole.nodes.values():
+        looks[node.id.agent].append(Look(node.stamp_ns / 1e9, truth[node.id], node.camera.semi_aperture))
     links = [edge for edge in whole.edges.values() if edge.kind is EdgeKind.MERGED]
     score = score_map({node: (c, p.mean) for node, (c, p) in merged.poses.items()}, links, truth)
     robots = fleet.control.status().robots.values()

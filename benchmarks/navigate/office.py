@@ -104,9 +104,8 @@ class Office:
             on_time(self.ticks / TICKS_PER_SECOND, f"{report.status.nodes} nodes")
             if report.status.finished:
                 break
-        nodes = HybridMap(self.merged().changes).nodes.values()
-        poses = self.control.truth_at(ROBOT, [node.stamp_ns for node in nodes])
-        truth = {str(node.id): pose.vector.tolist() for node, pose in zip(nodes, poses, strict=True)}
+        truth_of_nodes = self.control.truth_of(HybridMap(self.merged().changes).nodes.values())
+        truth = {str(node): pose.vector.tolist() for node, pose in truth_of_nodes.items()}
         (self._folder / TRUTH).write_text(json.dumps(truth), encoding="utf-8")
 
     def mapped(self) -> Mapped:

@@ -134,9 +134,5 @@ class KidnapEvents:
         )  # fmt: skip
 
     def _truth_of(self, whole: HybridMap) -> dict[NodeId, Pose2]:
-        truth: dict[NodeId, Pose2] = {}
-        for robot in self._stage.robots:
-            nodes = [node for node in whole.nodes.values() if node.id.agent == robot]
-            poses = self._fleet.control.truth_at(robot, [node.stamp_ns for node in nodes])
-            truth.update(zip([node.id for node in nodes], poses, strict=True))
-        return truth
+        robots = self._stage.robots
+        return self._fleet.control.truth_of(n for n in whole.nodes.values() if n.id.agent in robots)

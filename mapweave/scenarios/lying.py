@@ -83,10 +83,7 @@ def lie(
     own = [map_id for map_id in maps if map_id.agent == action.robot]
     if not own or len({map_id.agent for map_id in maps}) < 3:
         raise InvalidValue(f"lie: {action.robot} and two other robots must have a map")
-    truth: dict[NodeId, Pose2] = {}
-    for map_id, (nodes, _) in maps.items():
-        poses = fleet.control.truth_at(map_id.agent, [node.stamp_ns for node in nodes])
-        truth |= dict(zip((node.id for node in nodes), poses, strict=True))
+    truth = fleet.control.truth_of(node for nodes, _ in maps.values() for node in nodes)
     liar = max(own, key=lambda map_id: len(maps[map_id][0]))
     others = {node: pose for node, pose in truth.items() if node.agent != action.robot}
     camera = next(robot.camera for robot in stage.scenario.robots if robot.name == action.robot)

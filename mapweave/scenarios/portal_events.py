@@ -7,7 +7,6 @@ from mapweave.hybridmap.agent_status import AgentStatus
 from mapweave.hybridmap.hybrid_map import HybridMap
 from mapweave.hybridmap.ids import NodeId
 from mapweave.hybridmap.node import Node
-from mapweave.hybridmap.pose import Pose2
 from mapweave.scenarios.fleet import FLEET, TrialFleet, TrialStage
 from mapweave.storage.map_file import MapFile
 
@@ -53,7 +52,8 @@ class PortalEvents:
         for name in names:
             wait = agents[name].status.portal
             assert wait is not None, "it asks"
-            self._fleet.control.kidnap(name, self._truth(whole.nodes[wait.portal.exit]))
+            (there,) = self._fleet.control.truth_of([whole.nodes[wait.portal.exit]]).values()
+            self._fleet.control.kidnap(name, there)
             self._note(self._person.portal_done(name), False)
         return names
 
@@ -61,11 +61,9 @@ class PortalEvents:
         """A robot's nodes that are clear of all robots; most landmarks first."""
         standing = [one.world_from_robot for one in self._fleet.control.status().robots.values()]
         nodes = [node for node in whole.nodes.values() if node.id.agent == robot]
-        clear = [n for n in nodes if min(self._truth(n).distance(pose) for pose in standing) > CLEAR]
+        truth = self._fleet.control.truth_of(nodes)
+        clear = [n for n in nodes if min(truth[n.id].distance(pose) for pose in standing) > CLEAR]
         return sorted(clear, key=lambda node: (-len(node.landmarks), node.id))
-
-    def _truth(self, node: Node) -> Pose2:
-        return self._fleet.control.truth_at(node.id.agent, [node.stamp_ns])[0]
 
 
 def _apart(whole: HybridMap, a: NodeId, b: NodeId) -> float:

@@ -3,12 +3,20 @@
 import numpy as np
 import pytest
 
-from mapweave import Odometry, Pose2
+from mapweave import Odometry, Pose2, PoseGaussian
 from mapweave.agent.drivers.messages import ENDED
 from mapweave.hybridmap.errors import InvalidValue, NotConnected
+from mapweave.hybridmap.ids import NodeId
+from mapweave.hybridmap.node import Landmarks, Node
+from mapweave.sim.camera import WEBCAM
 from mapweave.sim.ground_truth_client import SimControl
 from tests.sim.stage import KEYS, PLAN, TICK_NS, Driver, FakeSimulation, Stage
 from tests.waiting import eventually
+
+
+def node_at(name: tuple[str, int, int], stamp_ns: int) -> Node:
+    pose = PoseGaussian.from_sigmas(Pose2(), 0.1, 0.1)
+    return Node(NodeId(*name), stamp_ns, pose, WEBCAM, Landmarks.empty())
 
 
 def test_control_is_answered_without_a_driver(stage: Stage):
@@ -42,6 +50,10 @@ def test_truth_of_the_past(stage: Stage):
     asked = [7 * TICK_NS, 0, 3 * TICK_NS]
     assert control.truth_at("r1", asked) == [simulation.truth_at("r1", stamp) for stamp in asked]
     assert control.truth_at("r1", []) == []
+    made = [node_at(("r1", 1, 2), 7 * TICK_NS), node_at(("r0", 1, 1), 0), node_at(("r1", 2, 1), 3 * TICK_NS)]
+    truth = {node.id: simulation.truth_at(node.id.agent, node.stamp_ns) for node in made}
+    assert control.truth_of(made) == truth
+    assert control.truth_of([]) == {}
     with pytest.raises(InvalidValue, match="was not simulated"):
         control.truth_at("r1", [9 * TICK_NS])
     with pytest.raises(InvalidValue, match="no robot 'r9'; there are r0, r1"):
