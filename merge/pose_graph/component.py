@@ -200,7 +200,9 @@ def along_tree(
         edge = graph.get_edge_data(m.a, m.b)
         if m.a != m.b and (edge is None or weight < edge["weight"]):
             graph.add_edge(m.a, m.b, weight=weight, measurement=m)
-    tree = nx.minimum_spanning_tree(graph.subgraph(nx.node_connected_component(graph, anchor)))
+    joined = graph.subgraph(nx.node_connected_component(graph, anchor))
+    # A map's way without its loops is a tree already.
+    tree = joined if joined.size() < len(joined) else nx.minimum_spanning_tree(joined)
     poses = {anchor: anchor_pose}
     for parent, node in nx.bfs_edges(tree, anchor):
         m = tree.edges[parent, node]["measurement"]
