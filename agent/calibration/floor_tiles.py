@@ -111,7 +111,7 @@ class FloorTiles:
         logs = _searched(template, after, _Warp(self, rays[..., EVERY_OTHER], at))
         step = sigma = np.zeros(len(logs))
         for _ in range(STEPS):
-            nearer, farther = (warp.values(after, logs + off) for off in (STEP, -STEP))
+            nearer, farther = warp.values(after, logs + np.array([[STEP], [-STEP]]))
             shown, slope = 0.5 * (nearer + farther), (nearer - farther) / (2.0 * STEP)
             gain = (_dot(template, shown) / np.maximum(_dot(shown, shown), 1e-6))[:, None]
             error, slope = gain * shown - template, gain * slope
@@ -142,9 +142,9 @@ class _Warp:
         self._translation = at.translation
 
     def pixels(self, logs: Array) -> tuple[Array, Array]:
-        """Columns and rows (N, P) px in the real image."""
+        """Columns and rows (..., N, P) px in the real image, by logarithms (..., N)."""
         tiles, camera = self._tiles, self._tiles.camera
-        rho = self._floor * np.exp(logs)[:, None]
+        rho = self._floor * np.exp(logs)[..., None]
         x, y, z = (np.multiply(rho, t) for t in self._translation)
         for moved, turned in zip((x, y, z), self._turned, strict=True):
             moved += turned
@@ -165,16 +165,18 @@ class _Warp:
         return np.asarray(y[:, :2] / np.maximum(y[:, 2:], 0.05))
 
     def values(self, after: NDArray[np.float32], logs: Array) -> Array:
-        """(N, P) of the second image there, less each tile's mean."""
+        """(..., N, P) of the second image there, less each tile's mean."""
         column, row = self.pixels(logs)
         row -= self._tiles.top
-        values = cv2.remap(after, column.astype(np.float32), row.astype(np.float32), cv2.INTER_LINEAR)
-        return np.asarray(values - values.mean(axis=1, keepdims=True), np.float64)
+        # OpenCV takes two dimensions.
+        x, y = (at.reshape(-1, at.shape[-1]).astype(np.float32) for at in (column, row))
+        values = cv2.remap(after, x, y, cv2.INTER_LINEAR).reshape(column.shape)
+        return np.asarray(values - values.mean(axis=-1, keepdims=True), np.float64)
 
 
 def _dot(one: Array, other: Array) -> Array:
-    """(N,) products of rows (N, P)."""
-    return np.asarray(np.einsum("np,np->n", one, other))
+    """(..., N) products of rows (..., N, P)."""
+    return np.asarray(np.einsum("...p,...p->...", one, other))
 
 
 def _correlation(one: Array, other: Array) -> Array:
@@ -186,5 +188,5 @@ def _correlation(one: Array, other: Array) -> Array:
 def _searched(template: Array, after: NDArray[np.float32], warp: _Warp) -> Array:
     """(N,) best of the logarithms that are tried, by every other pixel: a warp of these."""
     part = np.ascontiguousarray(template[:, EVERY_OTHER])
-    tried = [_correlation(part, warp.values(after, np.full(len(part), log))) for log in SEARCHED]
-    return np.asarray(SEARCHED[np.stack(tried).argmax(axis=0)])
+    logs = np.repeat(SEARCHED[:, None], len(part), axis=1)
+    return np.asarray(SEARCHED[_correlation(part, warp.values(after, logs)).argmax(axis=0)])
