@@ -90,11 +90,14 @@ def calibrate(
     part = Estimator(declared, sigma, keep_wheels)
     part.ranged = rangers.scale()
     trained = part.batch(others, wheels)
-    misses = (_miss(part, held, wheels, v) for v in (declared.vector, trained.usable.vector))
-    before, after = (camera.fx * miss for miss in misses)
     whole = Estimator(declared, sigma, keep_wheels)
     whole.ranged = part.ranged
-    return DriveCalibration(whole.batch(pairs, wheels), before, after)
+    estimate = whole.batch(pairs, wheels)
+    # Of the parameters that are written: fewer pairs show fewer.
+    checked = np.where(estimate.shown, trained.vector, declared.vector)
+    misses = (_miss(part, held, wheels, v) for v in (declared.vector, checked))
+    before, after = (camera.fx * miss for miss in misses)
+    return DriveCalibration(estimate, before, after)
 
 
 def _miss(estimator: Estimator, pairs: list[ImagePair], wheels: WheelTrack, vector: Array) -> float:
