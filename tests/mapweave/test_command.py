@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 import socket
 import subprocess
 import sys
@@ -148,7 +149,7 @@ ASKING = {
     "map portal remove": ["lift"], "portal done": ["r0"],
     "map unmerge": ["r0.1.1", "r1.1.2"], "map retire": ["r0.1"],
     "relocalize": ["walk/images/0.png"],
-    "record": ["r0", "--out", "drive"], "drive": ["r0", "--gamepad", "/dev/null"],
+    "record": ["r0", "--out", "drive"], "drive": ["r0", "--gamepad", "pad"],
     "calibrate drive": ["--robot", "remote", "--name", "r0"],
     "map from-photos": ["walk/images", "--camera", "walk/camera.toml", "--spacing", "0.5", "--out",
                         "out.mapweave", "--send"],
@@ -158,6 +159,13 @@ GO_ON = ["agent", "replay", "doctor", "sim serve"]
 """Those that also look for one, and do without it."""
 
 
+@pytest.fixture
+def asked_in(recording: Path) -> Path:
+    """The folder of what they are given: a recording, and a gamepad whose stick rests."""
+    os.mkfifo(recording.parent / "pad")
+    return recording.parent
+
+
 def test_the_commands_that_look_for_a_server_are_known():
     found = [words for words, parser in parsers().items() if "--connect ENDPOINT" in parser.format_help()]
     assert sorted(found) == sorted([*ASKING, *GO_ON])
@@ -165,9 +173,9 @@ def test_the_commands_that_look_for_a_server_are_known():
 
 @pytest.mark.usefixtures("signals")
 @pytest.mark.parametrize("words", ASKING)
-def test_without_a_router_one_line_says_so_and_what_to_do(words: str, recording: Path, capfd, monkeypatch):
+def test_without_a_router_one_line_says_so_and_what_to_do(words: str, asked_in: Path, capfd, monkeypatch):
     """Within the time for that, and no other: whatever listens there accepts, and says nothing."""
-    monkeypatch.chdir(recording.parent)
+    monkeypatch.chdir(asked_in)
     monkeypatch.setattr("mapweave.connection.SOON", 0.1)
     with socket.create_server(("127.0.0.1", 0)) as deaf:
         where = f"tcp/127.0.0.1:{deaf.getsockname()[1]}"
@@ -196,19 +204,19 @@ def timed(words: str, *arguments: str, folder: Path) -> tuple[float, int, str]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("words", ASKING)
-def test_every_command_says_within_2_s_that_there_is_no_router(words: str, recording: Path, closed: str):
-    took, status, err = timed(words, "--connect", closed, folder=recording.parent)
+def test_every_command_says_within_2_s_that_there_is_no_router(words: str, asked_in: Path, closed: str):
+    took, status, err = timed(words, "--connect", closed, folder=asked_in)
     assert status == FAILED and "no router at" in err, err
     assert took <= 2.0
 
 
 @pytest.mark.slow
-def test_a_command_says_within_2_s_that_there_is_no_server(recording: Path):
+def test_a_command_says_within_2_s_that_there_is_no_server(asked_in: Path):
     """A router is up."""
     endpoint = f"tcp/127.0.0.1:{free_port()}"
     with closing(ZenohBus(BusSettings(mode="router", listen=(endpoint,)))):
         for words in ("status", "map fetch", "map explain", "place list", "missions", "relocalize"):
-            took, status, err = timed(words, "--connect", endpoint, folder=recording.parent)
+            took, status, err = timed(words, "--connect", endpoint, folder=asked_in)
             assert status == FAILED and "no map server of fleet demo answers" in err, (words, err)
             assert took <= 2.0, words
 
