@@ -96,6 +96,7 @@ def test_the_property_that_is_run_once_before_all_tests_is_there():
     assert test.is_hypothesis_test
 
 
+@pytest.mark.slow
 def test_what_was_skipped_is_said_in_one_line_for_each_reason():
     """Without a browser all tests are green; how many were left out, and why, must be seen.
 

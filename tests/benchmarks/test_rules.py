@@ -86,6 +86,7 @@ def test_a_robot_sends_no_loop_closure_to_where_it_was_not():
         assert not would_send(own, replace(edge, a_from_b=further))
 
 
+@pytest.mark.slow
 def test_without_a_rule_on_own_loop_closures_more_is_wrong():
     found = by_rule(LOOP_RULES, lambda: own_loops(seed=4, count=1))
     assert found["own loops that agree"]["whole"]["50"]["false_loops"] > 0
@@ -111,6 +112,7 @@ def drive() -> tuple[RobotDescription, Drive]:
     return recorded(5, seconds=12.0)
 
 
+@pytest.mark.slow
 def test_a_drive_without_faults_is_mapped_well(drive: tuple[RobotDescription, Drive]):
     found = mapped(*drive)
     assert found["edges"] > 0 and found["wrong_edges"] == 0 and found["used"] > 0.9 * found["ticks"]

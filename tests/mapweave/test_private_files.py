@@ -41,7 +41,7 @@ def modes(folder: Path) -> dict[str, int]:
 
 @pytest.mark.parametrize(("process", "keys"), first_quick([
     ("server", False), ("server", True), ("agent", True), ("agent", False),
-], 3))  # fmt: skip
+], 2))  # fmt: skip
 def test_files_are_for_their_owner_alone_if_there_are_keys(keys: bool, process: str, tmp_path):
     folder = KeyFolder.create(tmp_path / "keys", "demo", Profile.PRODUCTION, [], "s0", free_port())
     folder.add("r0", Role.ROBOT)

@@ -430,6 +430,7 @@ def test_a_name_that_the_locale_cannot_show_is_shown_by_its_codes(
     assert printed in done.stdout.decode(encoding)
 
 
+@pytest.mark.slow
 def test_a_home_that_cannot_be_written_is_no_matter(tmp_path):
     """As that of a service: two lines of Matplotlib about its cache came before what was asked for."""
     path = tmp_path / "r0.1.mapweave"

@@ -108,6 +108,7 @@ def on_a_curve(walls: PhotoWalls) -> list[Observation]:
     return seen
 
 
+@pytest.mark.slow
 def test_a_lossless_recording_is_replayed_to_the_very_same_map(walls: PhotoWalls, tmp_path):
     """Axle and noise of the wheels were guessed: other nodes were made, some centimetres off."""
     robot = replace(DESCRIPTION, axle=0.35, wheel_noise=0.06, side_slip=0.01)

@@ -232,7 +232,7 @@ DAMAGE: dict[str, Any] = {
 }
 
 
-@pytest.mark.parametrize("name", first_quick([PART.format(0), MERGE, MERGE_MARK], 1))
+@pytest.mark.parametrize("name", first_quick([PART.format(0), MERGE, MERGE_MARK], 0))
 @pytest.mark.parametrize("how", first_quick(DAMAGE, 1))
 def test_a_follower_whose_merge_is_damaged_merges_itself_and_says_so(
     servers: Servers, address: str, name: str, how: str, monkeypatch

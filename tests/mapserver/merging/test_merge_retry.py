@@ -87,6 +87,7 @@ with MergeRetry(Path(sys.argv[1])).attempt():
 """
 
 
+@pytest.mark.slow
 def test_the_last_map_stays_and_no_map_is_blamed_where_memory_is_short():
     """With a real limit of the process: maps were set apart one by one, until they changed."""
     done = subprocess.run(

@@ -252,6 +252,7 @@ def test_two_similar_rooms_are_ambiguous():
     assert service.answer(view).certainty is Certainty.FOUND
 
 
+@pytest.mark.slow
 def test_maps_that_nothing_joins_are_not_silently_confused(scene: Scene):
     """Two robots mapped the same room, and no merged map says so yet."""
     rng = np.random.default_rng(8)
