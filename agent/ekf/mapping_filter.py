@@ -182,7 +182,7 @@ class MappingFilter:
             if pitch is not None:
                 # Landmarks that come in from now on are seen by the camera as it looks now; on a slope it
                 # does not look back.
-                self._settle(self.state.pitched(pitch.pitch))
+                self._settle(self.state.pitched(pitch.pitch, pitch.variance))
         else:
             # Rejected measurements must not choose the linearisation point either.
             self._step = by_wheels

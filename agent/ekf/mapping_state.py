@@ -77,15 +77,23 @@ class MappingState:
         covariance[:3, :] = covariance[:, :3] = 0.0
         return MappingState(np.zeros(3), self.rays, covariance)
 
-    def pitched(self, pitch: float) -> MappingState:
-        """The state with landmarks as a camera sees them that looks up by so much more, rad: they move down.
+    def pitched(self, pitch: float, variance: float) -> MappingState:
+        """The state with landmarks as a camera sees them that looks up by so much more: they move down.
 
-        How uncertain they are changes by a share of the pitch only.
+        What is wrong about the pitch is wrong about all of them alike; beside that, how uncertain they are
+        changes by a share of the pitch only.
+
+        Args:
+            pitch: rad.
+            variance: of its error, rad^2.
         """
         rays = self.rays.copy()
         rays[:, 1] += pitch
         rays /= 1.0 - pitch * self.rays[:, 1:2]
-        return MappingState(self.pose_vector, rays, self.covariance)
+        by_pitch = self.rays * self.rays[:, 1:2] + [0.0, 1.0, 0.0]
+        covariance = self.covariance.copy()
+        covariance[3:, 3:] += variance * np.outer(by_pitch, by_pitch)
+        return MappingState(self.pose_vector, rays, covariance)
 
     def corrected(
         self, slots: NDArray[np.intp], residual: Array, whitening: Array

@@ -5,6 +5,7 @@ the same direction, and precise landmarks then fail each other's gates, or refut
 from wrong landmarks and wheels in one way: no motion in the plane moves everything up.
 """
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -16,6 +17,8 @@ LEAST = 8
 """Landmarks that an offset is read off; fewer may be wrong together."""
 SIGMAS = 4.0
 """An offset is evident if it is so many times what the filter expects the landmarks to move together."""
+MEDIAN_VARIANCE = math.pi / 2.0
+"""Of the median of many Gaussian errors, over that of their mean."""
 
 
 class PitchOffset(NamedTuple):
@@ -23,11 +26,13 @@ class PitchOffset(NamedTuple):
 
     Attributes:
         pitch: rad.
+        variance: of its error, rad^2.
         offsets: (N, 2) to subtract from the slopes: the derivative of a pinhole camera's slopes (a, b) with
             respect to pitch, (a b, 1 + b^2), times the pitch.
     """
 
     pitch: float
+    variance: float
     offsets: Array
 
 
@@ -54,4 +59,5 @@ def pitch_offset(innovations: Array, covariance: Array, slopes: Array) -> PitchO
     more = int(expected.argmin())
     surest = order[: LEAST + more]
     pitch = median(innovations[surest, 1] / by_pitch[surest, 1])
-    return PitchOffset(pitch, pitch * by_pitch) if pitch**2 > SIGMAS**2 * float(expected[more]) else None
+    variance = MEDIAN_VARIANCE * float(expected[more])
+    return PitchOffset(pitch, variance, pitch * by_pitch) if pitch**2 > SIGMAS**2 * variance else None
