@@ -93,3 +93,16 @@ def test_tracks_seen_once_or_never_are_nan():
 def test_shapes_are_checked():
     with pytest.raises(InvalidValue):
         triangulate(np.zeros((3, 3)), np.zeros((4, 5, 2)), CAMERA)
+
+
+def test_tracks_that_fit_to_nothing_are_answered_as_well():
+    """Where a camera would come next to the point, one slope outweighs all else: the rest was rounded away."""
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        moves = np.column_stack([rng.uniform(0.0, 1.0, 5), rng.normal(0.0, 0.05, (5, 2))])
+        pixels = rng.uniform([0.0, 0.0], [CAMERA.width, CAMERA.height], (5, 4000, 2))
+        order = rng.random((5, 4000)).argsort(axis=0)
+        pixels[order >= rng.integers(1, 3, 4000)] = np.nan
+        triangulation = triangulate(moves.cumsum(axis=0), pixels, CAMERA)
+        seen = np.isfinite(triangulation.rays).all(axis=1)
+        assert seen.any() and (np.linalg.eigvalsh(triangulation.ray_covariances[seen]) > 0.0).all()
