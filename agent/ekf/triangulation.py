@@ -147,10 +147,12 @@ class _Solver:
         information[:, 1, 2] = information[:, 2, 1] = _over_images(down_w, down_b)
         mixed = _over_images(right_a, right_w) + _over_images(down_a, down_w)
         information[:, 0, 2] = information[:, 2, 0] = mixed
-        # The small prior only keeps tracks without parallax solvable: sigma 1e3 in slope and 1/m, and more than
-        # is rounded where a camera comes so close to where a track would be that one slope outweighs all else.
+        # The small prior only keeps tracks without parallax solvable: sigma 1e3 in slope and 1/m. It is more
+        # than rounding where a camera comes next to where a track would be, and one slope outweighs all else.
         prior = np.maximum(1e-6, ROUNDING * np.trace(information, axis1=1, axis2=2))
-        self.covariances = np.asarray(np.linalg.inv(information + prior[:, None, None] * np.eye(3)), np.float64)
+        self.covariances = np.asarray(
+            np.linalg.inv(information + prior[:, None, None] * np.eye(3)), np.float64
+        )
         gradient = np.stack([
             _over_images(right_a, off_right) + _over_images(down_a, off_down),
             _over_images(down_b, off_down),

@@ -96,7 +96,7 @@ def test_shapes_are_checked():
 
 
 def test_tracks_that_fit_to_nothing_are_answered_as_well():
-    """Where a camera would come next to the point, one slope outweighs all else: the rest was rounded away."""
+    """Where a camera would come next to the point, one slope outweighs all else, which is rounded away."""
     rng = np.random.default_rng(0)
     for _ in range(20):
         moves = np.column_stack([rng.uniform(0.0, 1.0, 5), rng.normal(0.0, 0.05, (5, 2))])
