@@ -17,6 +17,9 @@ INTERIOR, LEAF = 0x02, 0x0A
 FILE_HEADER = 100
 INTEGERS = {1: 1, 2: 2, 3: 3, 4: 4, 5: 6, 6: 8}
 """Bytes of an integer, by its serial type."""
+MOST_READS = 4
+"""Overflow pages that are read in all, of the pages of the file. A page belongs to one row, and to copies of
+it in pages that were freed since; rows that all claim the same pages would take the square of the length."""
 
 Value = int | bytes | None
 
@@ -53,6 +56,7 @@ class _Pages:
         self._data, self._size = data, size
         self._usable = size - data[20]
         self.count = len(data) // size
+        self._reads = MOST_READS * self.count
 
     def _page(self, number: int) -> bytes:
         return self._data[(number - 1) * self._size : number * self._size]
@@ -99,8 +103,9 @@ class _Pages:
         link = page[at + local : at + local + 4]
         while len(payload) < length:
             following = int.from_bytes(link, "big")
-            if not 1 < following <= self.count:
+            if not 1 < following <= self.count or not self._reads:
                 return None
+            self._reads -= 1
             overflow = self._page(following)
             link = overflow[:4]
             payload += overflow[4 : min(self._usable, 4 + length - len(payload))]
