@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+import time
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
@@ -327,7 +328,7 @@ class Agent:
             self._trajectory.add(observation.stamp_ns, observation.odometry.motion(), pose)
         if self._geometry is not None:
             self._geometry.see(self.pipeline.calibration)
-        line = self._server_watch.see(self._fleet.server_in_reach(), observation.stamp_ns)
+        line = self._server_watch.see(self._fleet.server_in_reach(), time.monotonic())
         if line and self._options.patience > 0.0:
             self._say(line)
         self._on_step(observation, step)

@@ -15,17 +15,23 @@ class ServerWatch:
         """Take the server's name."""
         self._server = server
         self.arrivals, self._in_reach = 0, False
-        self._missing, self._seen_ns = False, 0
+        self._missing = False
+        self._seen: float | None = None
 
-    def see(self, in_reach: bool, stamp_ns: int) -> str:
-        """Take in one tick; returns a line for people, or nothing."""
+    def see(self, in_reach: bool, now: float) -> str:
+        """Take in one tick; returns a line for people, or nothing.
+
+        Args:
+            in_reach: whether the map server is.
+            now: s, of a clock on the wall: a recording's own runs faster.
+        """
         self.arrivals += in_reach and not self._in_reach
         self._in_reach = in_reach
         if in_reach:
-            missing, self._missing, self._seen_ns = self._missing, False, stamp_ns
+            missing, self._missing, self._seen = self._missing, False, now
             return f"map server {self._server} is in reach" if missing else ""
-        self._seen_ns = self._seen_ns or stamp_ns
-        if self._missing or stamp_ns - self._seen_ns <= PATIENCE * 1e9:
+        self._seen = now if self._seen is None else self._seen
+        if self._missing or now - self._seen <= PATIENCE:
             return ""
         self._missing = True
         return (

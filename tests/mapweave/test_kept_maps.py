@@ -365,6 +365,25 @@ def test_an_agent_that_ends_without_a_map_server_says_so_and_does_not_wait_for_i
     assert f"r0: {words}: the map stays in the journal" in output.out + output.err
 
 
+class Faster(Carried):
+    """A recording of two minutes that is replayed within a second."""
+
+    def sense(self) -> Observation | None:
+        observation = super().sense()
+        return observation and replace(observation, stamp_ns=observation.stamp_ns + self.tick * 10**10)
+
+
+def test_seconds_without_a_server_are_those_of_who_waits(tmp_path, capfd, monkeypatch):
+    """A fast replay said after a second that for 20 s no map server is in reach."""
+    monkeypatch.setattr(agent_process, "ARRIVAL", 0.0)
+    bus = ZenohBus(BusSettings(endpoints=(f"tcp/127.0.0.1:{free_port()}",)))
+    options = AgentOptions("r0", tmp_path, epoch=1, mission=MissionKind.CARRIED, patience=0.1)
+    run_agent(Faster(12), bus, KEYS, AgentSettings(), options, threading.Event())
+    bus.close()
+    output = capfd.readouterr()
+    assert "r0: no server in reach" in (said := output.out + output.err) and "in reach for" not in said
+
+
 def test_an_agent_that_has_handed_over_everything_ends_at_once_without_its_server(
     tmp_path, capfd, monkeypatch
 ):
