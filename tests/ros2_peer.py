@@ -132,6 +132,11 @@ class RosPeer:
         self._held.append(publisher)
         return publisher
 
+    def buffered_publisher(self, topic: str, kind: str) -> BufferedPublisher:
+        """A publisher of a type with a byte array, of rmw_zenoh_cpp 0.10.5 (Lyrical) and later."""
+        self.announce("MP", topic, kind, ANY_HASH, "2::,5:,:,:,,/backends:cpu:")
+        return BufferedPublisher(self, topic, kind)
+
     def subscriber(self, topic: str, kind: str, type_hash: str = "", latched: bool = False) -> list[bytes]:
         """Messages as they come, without those that would end a ROS 2 process."""
         got: list[bytes] = []
@@ -199,6 +204,9 @@ class Publisher:
     def undeclare(self) -> None:
         self._publisher.undeclare()
 
+    def _put(self, payload: bytes, attachment: bytes | None) -> None:
+        self._publisher.put(payload, attachment=attachment)
+
     def publish(self, message: Cdr, stamp_ns: int = 0, named: bool = False) -> None:
         """Publish; `named` is the attachment of rmw_zenoh_cpp 0.2.0 to 0.2.3."""
         self._sequence += 1
@@ -208,7 +216,28 @@ class Publisher:
             names = (b"sequence_number", b"source_timestamp", b"source_gid")
             values = [bytes([len(n)]) + n + v for n, v in zip(names, values, strict=True)]
         attachment = None if self._bridge else b"".join(values)
-        self._publisher.put(message.bytes(), attachment=attachment)
+        self._put(message.bytes(), attachment)
+
+
+class BufferedPublisher(Publisher):
+    """Puts each message where the tokens of its subscribers want it.
+
+    Those that announce the backend "cpu" alone share one key; each of the others has a key of its own, to
+    which it alone subscribes. The key of the topic itself stays unused.
+    """
+
+    def __init__(self, peer: RosPeer, topic: str, kind: str) -> None:
+        key = peer.key(topic, kind, ANY_HASH)
+        super().__init__(peer, f"{key}/_buf_cpu", False)
+        self._peer, self._topic, self._key = peer, topic.replace("/", "%"), key
+
+    def _put(self, payload: bytes, attachment: bytes | None) -> None:
+        tokens = [token.split("/") for token in self._peer.tokens()]
+        subscribers = [t for t in tokens if t[5] == "MS" and t[9] == self._topic and t[11] == ANY_HASH]
+        if any(len(token) == 14 and token[13] == "backends:cpu:" for token in subscribers):
+            super()._put(payload, attachment)
+        for number in range(sum(len(token) == 13 for token in subscribers)):
+            self._peer.session.put(f"{self._key}/_buf/{number:032x}", payload, attachment=attachment)
 
 
 # The messages that a robot publishes.

@@ -20,6 +20,7 @@ from tests.waiting import eventually
 from tests.wire.fleets import ZenohFleet
 
 STRING, TWIST, ODOMETRY = "std_msgs/msg/String", "geometry_msgs/msg/Twist", "nav_msgs/msg/Odometry"
+IMAGE = "sensor_msgs/msg/Image"
 
 
 def twist_message(forward: float, turn: float) -> Any:
@@ -61,6 +62,10 @@ def test_keys_and_tokens_are_those_of_the_design_document():
     theirs = f"{session}/std_msgs::msg::dds_::String_/{HASHES[STRING]}/::,7:,:,:,,"
     assert keys.parse(theirs) == keys.parse(token) == chatter
     assert keys.parse(theirs.replace(HASHES[STRING], "TypeHashNotSupported")) is not None
+    buffered = keys.parse(f"{theirs}/backends:cpu:;cuda:device%3A0")
+    assert buffered == chatter
+    assert buffered.backends
+    assert keys.parse(f"{theirs}/backends:cpu:/more") is None
     for wrong in (
         theirs.replace("RIHS01_d", "RIHS01_*"),
         theirs.replace("::msg", "::srv"),
@@ -173,6 +178,32 @@ def test_humble_has_no_hashes(ros: RosPeer, node: Ros2Node):
 
     eventually(ranged)
     assert decode(got[0].kind, got[0].data).range == 1.5
+
+
+def test_images_of_lyrical_come_by_the_key_of_the_processors_memory(ros: RosPeer, node: Ros2Node):
+    """Its tokens were not understood, and none of its images came; Twist and Odometry did."""
+    got: list[Arrival] = []
+    node.subscribe("/image_raw", [IMAGE], got.append)
+    camera = ros.buffered_publisher("/image_raw", IMAGE)
+    eventually(lambda: node.publishers([IMAGE]) == ["/image_raw"])
+
+    def seen() -> bool:
+        camera.publish(peer.image(5, 4, 2, "mono8", 4, bytes(range(8))))
+        return bool(got)
+
+    eventually(seen)
+    assert bytes(decode(got[0].kind, got[0].data).data) == bytes(range(8))
+    assert len({arrival.published_ns for arrival in got}) == len(got), "a message came twice"
+    # Publishers of before give the same topic without backends, and are subscribed to without.
+    ros.publisher("/image_raw", IMAGE)
+    wanted = {(ANY_HASH, "1:2:1,10:,:,:,,", "backends:cpu:"), (ANY_HASH, "1:2:1,10:,:,:,,")}
+
+    def announced() -> bool:
+        tokens = [token.split("/") for token in ros.tokens() if "/MS/" in token and ros.zid not in token]
+        return {tuple(token[11:]) for token in tokens} == wanted
+
+    eventually(announced)
+    assert not ros.failures
 
 
 def test_a_message_of_another_type_is_named_and_not_decoded(ros: RosPeer, node: Ros2Node):

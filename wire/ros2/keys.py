@@ -6,14 +6,19 @@ rmw_zenoh (its docs/design.md):
     @ros2_lv/<domain>/<session>/<node>/<node>/NN/<enclave>/<namespace>/<name>
                                                                    a node
     @ros2_lv/<domain>/<session>/<node>/<entity>/MP|MS/<enclave>/<namespace>/<name>/
-        <topic>/<type>/<hash>/<quality of service>                 a publisher, a subscriber
+        <topic>/<type>/<hash>/<quality of service>[/<backends>]    a publisher, a subscriber
 
-In a token `%` replaces each `/` of a name. The bridge's key is the topic itself; its tokens are
+In a token `%` replaces each `/` of a name. Backends are named since rmw_zenoh_cpp 0.10.5 (Lyrical), 0.12.0,
+for types with byte arrays, images among them: `backends:cpu:`, and further kinds of memory. Such a publisher
+leaves the key of its messages unused while it can reach each subscriber by another key. Subscribers that name
+the CPU alone share `<key>/_buf_cpu`, where messages are the same bytes. One that names none gets nothing.
+
+The bridge's key is the topic itself; its tokens are
 `@/<session>/@ros2_lv/MP|MS/<topic>/<type>/<quality of service>`, where `§` replaces each `/`.
 """
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from mapweave.hybridmap.errors import InvalidMessage
@@ -25,6 +30,8 @@ NO_HASH = "TypeHashNotSupported"
 HASH = re.compile(rf"RIHS01_[0-9a-f]{{64}}|{NO_HASH}")
 DDS_TYPE = re.compile(r"(\w+)::msg::dds_::(\w+)_")
 ROS_TYPE = re.compile(r"\w+/msg/\w+")
+CPU_BACKEND, CPU_MESSAGES = "backends:cpu:", "_buf_cpu"
+"""The last part of the token of a subscriber without other memory, and of the key of messages to such."""
 RELIABLE, TRANSIENT_LOCAL, VOLATILE, KEEP_LAST = 1, 1, 2, 1
 """Numbers of rmw/types.h."""
 
@@ -44,11 +51,13 @@ class Endpoint:
         topic: full name, with a leading slash.
         kind: type, for example `nav_msgs/msg/Odometry`.
         type_hash: of the type's definition; empty with the bridge.
+        backends: whether its token names backends; the messages are the same.
     """
 
     topic: str
     kind: str
     type_hash: str = ""
+    backends: bool = field(default=False, compare=False)
 
 
 def dds_type(kind: str) -> str:
@@ -112,13 +121,14 @@ class RmwZenohKeys:
         where = f"{self._domain}/{endpoint.topic.strip('/')}"
         return f"{where}/{dds_type(endpoint.kind)}/{endpoint.type_hash}"
 
-    def all_messages(self, topic: str) -> str:
-        """The pattern of a topic's messages of any type."""
-        return f"{self._domain}/{topic.strip('/')}/*/*"
+    def all_messages(self, topic: str) -> tuple[str, ...]:
+        """The patterns of a topic's messages of any type; each message comes by one of them."""
+        messages = f"{self._domain}/{topic.strip('/')}/*/*"
+        return messages, f"{messages}/{CPU_MESSAGES}"
 
     def kind_of(self, key: str) -> tuple[str, str]:
         """Type and hash of a message by its key; the type is empty if it is none."""
-        kind, _, type_hash = key.rpartition("/")
+        kind, _, type_hash = key.removesuffix(f"/{CPU_MESSAGES}").rpartition("/")
         return ros_type(kind.rpartition("/")[2]), type_hash
 
     def node(self) -> str | None:
@@ -133,31 +143,33 @@ class RmwZenohKeys:
         Args:
             role: which of the two.
             number: unique in the session, from 1.
-            endpoint: topic and type.
+            endpoint: topic and type; a subscriber of one with backends announces the CPU's.
             latched: whether late subscribers get the last messages (transient local).
             depth: how many messages are kept.
         """
         # All of rmw_zenoh's defaults may be left out; which these are has changed, so they are not.
         qos = f"{RELIABLE}:{TRANSIENT_LOCAL if latched else VOLATILE}:{KEEP_LAST},{depth}:,:,:,,"
+        wanted = endpoint.backends and role is EndpointRole.SUBSCRIBER
         return (
             f"{ADMIN}/{self._domain}/{self._session}/0/{number}/{role}/%/{self._namespace}/{self._node}/"
             f"{_mangled(endpoint.topic)}/{dds_type(endpoint.kind)}/{endpoint.type_hash}/{qos}"
+            f"{f'/{CPU_BACKEND}' if wanted else ''}"
         )
 
     def all_tokens(self, role: EndpointRole, topic: str | None = None) -> str:
         """The pattern of the tokens of a topic, or of all topics."""
         name = "*" if topic is None else _mangled(topic)
-        return f"{ADMIN}/{self._domain}/*/*/*/{role}/*/*/*/{name}/*/*/*"
+        return f"{ADMIN}/{self._domain}/*/*/*/{role}/*/*/*/{name}/*/*/*/**"
 
     def parse(self, token: str) -> Endpoint | None:
         """Read the token of a publisher or subscriber; None if it is another's or malformed."""
         parts = token.split("/")
-        if len(parts) != 13:
+        if len(parts) not in (13, 14):
             return None
         topic, kind, type_hash = parts[9].replace("%", "/"), ros_type(parts[10]), parts[11]
         if not (_is_topic(topic) and kind and HASH.fullmatch(type_hash)):
             return None
-        return Endpoint(topic, kind, type_hash)
+        return Endpoint(topic, kind, type_hash, len(parts) == 14)
 
 
 class BridgeKeys:
@@ -167,9 +179,9 @@ class BridgeKeys:
         """The key of a topic's messages."""
         return endpoint.topic.strip("/")
 
-    def all_messages(self, topic: str) -> str:
+    def all_messages(self, topic: str) -> tuple[str, ...]:
         """The same."""
-        return topic.strip("/")
+        return (topic.strip("/"),)
 
     def kind_of(self, key: str) -> tuple[str, str]:
         """A key does not tell the type."""

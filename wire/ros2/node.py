@@ -126,10 +126,10 @@ class Ros2Node:
             self._bus.declare(Token(self._bus.owner, token))
         return token or f"{endpoint.topic}/{self._entities}"
 
-    def listen(self, topic: str, handler: Callable[[Sample], None], latched: bool) -> Closing:
+    def listen(self, topic: str, handler: Callable[[Sample], None], latched: bool) -> None:
         """Call the handler with each message of a topic, of any type."""
-        key = self.keys.all_messages(topic)
-        return self._bus.declare(TopicSubscription(self._bus.owner, key, handler, latched))
+        for key in self.keys.all_messages(topic):
+            self._bus.declare(TopicSubscription(self._bus.owner, key, handler, latched))
 
     def publication(self, endpoint: Endpoint, latched: bool) -> TopicPublication:
         """Declare a publication."""
@@ -175,7 +175,7 @@ class Subscriber:
         """Subscribe; see `Ros2Node.subscribe`."""
         self.topic, self.kinds, self.refused = topic, tuple(kinds), ""
         self._node, self._handler, self._latched = node, handler, latched
-        self._announced: dict[Endpoint, str] = {}
+        self._announced: dict[tuple[Endpoint, bool], str] = {}
         node.watch(EndpointRole.PUBLISHER, topic, self._presence)
         node.listen(topic, self._receive, latched)
 
@@ -184,13 +184,13 @@ class Subscriber:
             return
         if endpoint.kind not in self.kinds:
             self.refused = endpoint.kind
-        elif endpoint not in self._announced:
-            self._announced[endpoint] = self._node.announce(EndpointRole.SUBSCRIBER, endpoint, self._latched)
+        elif (one := (endpoint, endpoint.backends)) not in self._announced:
+            self._announced[one] = self._node.announce(EndpointRole.SUBSCRIBER, endpoint, self._latched)
 
     def _receive(self, sample: Sample) -> None:
         kind, _ = self._node.keys.kind_of(sample.key)
         if not kind:
-            kind = next((known.kind for known in self._announced), self.refused or self.kinds[0])
+            kind = next((known.kind for known, _ in self._announced), self.refused or self.kinds[0])
         if kind not in self.kinds:
             self.refused = kind
             return
