@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from mapweave.agent.drivers.clock import now_ns, of_monotonic_ns
 from mapweave.agent.drivers.settings import CameraSettings
+from mapweave.agent.drivers.stream_refusal import refusal, without_password
 from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.storage.image_file import check_size
 
@@ -34,15 +35,29 @@ MOST_DAMAGED = 10
 """Images in a row that cannot be decoded before a stream is opened again, which takes a second."""
 DAMAGED_PAUSE = 0.02
 """s between two of them: a stream that has ended says at once that it has no more."""
+LONGEST_GAP = 0.5
+"""s without an image, after which the first one is left out: FFmpeg's parser and decoders hand over the last
+one from before the gap only then."""
 FFMPEG_LEVEL, QUIET = "OPENCV_FFMPEG_LOGLEVEL", "-8"
 """FFmpeg writes up to thirty lines of its own about each damaged image."""
 FFMPEG_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 """The environment's variable that OpenCV reads when it opens a source."""
-RAW_STREAM = "fflags;nobuffer|analyzeduration;500000"
-"""For images on TCP without a container. By default FFmpeg examines them for 5 s, keeps them, and delivers
-them first: for some seconds each image would be as old as that, with the stamp of now."""
+UNBUFFERED = "fflags;nobuffer|analyzeduration;500000"
+"""By default FFmpeg examines the images of a stream for up to 5 s, keeps them, and delivers them first: each
+would be as old as that, with the stamp of now."""
+PROMPT_STREAMS = {
+    "tcp": UNBUFFERED,
+    "rtsp": f"{UNBUFFERED}|rtsp_flags;prefer_tcp",
+    "rtsps": f"{UNBUFFERED}|rtsp_flags;prefer_tcp",
+}
+"""By the scheme of the URL: images on TCP without a container, and RTSP. They replace the option that OpenCV
+sets itself, that RTSP prefers TCP."""
 FARTHEST_STAMP_NS = 1_000_000_000
 """Largest age of a frame; a greater difference means that the device uses another clock."""
+
+
+class NotOpened(DeviceError):
+    """A source that does not open; what is wrong with a stream is for its server to say."""
 
 
 class StampedImage(NamedTuple):
@@ -77,6 +92,8 @@ class Capture:
             DeviceError: the source cannot be opened.
         """
         self._settings = settings
+        self._name = without_password(settings.source)
+        self._waited = 0.0
         self._changed = threading.Condition()
         self._newest: StampedImage | None = None
         self._closing = False
@@ -106,10 +123,12 @@ class Capture:
         while True:
             try:
                 return self._open()
-            except DeviceError:
+            except NotOpened:
                 if time.monotonic() >= end:
-                    raise
+                    break
                 time.sleep(RETRY / 5)
+        reason = refusal(self._settings.source) if "://" in self._settings.source else self._hint()
+        raise DeviceError(f"camera {self._name}: cannot be opened; {reason}")
 
     def _open(self) -> cv2.VideoCapture:
         settings, source = self._settings, self._settings.source
@@ -120,32 +139,28 @@ class Capture:
         self._is_device = number is not None
         self._is_file = number is None and "://" not in source
         if self._is_file and not Path(source).is_file():
-            raise DeviceError(f"camera {source}: no such file; a source is a number, a file or a URL")
+            raise DeviceError(f"camera {self._name}: no such file; a source is a number, a file or a URL")
         if number is not None:
             capture = cv2.VideoCapture(int(number[1]), cv2.CAP_V4L2)
             capture.set(cv2.CAP_PROP_FRAME_WIDTH, settings.width)
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
             capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         else:
-            raw = source.startswith("tcp://") and FFMPEG_OPTIONS not in os.environ
-            if raw:
-                os.environ[FFMPEG_OPTIONS] = RAW_STREAM
+            prompt = PROMPT_STREAMS.get(source.partition("://")[0].lower())
+            set_here = prompt is not None and FFMPEG_OPTIONS not in os.environ
+            if prompt is not None and set_here:
+                os.environ[FFMPEG_OPTIONS] = prompt
             # FFmpeg with n threads decodes n frames at once, which delays each by n frames.
             options = [
                 cv2.CAP_PROP_N_THREADS, 1, cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(STREAM_SILENT_MS),
                 cv2.CAP_PROP_READ_TIMEOUT_MSEC, round(STREAM_SILENT_MS),
             ]  # fmt: skip
             capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, options)
-            if raw:
+            if set_here:
                 del os.environ[FFMPEG_OPTIONS]
         if not capture.isOpened():
             capture.release()
-            hint = "is it connected, and not in use by another program?"
-            if self._is_file:
-                hint = "it is no video, or one cut off at its start; `mapweave info` says what is in a file"
-            elif not self._is_device:
-                hint = "does its server run, and does a player show images of this address?"
-            raise DeviceError(f"camera {source}: cannot be opened; {hint}")
+            raise NotOpened(self._name)
         try:
             # Later frames of another size are scaled to the first one's.
             check_size(
@@ -153,8 +168,14 @@ class Capture:
             )
         except InvalidValue as error:
             capture.release()
-            raise DeviceError(f"camera {source}: {error}") from None
+            raise DeviceError(f"camera {self._name}: {error}") from None
         return capture
+
+    def _hint(self) -> str:
+        """What may be wrong with a device or a file that does not open."""
+        if self._is_file:
+            return "it is no video, or one cut off at its start; `mapweave info` says what is in a file"
+        return "is it connected, and not in use by another program?"
 
     # In the camera's thread.
 
@@ -168,7 +189,7 @@ class Capture:
                 return
             # A camera that opens and delivers nothing is reported once, not with each attempt.
             if not said or self._newest is not reported:
-                log.warning("camera %s delivers no images%s; opening it again", self._settings.source, reason)
+                log.warning("camera %s delivers no images%s; opening it again", self._name, reason)
                 reported, said = self._newest, True
             while not self._closing:
                 time.sleep(RETRY)
@@ -212,15 +233,26 @@ class Capture:
                 self._lock_exposure()
 
     def _grabs(self, capture: cv2.VideoCapture) -> bool:
-        """Whether there is another image; damaged ones of a stream are left out."""
+        """Whether there is another image; those of a stream that are damaged or late are left out."""
+        live = not (self._is_file or self._is_device)
         began = time.monotonic()
         for _ in range(MOST_DAMAGED):
-            if capture.grab():
-                return True
-            silent = time.monotonic() - began >= STREAM_SILENT_MS / 1e3
-            if self._is_file or self._is_device or self._closing or silent:
+            asked = time.monotonic()
+            grabbed = capture.grab()
+            now, waited_before = time.monotonic(), self._waited
+            self._waited = now - asked
+            if not live:
+                return grabbed
+            # One that comes as the connection is given up is as old as that.
+            if self._closing or now - began >= STREAM_SILENT_MS / 1e3:
                 break
-            time.sleep(DAMAGED_PAUSE)
+            # A camera of one image in two seconds has a gap each time.
+            if grabbed and not self._waited > LONGEST_GAP >= waited_before:
+                return True
+            if grabbed:
+                began = now
+            else:
+                time.sleep(DAMAGED_PAUSE)
         return False
 
     def _stamp_ns(self) -> int:
@@ -240,4 +272,4 @@ class Capture:
         done = capture.set(cv2.CAP_PROP_AUTO_EXPOSURE, 1) and capture.set(cv2.CAP_PROP_EXPOSURE, exposure)
         capture.set(cv2.CAP_PROP_AUTO_WB, 0)
         if not done:
-            log.warning("camera %s: this device cannot lock its exposure", self._settings.source)
+            log.warning("camera %s: this device cannot lock its exposure", self._name)

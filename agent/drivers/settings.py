@@ -141,7 +141,7 @@ class RobotSettings:
                 raise
             found = "; `mapweave find-port` finds it" if words.endswith(" port is missing") else ""
             raise SettingsError(
-                f"{words}: write it in the robot's settings file, and give that with --settings FILE "
+                f"{words}: write it in the robot's settings file, and give that with --robot FILE.toml "
                 f"(docs/drivers.md){found}"
             ) from None
 

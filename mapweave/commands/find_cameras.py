@@ -41,6 +41,7 @@ def run(arguments: argparse.Namespace) -> int:
 
     from mapweave.agent.drivers.camera import Capture
     from mapweave.agent.drivers.settings import CameraSettings
+    from mapweave.agent.drivers.stream_refusal import without_password
     from mapweave.agent.vision.image_quality import ImageQuality
     from mapweave.doctor.camera import SECONDS, watch
     from mapweave.hybridmap.errors import DeviceError, Refused
@@ -54,6 +55,7 @@ def run(arguments: argparse.Namespace) -> int:
     failed: list[str] = []
     for number, source in enumerate(sources):
         settings = CameraSettings(width, height, width, width, width / 2, height / 2, 0.3, source=source)
+        source = without_password(source)
         try:
             camera = Capture(settings)
         except DeviceError as error:

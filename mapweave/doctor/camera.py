@@ -67,6 +67,8 @@ def examine(settings: CameraSettings) -> Iterator[Finding]:
         camera = Capture(settings)
     except DeviceError as error:
         advice = "mapweave find-cameras lists the cameras that open; set [robot.camera] source"
+        if "://" in settings.source:
+            advice = "mend that, or [robot.camera] source; mapweave find-cameras URL tries an address"
         yield wrong("camera", str(error), advice)
         return
     try:
@@ -78,7 +80,9 @@ def examine(settings: CameraSettings) -> Iterator[Finding]:
 
 def judge(settings: CameraSettings, watched: Watched) -> Iterator[Finding]:
     """What the images of a camera say."""
-    source = settings.source
+    from mapweave.agent.drivers.stream_refusal import without_password
+
+    source = without_password(settings.source)
     if not watched.images:
         yield wrong(
             "camera", f"{source} opens and gives no image",

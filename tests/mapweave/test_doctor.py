@@ -17,6 +17,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+from mapweave.agent.drivers import camera as driver_camera
 from mapweave.agent.drivers import wheeled
 from mapweave.agent.drivers.serial_port import SerialPort
 from mapweave.agent.observation import Observation, Odometry, RobotDescription
@@ -38,6 +39,7 @@ from tests.agent.drivers.emulators import ArduinoSketch
 from tests.mapweave.expired_key import EXPIRED, expired_key
 from tests.programs import python
 from tests.recordings import write_video
+from tests.rtsp_stream import RtspStream
 from tests.waiting import eventually
 
 ROOT = Path(__file__).parents[2]
@@ -163,7 +165,7 @@ def film(path: Path, walls: PhotoWalls, spoil=lambda image: image, moves: bool =
     return write_video(path, [image for image in images for _ in range(10)], 20.0)
 
 
-def robot_toml(folder: Path, video: Path, port: object, width: int = WIDTH) -> Path:
+def robot_toml(folder: Path, video: Path | str, port: object, width: int = WIDTH) -> Path:
     path = folder / "robot.toml"
     path.write_text(f"""
 [robot]
@@ -268,6 +270,28 @@ def test_no_camera_and_wrong_settings(tmp_path, capfd):
     assert first == "settings" and "did you mean 'driver'" in findings["settings"].detail
     _, findings, _ = doctor(capfd, "--robot", "koala", "--offline", "--data", tmp_path)
     assert "driver koala" in findings["settings"].detail
+
+
+def test_an_option_that_is_missing_is_asked_for_in_the_file_of_the_robot(tmp_path, capfd):
+    """It was "give that with --settings FILE" where --robot FILE had been given."""
+    settings = tmp_path / "robot.toml"
+    settings.write_text('[robot]\ndriver = "arduino"\n')
+    _, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
+    assert first == "driver"
+    assert "write it in the robot's settings file, and give that with --robot FILE.toml" in (
+        findings["driver"].detail
+    )
+
+
+def test_what_a_stream_lacks_is_said_without_its_password(tmp_path, capfd, opened, monkeypatch):
+    monkeypatch.setattr(driver_camera, "STREAM_PATIENCE", 0.0)
+    place = opened(RtspStream(lambda: b"", "bob:secret")).place
+    settings = robot_toml(tmp_path, f"rtsp://bob:secret@{place}/none", tmp_path / "ttyUSB7")
+    _, findings, first = doctor(capfd, "--robot", settings, "--offline", "--data", tmp_path)
+    assert first == "camera"
+    assert findings["camera"].detail.endswith(f"{place} has nothing at /none: mend the path")
+    assert "[robot.camera] source" in findings["camera"].advice
+    assert not any("secret" in one.detail for one in findings.values())
 
 
 # Encoders against the image

@@ -3,6 +3,7 @@
 import re
 import sys
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,6 +17,7 @@ from mapweave.exit_status import NO
 from tests.agent.drivers.emulators import ArduinoSketch
 from tests.mapweave.command_line import complaint
 from tests.recordings import write_video
+from tests.rtsp_stream import RtspStream
 
 
 @pytest.fixture(autouse=True)
@@ -140,3 +142,20 @@ def test_no_camera_is_an_error(tmp_path, capfd):
     words = complaint(capfd, "find-cameras", tmp_path / "none.avi", "--out", tmp_path / "frames", status=NO)
     assert "no such file" in words and "no camera gives an image" in words
     assert not (tmp_path / "frames").exists()
+
+
+def test_a_password_in_an_address_is_not_shown(tmp_path, capfd, opened):
+    frame = cv2.imencode(".jpg", np.random.default_rng(1).integers(0, 255, (48, 64, 3), np.uint8))[
+        1
+    ].tobytes()
+
+    def next_frame() -> bytes:
+        time.sleep(0.05)
+        return frame
+
+    place = opened(RtspStream(next_frame, "bob:secret")).place
+    url, out = f"rtsp://bob:secret@{place}/cam", tmp_path / "frames"
+    assert main(["find-cameras", url, "--json", "--out", str(out)]) == 0
+    said = "".join(capfd.readouterr())
+    assert f"rtsp://bob:***@{place}/cam" in said
+    assert "secret" not in said

@@ -1,5 +1,6 @@
 """OpenCV capture: the newest frame, stamped when it was taken."""
 
+import re
 import socket
 import threading
 import time
@@ -11,11 +12,14 @@ import numpy as np
 import pytest
 
 from mapweave.agent.drivers import camera as camera_module
-from mapweave.agent.drivers.camera import Capture
+from mapweave.agent.drivers import stream_refusal
+from mapweave.agent.drivers.camera import Capture, StampedImage
 from mapweave.agent.drivers.settings import CameraSettings
+from mapweave.agent.drivers.stream_refusal import refusal, without_password
 from mapweave.hybridmap.errors import DeviceError
 from tests.mjpeg_stream import MjpegStream
 from tests.recordings import write_video
+from tests.rtsp_stream import RtspStream
 from tests.waiting import eventually, free_port
 
 WIDTH, HEIGHT = 64, 48
@@ -84,7 +88,9 @@ def test_a_source_that_is_not_there(source: str, words: str):
 def test_of_a_stream_that_is_not_there_its_server_is_asked_for(monkeypatch):
     monkeypatch.setattr(camera_module, "STREAM_PATIENCE", 0.0)
     url = f"http://127.0.0.1:{free_port()}/video"
-    with pytest.raises(DeviceError, match="cannot be opened; does its server run, and does a player show"):
+    with pytest.raises(
+        DeviceError, match=r"cannot be opened; no server listens at 127\.0\.0\.1:\d+: start it"
+    ):
         Capture(settings(url))
 
 
@@ -318,3 +324,125 @@ def test_a_device_is_stamped_by_its_driver_and_its_exposure_locked(locks: bool, 
     assert ("cannot lock its exposure" in caplog.text) is not locks
     camera.close()
     assert device.released
+
+
+class Counted:
+    """Frames that say their number, at a steady rate."""
+
+    def __init__(self) -> None:
+        self.number = 0
+        self._began = time.monotonic()
+
+    def next(self) -> bytes:
+        self.number += 1
+        time.sleep(max(self._began + self.number / RATE - time.monotonic(), 0.0))
+        image = np.full((HEIGHT, WIDTH, 3), shade(self.number), np.uint8)
+        return cv2.imencode(".jpg", image)[1].tobytes()
+
+
+def test_an_rtsp_stream_begins_with_the_image_of_now(opened, monkeypatch):
+    """Its first images were up to 1.4 s old, with the stamp of now."""
+    frames, behind = Counted(), []
+
+    def stamped(stamp_ns: int, image: np.ndarray) -> StampedImage:
+        behind.append((frames.number - round(int(image[20, 20]) / 5)) % 50)
+        return StampedImage(stamp_ns, image)
+
+    monkeypatch.setattr(camera_module, "StampedImage", stamped)
+    camera = opened(Capture(settings(opened(RtspStream(frames.next)).url)))
+    frame = camera.newer(0, 5.0)
+    assert frame is not None
+    assert frame.image.shape == (HEIGHT, WIDTH)
+    assert behind[0] <= 3
+
+
+@pytest.mark.parametrize(
+    ("credentials", "path", "words"),
+    [
+        ("bob:", "cam", "asks for a user name and a password: rtsp://USER:PASSWORD@"),
+        ("", "other", "has nothing at /other: mend the path"),
+        ("bob:wr%3Fong", "cam", "refuses this user name and password"),
+    ],
+)
+def test_why_a_stream_does_not_open_is_said_without_its_password(
+    credentials: str, path: str, words: str, opened, monkeypatch
+):
+    """All of them were "cannot be opened; does its server run", with the password in the line."""
+    monkeypatch.setattr(camera_module, "STREAM_PATIENCE", 0.0)
+    asked = "bob:secret" if credentials else ""
+    place = opened(RtspStream(Counted().next, asked)).place
+    who = "" if credentials in ("", "bob:") else f"{credentials}@"
+    with pytest.raises(DeviceError) as refused:
+        Capture(settings(f"rtsp://{who}{place}/{path}"))
+    line = str(refused.value)
+    assert words in line and "ong" not in line and "\n" not in line
+    assert line.startswith(
+        f"camera rtsp://{'bob:***@' if who else ''}{place}/{path}: cannot be opened; {place}"
+    )
+
+
+def test_a_stream_with_the_right_password_opens(opened):
+    place = opened(RtspStream(Counted().next, "bob:wr?ong")).place
+    camera = opened(Capture(settings(f"rtsp://bob:wr%3Fong@{place}/cam")))
+    assert camera.newer(0, 5.0) is not None
+
+
+def test_a_server_that_hangs_or_speaks_another_protocol_is_named(stream: Stream, monkeypatch):
+    monkeypatch.setattr(stream_refusal, "PATIENCE", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as silent:
+        place = "{}:{}".format(*silent.getsockname())
+        assert refusal(f"rtsp://{place}/cam") == (
+            f"{place} does not answer: is that computer on, and does its server hang?"
+        )
+    assert refusal(f"rtsp://{place}/cam") == f"no server listens at {place}: start it, or mend the port"
+    other = stream.url.replace("http", "rtsp")
+    assert re.fullmatch(r"127.*:\d+ answers 505 .*|what listens at .* does not speak RTSP", refusal(other))
+    assert refusal(stream.url) == "does a player show images of this address?"
+    assert refusal("udp://:5000") == "is its address complete, with the port?"
+    assert refusal("rtsp://[::1/cam") == "its address is no URL"
+    assert without_password("rtsp://u:p@ss@h:1/a@b:c") == "rtsp://u:***@h:1/a@b:c"
+    for plain in ("/dev/video0", "rtsp://h:554/x", "rtsp://u@h/x", "C:/a@b"):
+        assert without_password(plain) == plain
+
+
+class Paused(Device):
+    """A stream whose images come after these times, and say which they are."""
+
+    def __init__(self, waits: list[float]) -> None:
+        super().__init__(False)
+        self.waits, self.number = waits, 0
+
+    def grab(self) -> bool:
+        if self.number == len(self.waits):
+            time.sleep(0.05)
+            return False
+        self.number += 1
+        time.sleep(self.waits[self.number - 1])
+        return True
+
+    def retrieve(self) -> tuple[bool, np.ndarray]:
+        return True, np.full((HEIGHT, WIDTH), self.number, np.uint8)
+
+
+@pytest.mark.parametrize(
+    ("waits", "wanted"),
+    [
+        ([0.02, 0.02, 0.3, 0.02, 0.02], [1, 2, 4, 5]),
+        ([0.02, 0.3, 0.3, 0.3], [1, 3, 4]),
+        ([0.02, 0.02, 0.6, 0.02], [1, 2]),
+    ],
+    ids=["after a gap", "a slow camera", "as it is given up"],
+)
+def test_the_image_from_before_a_gap_gets_no_stamp_of_now(waits: list[float], wanted: list[int], monkeypatch):
+    """A stream of H.264 hands it over when the next one comes: it was two seconds old after two seconds."""
+    monkeypatch.setattr(camera_module, "LONGEST_GAP", 0.15)
+    monkeypatch.setattr(camera_module, "STREAM_SILENT_MS", 500.0)
+    monkeypatch.setattr("cv2.VideoCapture", lambda *_: Paused(waits))
+    seen: list[int] = []
+    camera = Capture(settings("rtsp://camera/stream"))
+    last = 0
+    while (frame := camera.newer(last, 0.8)) is not None and len(seen) < len(wanted):
+        last = frame.stamp_ns
+        seen.append(int(frame.image[0, 0]))
+    camera.close()
+    assert seen == wanted

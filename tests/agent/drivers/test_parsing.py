@@ -85,9 +85,9 @@ def test_what_a_waveshare_says():
 @pytest.mark.parametrize(("driver", "options", "words"), [
     ("koala", {"prot": "x"}, r"\[robot.options\]: no setting 'prot'; did you mean 'port'"),
     ("create", {},
-     r"\[robot.options\]: port is missing: write it in .* --settings FILE .*`mapweave find-port`"),
+     r"\[robot.options\]: port is missing: write it in .* --robot FILE\.toml .*`mapweave find-port`"),
     ("arduino", {"port": "x"},
-     r"wheel_radius is missing: write it in .* --settings FILE \(docs/drivers.md\)$"),
+     r"wheel_radius is missing: write it in .* --robot FILE\.toml \(docs/drivers.md\)$"),
     ("arduino", {"port": "x", "wheel_radius": 0.0, "counts_per_turn": 1},
      "wheel_radius must be a number, above 0; it is 0.0"),
     ("arduino", {"port": "x", "wheel_radius": 1.0, "counts_per_turn": 1, "baud": 0},
