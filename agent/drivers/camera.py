@@ -45,13 +45,8 @@ FFMPEG_OPTIONS = "OPENCV_FFMPEG_CAPTURE_OPTIONS"
 UNBUFFERED = "fflags;nobuffer|analyzeduration;500000"
 """By default FFmpeg examines the images of a stream for up to 5 s, keeps them, and delivers them first: each
 would be as old as that, with the stamp of now."""
-PROMPT_STREAMS = {
-    "tcp": UNBUFFERED,
-    "rtsp": f"{UNBUFFERED}|rtsp_flags;prefer_tcp",
-    "rtsps": f"{UNBUFFERED}|rtsp_flags;prefer_tcp",
-}
-"""By the scheme of the URL: images on TCP without a container, and RTSP. They replace the option that OpenCV
-sets itself, that RTSP prefers TCP."""
+OVER_TCP = "|rtsp_flags;prefer_tcp"
+"""For RTSP, as OpenCV sets it where no options are given."""
 FARTHEST_STAMP_NS = 1_000_000_000
 """Largest age of a frame; a greater difference means that the device uses another clock."""
 
@@ -146,10 +141,10 @@ class Capture:
             capture.set(cv2.CAP_PROP_FRAME_HEIGHT, settings.height)
             capture.set(cv2.CAP_PROP_BUFFERSIZE, 1)
         else:
-            prompt = PROMPT_STREAMS.get(source.partition("://")[0].lower())
-            set_here = prompt is not None and FFMPEG_OPTIONS not in os.environ
-            if prompt is not None and set_here:
-                os.environ[FFMPEG_OPTIONS] = prompt
+            set_here = not self._is_file and FFMPEG_OPTIONS not in os.environ
+            if set_here:
+                rtsp = source.lower().startswith(("rtsp://", "rtsps://"))
+                os.environ[FFMPEG_OPTIONS] = UNBUFFERED + (OVER_TCP if rtsp else "")
             # FFmpeg with n threads decodes n frames at once, which delays each by n frames.
             options = [
                 cv2.CAP_PROP_N_THREADS, 1, cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, round(STREAM_SILENT_MS),

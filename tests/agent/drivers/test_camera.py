@@ -1,5 +1,6 @@
 """OpenCV capture: the newest frame, stamped when it was taken."""
 
+import os
 import re
 import socket
 import threading
@@ -354,6 +355,24 @@ def test_an_rtsp_stream_begins_with_the_image_of_now(opened, monkeypatch):
     assert frame is not None
     assert frame.image.shape == (HEIGHT, WIDTH)
     assert behind[0] <= 3
+
+
+@pytest.mark.parametrize("scheme", ["RTSP", "http", "udp"])
+def test_no_stream_is_buffered_unless_options_are_given(scheme: str, monkeypatch):
+    """MPEG-TS over HTTP began with the images of two seconds."""
+    given: list[str | None] = []
+
+    def opened(*_: object) -> Paused:
+        given.append(os.environ.get(camera_module.FFMPEG_OPTIONS))
+        return Paused([])
+
+    monkeypatch.setattr("cv2.VideoCapture", opened)
+    Capture(settings(f"{scheme}://camera/stream")).close()
+    monkeypatch.setenv(camera_module.FFMPEG_OPTIONS, "rtsp_transport;udp")
+    Capture(settings(f"{scheme}://camera/stream")).close()
+    unbuffered = "fflags;nobuffer|analyzeduration;500000"
+    over_tcp = "|rtsp_flags;prefer_tcp" if scheme == "RTSP" else ""
+    assert given == [unbuffered + over_tcp, "rtsp_transport;udp"]
 
 
 @pytest.mark.parametrize(
