@@ -21,6 +21,7 @@ from mapweave.commands.network import (
 
 if TYPE_CHECKING:
     import threading
+    from collections.abc import Callable
 
     from mapweave.teleoperation.gamepad import Gamepad
     from mapweave.teleoperation.keyboard import Keyboard, RawTerminal
@@ -96,7 +97,7 @@ def _by_keyboard(
 ) -> None:
     from mapweave.teleoperation.keyboard import HELP
 
-    show = _shown(session, name, HELP)
+    show = _shown(session, name, lambda: HELP)
     while not (stop.is_set() or keyboard.quit or session.refused):
         if select.select([terminal], [], [], TICK)[0]:
             data = terminal.read()
@@ -108,17 +109,22 @@ def _by_keyboard(
 
 
 def _by_gamepad(session: Session, name: str, gamepad: Gamepad, stop: threading.Event) -> None:
-    from mapweave.teleoperation.gamepad import HELP
+    from mapweave.hybridmap.errors import DeviceError
 
-    show = _shown(session, name, f"{HELP}, Ctrl-C quits")
+    show = _shown(session, name, lambda: f"{gamepad.hint}, Ctrl-C quits")
     while not (stop.is_set() or session.refused):
         if select.select([gamepad], [], [], TICK)[0]:
-            gamepad.read()
+            try:
+                gamepad.read()
+            except DeviceError as error:
+                raise DeviceError(
+                    f"{error}. {name} stands until someone drives it and quits, or gives it a mission"
+                ) from None
         session.want(*gamepad.wanted())
         show()
 
 
-def _shown(session: Session, name: str, usage: str) -> Any:
+def _shown(session: Session, name: str, usage: Callable[[], str]) -> Any:
     """A function that shows the state, no more often than people can read it."""
     from mapweave.agent.teleoperation import DEAD_MAN
     from mapweave.teleoperation.display import Display, lines
@@ -132,7 +138,9 @@ def _shown(session: Session, name: str, usage: str) -> Any:
         last[0] = now
         silence = now - session.answered
         display.show(
-            lines(name, session.answer.report, session.command, silence if silence > DEAD_MAN else 0.0, usage)
+            lines(
+                name, session.answer.report, session.command, silence if silence > DEAD_MAN else 0.0, usage()
+            )
         )
 
     return show

@@ -28,6 +28,8 @@ FIRST = 1.0
 class Session:
     """Sends commands in a thread of its own until it is closed; then the mission goes on.
 
+    If it is closed by an error, as that a gamepad is gone, the robot stands instead.
+
     Attributes:
         answer: the agent's last one; None before the first.
         answered: when it came, s of `time.monotonic`.
@@ -55,7 +57,7 @@ class Session:
         self._number = secrets.randbits(52)
         self._shares = (0.0, 0.0)
         self._changed = threading.Event()
-        self._closing = False
+        self._closing = self._failed = False
         self._sender = threading.Thread(target=self._send_all, name="commands", daemon=True)
         end = time.monotonic() + FIRST
         while self.answer is None and not self.refused:
@@ -70,8 +72,10 @@ class Session:
         self._sender.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
-        """Give the wheels back."""
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Give the wheels back, or stop them: no person has quit where an error ends the drive."""
+        self._failed = kind is not None
+        self._shares = 0.0, 0.0
         self._closing = True
         self._changed.set()
         self._sender.join()
@@ -98,7 +102,7 @@ class Session:
             self._send(DEAD_MAN)
             self._changed.wait(max(began + PERIOD - time.monotonic(), 0.0))
         if not self.refused:
-            self._send(DEAD_MAN, release=True)
+            self._send(DEAD_MAN, release=not self._failed)
 
     def _send(self, timeout: float, release: bool = False) -> None:
         answer_ns = 0 if self.answer is None else self.answer.answer_ns
