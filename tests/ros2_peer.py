@@ -175,7 +175,9 @@ class RosPeer:
             self._token(f"@ros2_lv/{self.domain}/{who}/{name}/{dds(kind)}/{type_hash}/{qos}")
         else:
             name = self.key(topic, kind, "").replace("/", "§")
-            self._token(f"@/{self.zid}/@ros2_lv/{role}/{name}/{kind.replace('/', '§')}/1:2:1,10")
+            # No key, reliable, volatile, keep last 10 by the numbers of DDS, and the type's hash since Iron.
+            dds_qos = f":1:0:0,10:typehash={type_hash};"
+            self._token(f"@/{self.zid}/@ros2_lv/{role}/{name}/{kind.replace('/', '§')}/{dds_qos}")
 
     def tokens(self) -> list[str]:
         """What `ros2 topic list` and `ros2 node list` are made of."""

@@ -240,6 +240,17 @@ def test_a_bridge_has_plain_keys(router: ZenohFleet):
         bridge.close()
 
 
+def test_either_byte_order_is_read_and_the_second_version_of_cdr_refused():
+    """A bridge hands on what its DDS writers send: plain CDR or XCDR2, which aligns doubles to 4 bytes."""
+    values = (0.25, 0.0, 0.0, 0.0, 0.0, -0.5)
+    for order, representation in ((">", b"\0\0"), ("<", b"\0\1")):
+        twist = decode(TWIST, representation + b"\0\0" + struct.pack(f"{order}6d", *values))
+        assert (twist.linear.x, twist.angular.z) == (0.25, -0.5)
+    for representation in (b"\0\6", b"\0\7", b"\0\3", b"\0\x0b"):
+        with pytest.raises(InvalidMessage, match="52 bytes are no geometry_msgs/msg/Twist"):
+            decode(TWIST, representation + b"\0\0" + struct.pack("<6d", *values))
+
+
 def test_a_link_refuses_what_is_no_name(monkeypatch):
     for wrong in ({"endpoint": "127.0.0.1"}, {"namespace": "/a b"}, {"namespace": "/1st"}):
         with pytest.raises(SettingsError):
