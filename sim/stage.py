@@ -16,7 +16,8 @@ SUBSTEPS = 8
 """Steps of the physics in a tick: 80 Hz."""
 SOLVER_ITERATIONS = 20
 """Of PyBullet's contact solver. Together with SUBSTEPS: over a drive of 9 m and three turns, wheels without
-slip then lose 4 mm to the solver, as against 2 mm with twice the iterations and half as many steps more."""
+slip then lose 3 mm to the solver, as against 2 mm with half as many steps more. Twice the iterations change
+less than 0.2 mm."""
 
 RigidPose = tuple[NDArray[np.float64], NDArray[np.float64]]
 """(3,) m of an origin, and (3, 3) rotation of its axes, in world."""

@@ -148,6 +148,36 @@ def test_the_solver_loses_next_to_nothing(bare: World):
     assert abs(off.heading) < math.radians(0.1)
 
 
+def test_a_robot_without_a_command_stays_where_it_is(bare: World):
+    """Of any mass and heading, after a drive: within 0.04 mm in half a second and 0.2 mm in five seconds."""
+    masses = [1.0, 4.0, 4.0, 4.0, 4.0, 30.0]
+    setups = [RobotSetup(f"r{k}", body=BodySettings(mass=mass)) for k, mass in enumerate(masses)]
+    poses = [Pose2(0.0, 3.0 * k, 0.6 * k) for k in range(len(masses))]
+    with Simulation(bare, setups, 6, poses) as simulation:
+        for _ in range(15):
+            simulation.advance({name: Command(0.25, 0.3) for name in simulation.robots})
+        for _ in range(70):
+            simulation.advance({})
+        for name in simulation.robots:
+            # The wheels have come to rest after 2 s.
+            way = simulation.trajectory(name)[1][35:, :2]
+            for ticks, bound in ((5, 4e-5), (50, 2e-4)):
+                assert np.linalg.norm(way[ticks:] - way[:-ticks], axis=1).max() < bound
+
+
+def test_a_robot_that_stands_can_be_pushed(bare: World):
+    """By a heavier one, also across its wheels; then it stays where it was pushed to."""
+    setups = [RobotSetup("r0"), RobotSetup("r1", body=BodySettings(mass=8.0))]
+    with Simulation(bare, setups, 7, [Pose2(0.0, 0.0, math.pi / 2), Pose2(-0.4, 0.0, 0.0)]) as simulation:
+        for _ in range(40):
+            simulation.advance({"r1": Command(0.3)})
+        assert simulation.truth("r0").x > 0.5
+        for _ in range(70):
+            simulation.advance({})
+        way = simulation.trajectory("r0")[1][60:, :2]
+        assert np.linalg.norm(way[50:] - way[:-50], axis=1).max() < 2e-4
+
+
 @pytest.mark.parametrize("sign", [-1.0, 1.0])
 def test_commands_are_clipped(bare: World, sign: float):
     """Ten times the limit is the limit."""
