@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from mapweave.agent.calibration.camera_motions import (
     CameraMotions,
@@ -25,9 +26,9 @@ from mapweave.agent.calibration.camera_motions import (
 from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate, Lengths
 from mapweave.agent.calibration.floor_path import DrivenStep, follow, heights_over
 from mapweave.agent.calibration.floor_scale import floor_scale
+from mapweave.agent.calibration.floor_tiles import FloorTiles
 from mapweave.agent.calibration.pair_information import (
     FARTHEST_FLOOR,
-    FloorMatches,
     ImagePair,
     PairInformation,
     reduce_pair,
@@ -121,10 +122,26 @@ class Estimator:
         follow(self._ways, pair.first_s, pair.last_s, self.informations[-1].at)
         return self.informations[-1]
 
-    def add_floor(self, floor: FloorMatches) -> None:
-        """Keep points of the floor with the newest pair."""
-        pair = self.pairs[-1] = replace(self.pairs[-1], floor=floor)
-        self.informations[-1] = with_floor(self.informations[-1], pair, self._most_sigma)
+    def add_with_floor(
+        self,
+        pair: ImagePair,
+        wheels: WheelTrack,
+        tiles: FloorTiles,
+        before: NDArray[np.float32],
+        after: NDArray[np.float32],
+    ) -> None:
+        """Reduce a pair and keep it, with the tiles of the floor that its two images show.
+
+        Args:
+            pair: its tracks.
+            wheels: what they have counted, up to the second image at least.
+            tiles: of the camera.
+            before: part of the first image, as `FloorTiles.part`.
+            after: part of the second.
+        """
+        information = self.add(pair, wheels)
+        pair = self.pairs[-1] = replace(pair, floor=tiles.match(before, after, information.at))
+        self.informations[-1] = with_floor(information, pair, self._most_sigma)
 
     def drop(self, index: int) -> None:
         """Forget a pair."""
@@ -267,8 +284,7 @@ class Estimator:
         logs = assumed - np.log(np.clip(heights / height, 1.0 / FARTHEST_FLOOR, FARTHEST_FLOOR))
         logs -= self.vector[P.WHEEL_SCALE]
         sigmas = np.concatenate([floor.sigmas for floor in floors])
-        lane = any(len(self.pairs[k].floor.before) for k in kept)
-        found = floor_scale(logs, sigmas, off / height, numbers, BLOCK, lane)
+        found = floor_scale(logs, sigmas, off / height, numbers, BLOCK)
         if found is None:
             return
         pitch = math.sqrt(self._covariance[P.PITCH, P.PITCH]) * found.flatness

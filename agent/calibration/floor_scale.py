@@ -64,15 +64,14 @@ class FloorScale:
 
 
 def floor_scale(
-    logs: Array, sigmas: Array, flatness: Array, pairs: NDArray[np.int64], block: int, lane: bool
+    logs: Array, sigmas: Array, flatness: Array, pairs: NDArray[np.int64], block: int
 ) -> FloorScale | None:
     """Tell the floor from what stands on it.
 
     Points of the floor scatter about one ratio. What stands on it is spread evenly from there up, and some
     points are found wrongly, above or below. A mixture of three, by expectation maximisation, begun where the
-    density rises: things stand on the floor, nothing is below it. In the lane ahead the shares above and
-    below are found along with the floor; held equal, the feet of walls and boxes would count as floor. Beside
-    it lie pavements and verges, from which nothing rises evenly: there they are held equal.
+    density rises: things stand on the floor, nothing is below it. The shares above and below are found along
+    with the floor; held equal, the feet of walls and boxes would count as floor.
 
     Args:
         logs: (N,) logarithms of the declared over the measured height of the camera.
@@ -81,7 +80,6 @@ def floor_scale(
             nearest place, along the floor, over its height.
         pairs: (N,) number of the pair of images that each belongs to, ascending.
         block: pairs in a row whose errors may go together.
-        lane: whether points were looked for in the lane ahead.
 
     Returns:
         None where no floor can be found.
@@ -107,8 +105,6 @@ def floor_scale(
         total = on + over + under + NOWHERE
         share = on / total
         floor, above, below = (float((part / total).mean()) for part in (on, over, under))
-        if not lane:
-            above = below = 0.5 * (above + below)
         pull = share / spread**2
         square = (share * (off / sigmas) ** 2).sum() / max(share.sum(), 1e-9)
         # The mode is common, each pair has a slope: its row of the normal equations is eliminated.

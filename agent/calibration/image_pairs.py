@@ -31,6 +31,8 @@ LEAST_LEFT = 0.6
 """or no more than this share of them is left;"""
 LEAST_TRACKS = 25
 """with fewer it says nothing."""
+FEWEST_PAIRS = 20
+"""Without so many nothing is estimated. Chosen: these are at most 20 s of driving."""
 LEAST_PX = 1.0
 """Half of the points must have moved this far: a robot that stands says nothing."""
 
@@ -79,12 +81,17 @@ def centres(image: NDArray[np.uint8], points: Array, window: int) -> Array:
 
 
 class ImagePairs:
-    """Follows corners from image to image and gives a pair whenever the view has moved enough."""
+    """Follows corners from image to image and gives a pair whenever the view has moved enough.
+
+    Attributes:
+        first: (H, W) grey, the image with which the pair begins that is followed now; empty before any.
+    """
 
     def __init__(self, camera: Camera, lens: Lens) -> None:
         """Begin with no image."""
         self._camera, self._lens = camera, lens
-        self._before: NDArray[np.uint8] | None = None
+        self.first: NDArray[np.uint8] = np.zeros((0, 0), np.uint8)
+        self._before = self.first
         self._first_s = 0.0
         self._begin: Array = np.zeros((0, 2))
         self._here: NDArray[np.float32] = np.zeros((0, 1, 2), np.float32)
@@ -93,10 +100,7 @@ class ImagePairs:
 
     def step(self, stamp_s: float, image: NDArray[np.uint8]) -> ImagePair | None:
         """Take the next image; a pair if one is complete."""
-        if self._before is None or self._before.shape != image.shape:
-            self._start(stamp_s, image)
-            return None
-        if not self._follow(image):
+        if self._before.shape != image.shape or not self._follow(image):
             self._start(stamp_s, image)
             return None
         took = stamp_s - self._first_s
@@ -115,7 +119,7 @@ class ImagePairs:
         return pair
 
     def _start(self, stamp_s: float, image: NDArray[np.uint8]) -> None:
-        self._before, self._first_s = image, stamp_s
+        self.first, self._before, self._first_s = image, image, stamp_s
         middle = image.shape[0] // 2
         upper, lower = (
             corners(part, CORNERS // 2, QUALITY, APART_PX, WINDOW_PX)

@@ -18,6 +18,7 @@ from mapweave.agent.calibration.estimate import SIGNIFICANT, Estimate, Lengths
 from mapweave.agent.calibration.estimator import Estimator
 from mapweave.agent.calibration.floor_tiles import FloorTiles
 from mapweave.agent.calibration.image_pairs import (
+    FEWEST_PAIRS,
     LEAST_LEFT,
     LEAST_TRACKS,
     LONGEST_S,
@@ -42,8 +43,6 @@ ENOUGH_HEIGHTS = 0.5
 """or the camera by so many of its heights: near floor leaves the view;"""
 LEAST = 0.004
 """and says nothing if they have moved less than this."""
-FEWEST_PAIRS = 20
-"""No solution before so many pairs, as of a recorded drive (`recorded_drive`)."""
 SOLVE_EVERY = 4
 """Pairs between two solutions."""
 PARTS = 2
@@ -271,8 +270,7 @@ class OnlineCalibration:
     def _take(self, pair: ImagePair, floor: NDArray[np.float32]) -> None:
         estimator = self._estimator
         wheels = self._counted.track()
-        at = estimator.add(pair, wheels).at
-        estimator.add_floor(self._tiles.match(floor, self._floor, at))
+        estimator.add_with_floor(pair, wheels, self._tiles, floor, self._floor)
         turned = np.interp([pair.first_s, pair.last_s], wheels.stamps, wheels.turn)
         self._taken += 1
         self._turns.append(abs(float(turned[1] - turned[0])))

@@ -7,9 +7,11 @@ import numpy as np
 
 from mapweave.agent.calibration.camera_motions import WheelTrack, predict
 from mapweave.agent.calibration.correction import geometry_of
+from mapweave.agent.calibration.counted_wheels import CountedWheels
 from mapweave.agent.calibration.estimate import Estimate
 from mapweave.agent.calibration.estimator import Estimator
-from mapweave.agent.calibration.image_pairs import ImagePairs, sigma_of
+from mapweave.agent.calibration.floor_tiles import FloorTiles
+from mapweave.agent.calibration.image_pairs import FEWEST_PAIRS, ImagePairs, sigma_of
 from mapweave.agent.calibration.pair_information import ImagePair
 from mapweave.agent.calibration.ranger_scale import RangerScale
 from mapweave.agent.observation import Observation, RobotDescription
@@ -17,9 +19,6 @@ from mapweave.hybridmap.errors import InvalidValue
 from mapweave.hybridmap.pose import Array
 from mapweave.vision.lens import Lens
 
-FEWEST_PAIRS = 20
-"""Pairs of images without which nothing is estimated. Chosen: a pair is up to 1 s, so these are at most 20 s
-of driving."""
 LEAST_S = 10.0
 """Of driving, s; half a minute is better."""
 LEAST_TURN = 0.5
@@ -59,45 +58,45 @@ def calibrate(
     """
     camera = description.camera
     lens = Lens(camera, description.distortion)
-    images = ImagePairs(camera, Lens(camera) if lens.rectifies else lens)
-    stamps, ways, turns = list[float](), list[float](), list[float]()
-    pairs, rangers = [], RangerScale(description)
+    plain = Lens(camera) if lens.rectifies else lens
+    images, tiles = ImagePairs(camera, plain), FloorTiles(camera, plain)
+    counted, turned, rangers = CountedWheels(), 0.0, RangerScale(description)
+    declared, sigma = geometry_of(description), sigma_of(camera)
+    whole = Estimator(declared, sigma, keep_wheels)
     for observation in observations:
-        stamps.append(1e-9 * observation.stamp_ns)
-        ways.append(observation.odometry.forward)
-        turns.append(observation.odometry.turn)
+        stamp = 1e-9 * observation.stamp_ns
+        counted.add(stamp, observation.odometry)
+        turned += abs(observation.odometry.turn)
         rangers.step(observation.odometry, observation.proximity)
         if observation.image is not None:
-            pair = images.step(stamps[-1], lens.rectified(observation.image))
+            before = images.first
+            pair = images.step(stamp, lens.rectified(observation.image))
             if pair is not None:
-                pairs.append(pair)
+                parts = tiles.part(before), tiles.part(images.first)
+                whole.add_with_floor(pair, counted.track(), tiles, *parts)
+    pairs, wheels = whole.pairs, counted.track()
     driven = sum(pair.last_s - pair.first_s for pair in pairs)
     if len(pairs) < FEWEST_PAIRS or driven < LEAST_S:
         raise InvalidValue(
             f"too short: {driven:.0f} s in which the robot moves and points can be followed; "
             "drive for half a minute, with turns to both sides, where there is something to see"
         )
-    turned = float(np.abs(turns).sum())
     if turned < LEAST_TURN:
         raise InvalidValue(
             f"the drive turns by {np.degrees(turned):.0f} degrees in all, and only turns show where the "
             "camera stands; drive curves to both sides"
         )
-    wheels = WheelTrack(np.array(stamps), np.cumsum([0.0, *ways[1:]]), np.cumsum([0.0, *turns[1:]]))
-    declared, sigma = geometry_of(description), sigma_of(camera)
     held = pairs[HELD_OUT - 1 :: HELD_OUT]
     others = [pair for k, pair in enumerate(pairs) if k % HELD_OUT != HELD_OUT - 1]
     part = Estimator(declared, sigma, keep_wheels)
-    part.ranged = rangers.scale()
+    part.ranged = whole.ranged = rangers.scale()
     trained = part.batch(others, wheels)
-    whole = Estimator(declared, sigma, keep_wheels)
-    whole.ranged = part.ranged
     estimate = whole.batch(pairs, wheels)
     # Of the parameters that are written: fewer pairs show fewer.
     checked = np.where(estimate.shown, trained.vector, declared.vector)
     misses = (_miss(part, held, wheels, v) for v in (declared.vector, checked))
-    before, after = (camera.fx * miss for miss in misses)
-    return DriveCalibration(estimate, before, after)
+    declared_px, estimated_px = (camera.fx * miss for miss in misses)
+    return DriveCalibration(estimate, declared_px, estimated_px)
 
 
 def _miss(estimator: Estimator, pairs: list[ImagePair], wheels: WheelTrack, vector: Array) -> float:

@@ -167,8 +167,14 @@ def pairs(
     return found
 
 
-def render(run: RoomDrive, seed: int = 0) -> list[NDArray[np.uint8]]:
-    """One image a stamp: rays from the camera to the nearest plane of the room and its pillars."""
+def render(run: RoomDrive, seed: int = 0, floor: float = 1.0) -> list[NDArray[np.uint8]]:
+    """One image a stamp: rays from the camera to the nearest plane of the room and its pillars.
+
+    Args:
+        run: the drive.
+        seed: of pattern and noise.
+        floor: contrast of floor and ceiling over that of the walls.
+    """
     rng = np.random.default_rng(seed)
     size = 1024
     pattern = np.zeros((size, size), np.float32)
@@ -203,6 +209,8 @@ def render(run: RoomDrive, seed: int = 0) -> list[NDArray[np.uint8]]:
             pattern, (a % (size - 1)).astype(np.float32).reshape(u.shape),
             (b % (size - 1)).astype(np.float32).reshape(u.shape), cv2.INTER_LINEAR,
         )  # fmt: skip
+        level = (plane == 2).reshape(u.shape)
+        grey[level] = 128.0 + floor * (grey[level] - 128.0)
         shade = np.array([0.85, 1.0, 0.7])[axis].reshape(u.shape)
         noisy = grey * shade + rng.normal(0.0, 2.0, grey.shape)
         images.append(np.clip(noisy, 0, 255).astype(np.uint8))
