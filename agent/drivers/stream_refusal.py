@@ -2,7 +2,6 @@
 
 import base64
 import socket
-import ssl
 from http import HTTPStatus
 from urllib.parse import SplitResult, unquote, urlsplit
 
@@ -10,8 +9,10 @@ PATIENCE = 2.0
 """s for the connection, and for the answer."""
 LONGEST_ANSWER = 4096
 """Bytes of the answer that are read; its first lines tell."""
-PORTS = {"rtsp": 554, "rtsps": 322, "http": 80, "https": 443}
-ENCRYPTED = ("rtsps", "https")
+PORTS = {"rtsp": 554, "rtsps": 322, "http": 80, "https": 443, "tcp": None}
+"""Of the schemes whose servers are reached by TCP; the last has no usual one."""
+ASKED = ("rtsp", "http")
+"""The schemes in which a question is put here."""
 PLAYER = "does a player show images of this address?"
 
 
@@ -31,7 +32,9 @@ def refusal(url: str) -> str:
     """
     try:
         parts = urlsplit(url)
-        port = parts.port or PORTS.get(parts.scheme)
+        if parts.scheme not in PORTS:
+            return PLAYER
+        port = parts.port or PORTS[parts.scheme]
         if not parts.hostname or port is None:
             return "is its address complete, with the port?"
         return _asked(parts, parts.hostname, port)
@@ -43,7 +46,7 @@ def _asked(parts: SplitResult, host: str, port: int) -> str:
     place = f"{host}:{port}"
     try:
         with socket.create_connection((host, port), PATIENCE) as connection:
-            if parts.scheme not in PORTS or parts.scheme in ENCRYPTED:
+            if parts.scheme not in ASKED:
                 return PLAYER
             connection.sendall(_question(parts, place))
             answer = connection.recv(LONGEST_ANSWER).decode("latin-1")
@@ -53,7 +56,7 @@ def _asked(parts: SplitResult, host: str, port: int) -> str:
         return f"no server listens at {place}: start it, or mend the port"
     except TimeoutError:
         return f"{place} does not answer: is that computer on, and does its server hang?"
-    except (OSError, ssl.SSLError) as error:
+    except OSError as error:
         return f"{place}: {error.strerror or error}"
     return _in_words(parts, place, answer)
 

@@ -417,7 +417,9 @@ def test_a_server_that_hangs_or_speaks_another_protocol_is_named(stream: Stream,
     other = stream.url.replace("http", "rtsp")
     assert re.fullmatch(r"127.*:\d+ answers 505 .*|what listens at .* does not speak RTSP", refusal(other))
     assert refusal(stream.url) == "does a player show images of this address?"
-    assert refusal("udp://:5000") == "is its address complete, with the port?"
+    assert refusal("tcp://camera") == "is its address complete, with the port?"
+    # Nothing listens by TCP where a camera sends by UDP.
+    assert refusal(f"udp://{place}") == "does a player show images of this address?"
     assert refusal("rtsp://[::1/cam") == "its address is no URL"
     assert without_password("rtsp://u:p@ss@h:1/a@b:c") == "rtsp://u:***@h:1/a@b:c"
     for plain in ("/dev/video0", "rtsp://h:554/x", "rtsp://u@h/x", "C:/a@b"):
