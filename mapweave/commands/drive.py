@@ -29,6 +29,8 @@ if TYPE_CHECKING:
 
 TICK = 0.05
 """Between two looks at the keys, s."""
+STANDS = "stands until someone drives it and quits, or gives it a mission"
+"""What the robot does that has lost who drives it."""
 SHOWN = 0.2
 """Between two states on the screen, s."""
 
@@ -95,6 +97,7 @@ def run(arguments: argparse.Namespace) -> int:
 def _by_keyboard(
     session: Session, name: str, terminal: RawTerminal, keyboard: Keyboard, stop: threading.Event
 ) -> None:
+    from mapweave.hybridmap.errors import DeviceError
     from mapweave.teleoperation.keyboard import HELP
 
     show = _shown(session, name, lambda: HELP)
@@ -102,10 +105,13 @@ def _by_keyboard(
         if select.select([terminal], [], [], TICK)[0]:
             data = terminal.read()
             if not data:
-                return
+                break
             keyboard.feed(data, time.monotonic())
         session.want(*keyboard.wanted(time.monotonic()))
         show()
+    # The signal of its end stops this loop as Ctrl-C does, and no person has quit.
+    if terminal.gone:
+        raise DeviceError(f"the terminal is gone. {name} {STANDS}")
 
 
 def _by_gamepad(session: Session, name: str, gamepad: Gamepad, stop: threading.Event) -> None:
@@ -117,9 +123,7 @@ def _by_gamepad(session: Session, name: str, gamepad: Gamepad, stop: threading.E
             try:
                 gamepad.read()
             except DeviceError as error:
-                raise DeviceError(
-                    f"{error}. {name} stands until someone drives it and quits, or gives it a mission"
-                ) from None
+                raise DeviceError(f"{error}. {name} {STANDS}") from None
         session.want(*gamepad.wanted())
         show()
 

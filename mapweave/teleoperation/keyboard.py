@@ -99,12 +99,22 @@ class RawTerminal:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Restore the terminal as it was before."""
-        termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
+        """Restore the terminal as it was before, if it is still there."""
+        if not self.gone:
+            termios.tcsetattr(self._fd, termios.TCSADRAIN, self._before)
 
     def fileno(self) -> int:
         """The file descriptor for `select`."""
         return self._fd
+
+    @property
+    def gone(self) -> bool:
+        """Whether it was closed, as by the loss of a connection by ssh."""
+        try:
+            termios.tcgetattr(self._fd)
+        except termios.error:
+            return True
+        return False
 
     def read(self) -> bytes:
         """Bytes that are there; none at its end."""

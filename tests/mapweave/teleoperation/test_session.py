@@ -1,6 +1,8 @@
-"""A drive by gamepad: `mapweave drive` at one end, the agent's commands at the other."""
+"""A drive by gamepad or keys: `mapweave drive` at one end, the agent's commands at the other."""
 
 import os
+import pty
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -13,10 +15,11 @@ from mapweave.agent.mission import Driven
 from mapweave.agent.mission_control import MissionControl
 from mapweave.agent.observation import Command
 from mapweave.agent.teleoperation import Teleoperation
-from mapweave.commands.drive import _by_gamepad
+from mapweave.commands.drive import _by_gamepad, _by_keyboard
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.ids import MapId
 from mapweave.teleoperation.gamepad import Gamepad
+from mapweave.teleoperation.keyboard import Keyboard, RawTerminal
 from mapweave.teleoperation.session import Session
 from mapweave.wire.keys import Keys
 from mapweave.wire.memory import MemoryBus, MemoryHub
@@ -74,6 +77,41 @@ def test_a_gamepad_that_is_unplugged_stops_the_robot_and_its_mission_does_not_go
     thread.join()
     pad.close()
     assert "it is gone. r0 stands until someone drives it and quits, or gives it a mission" in str(failed[0])
+    assert stands(robot)
+
+
+@pytest.mark.parametrize("signalled", [False, True])
+def test_a_terminal_that_is_lost_stops_the_robot_too(
+    signalled: bool, ends: tuple[MemoryBus, FleetClient], monkeypatch: pytest.MonkeyPatch
+):
+    """As where a connection by ssh breaks: the end of the terminal was taken for Ctrl-C."""
+    person, robot = ends
+    master, slave = pty.openpty()
+    with os.fdopen(slave) as stdin:
+        monkeypatch.setattr(sys, "stdin", stdin)
+        stop = threading.Event()
+        failed: list[DeviceError] = []
+
+        def drive() -> None:
+            try:
+                with Session(person, KEYS, "r0") as session, RawTerminal() as terminal:
+                    _by_keyboard(session, "r0", terminal, Keyboard(1.0), stop)
+            except DeviceError as error:
+                failed.append(error)
+
+        thread = threading.Thread(target=drive)
+        thread.start()
+
+        def pressed() -> bool:
+            os.write(master, b"w")
+            return robot.driven() == Driven(Command(0.3))
+
+        eventually(pressed)
+        os.close(master)
+        if signalled:
+            stop.set()
+        thread.join()
+    assert str(failed[0]).startswith("the terminal is gone. r0 stands until someone drives it")
     assert stands(robot)
 
 
