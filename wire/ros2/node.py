@@ -128,7 +128,9 @@ class Ros2Node:
 
     def listen(self, topic: str, handler: Callable[[Sample], None], latched: bool) -> None:
         """Call the handler with each message of a topic, of any type."""
-        for key in self.keys.all_messages(topic):
+        keys = self.keys.all_messages(topic)
+        # Publishers with backends are not latched.
+        for key in keys[:1] if latched else keys:
             self._bus.declare(TopicSubscription(self._bus.owner, key, handler, latched))
 
     def publication(self, endpoint: Endpoint, latched: bool) -> TopicPublication:
