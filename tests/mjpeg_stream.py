@@ -8,11 +8,12 @@ from collections.abc import Callable
 class MjpegStream:
     """Serves at `url` until it is closed; each connection gets frames by itself."""
 
-    def __init__(self, next_frame: Callable[[], bytes | None]) -> None:
+    def __init__(self, next_frame: Callable[[], bytes | None], port: int = 0) -> None:
         """Begin to serve.
 
         Args:
             next_frame: waits for the next frame, as JPEG; None ends the connection that asks.
+            port: of the server; 0 takes a free one.
         """
 
         class Handler(http.server.BaseHTTPRequestHandler):
@@ -30,7 +31,7 @@ class MjpegStream:
             def log_message(self, *_: object) -> None:
                 pass
 
-        self._server = http.server.ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self._server = http.server.ThreadingHTTPServer(("127.0.0.1", port), Handler)
         self._server.daemon_threads = True
         self.url = f"http://127.0.0.1:{self._server.server_address[1]}/stream.mjpg"
         threading.Thread(target=self._server.serve_forever, args=(0.02,), daemon=True).start()

@@ -22,16 +22,17 @@ class RtspStream:
         url: of its only stream, /cam.
     """
 
-    def __init__(self, next_frame: Callable[[], bytes], credentials: str = "") -> None:
+    def __init__(self, next_frame: Callable[[], bytes], credentials: str = "", port: int = 0) -> None:
         """Begin to serve.
 
         Args:
             next_frame: waits for the next frame, as a colour JPEG of multiples of 16 px.
             credentials: USER:PASSWORD that are asked for; empty asks for none.
+            port: of the server; 0 takes a free one.
         """
         self._next_frame, self._credentials = next_frame, credentials
         self._closing = threading.Event()
-        self._socket = socket.create_server(("127.0.0.1", 0))
+        self._socket = socket.create_server(("127.0.0.1", port))
         self.place = "{}:{}".format(*self._socket.getsockname())
         self.url = f"rtsp://{self.place}/cam"
         threading.Thread(target=self._accept, daemon=True).start()

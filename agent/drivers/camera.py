@@ -55,6 +55,18 @@ class NotOpened(DeviceError):
     """A source that does not open; what is wrong with a stream is for its server to say."""
 
 
+class StreamAway(DeviceError):
+    """A stream that does not open yet, and may later: its server is not reached, or not ready.
+
+    Attributes:
+        url: of the stream, with its password.
+    """
+
+    def __init__(self, words: str, url: str) -> None:
+        super().__init__(words)
+        self.url = url
+
+
 class StampedImage(NamedTuple):
     """An image with its stamp.
 
@@ -84,6 +96,7 @@ class Capture:
         """Open the source and start to capture.
 
         Raises:
+            StreamAway: the stream does not answer yet.
             DeviceError: the source cannot be opened.
         """
         self._settings = settings
@@ -122,8 +135,11 @@ class Capture:
                 if time.monotonic() >= end:
                     break
                 time.sleep(RETRY / 5)
-        reason = refusal(self._settings.source) if "://" in self._settings.source else self._hint()
-        raise DeviceError(f"camera {self._name}: cannot be opened; {reason}")
+        why = f"camera {self._name}: cannot be opened; "
+        if "://" not in self._settings.source:
+            raise DeviceError(why + self._hint())
+        words, may_pass = refusal(self._settings.source)
+        raise StreamAway(why + words, self._settings.source) if may_pass else DeviceError(why + words)
 
     def _open(self) -> cv2.VideoCapture:
         settings, source = self._settings, self._settings.source

@@ -66,6 +66,7 @@ class WheeledRobot:
 
         Raises:
             SettingsError: there is no camera.
+            StreamAway: the camera's stream does not answer yet.
             DeviceError: the camera cannot be opened, or the base is none.
         """
         check_base(base)

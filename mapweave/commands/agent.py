@@ -196,7 +196,7 @@ def run(arguments: argparse.Namespace) -> int:
         if found_soon(body, client_settings(beside)):
             claim = Claim(body, keys, name)
         robot, synchronization = checked, _ = open_robot(
-            arguments, settings.robot, body, network.fleet, name, arguments.lockstep
+            arguments, settings.robot, body, network.fleet, name, arguments.lockstep, stop
         )
         # After what is wrong with settings and driver, which then is the only line.
         warn_without_router(bus, name, client_settings(network), opened)
@@ -289,8 +289,12 @@ def open_robot(
     fleet: str,
     name: str,
     lockstep: bool = False,
+    stop: threading.Event | None = None,
 ) -> tuple[CheckedRobot, Synchronization]:
-    """The robot, its output checked, and how the loop is synchronised: a simulation may run in lock-step."""
+    """The robot, its output checked, and how the loop is synchronised: a simulation may run in lock-step.
+
+    Until `stop` a camera's stream that does not answer yet is waited for; without it, it is an error at once.
+    """
     from mapweave.agent.drivers.checked import CheckedRobot
     from mapweave.agent.drivers.registry import find_driver
     from mapweave.agent.drivers.remote import RemoteRobot
@@ -315,7 +319,12 @@ def open_robot(
         make = find_driver(driver)
     except SettingsError as error:
         raise (UsageError(str(error)) if arguments.robot else error) from None
-    return CheckedRobot(make(settings)), FreeRunning()
+    if stop is None:
+        return CheckedRobot(make(settings)), FreeRunning()
+    from mapweave.processes.stream_wait import made_with_stream
+
+    opened = made_with_stream(lambda: make(settings), lambda line: print_error(f"{name}: {line}"), stop)
+    return CheckedRobot(opened), FreeRunning()
 
 
 def bus_of(arguments: argparse.Namespace, settings: RobotSettings, network: NetworkSettings) -> ZenohBus:

@@ -53,7 +53,7 @@ def run(arguments: argparse.Namespace) -> int:
         network = replace(network, endpoints=(arguments.body,))
     bus = bus_of(arguments, settings.robot, network)
     try:
-        robot, _ = open_robot(arguments, settings.robot, bus, network.fleet, name)
+        robot, _ = open_robot(arguments, settings.robot, bus, network.fleet, name, stop=stop)
         threading.Thread(target=close_on, args=(stop, robot), name="stop", daemon=True).start()
         recorded = RecordedRobot(robot, arguments.out, arguments.lossless, print_error)
         try:

@@ -410,17 +410,18 @@ def test_a_server_that_hangs_or_speaks_another_protocol_is_named(stream: Stream,
     monkeypatch.setattr(stream_refusal, "PATIENCE", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as silent:
         place = "{}:{}".format(*silent.getsockname())
-        assert refusal(f"rtsp://{place}/cam") == (
-            f"{place} does not answer: is that computer on, and does its server hang?"
-        )
-    assert refusal(f"rtsp://{place}/cam") == f"no server listens at {place}: start it, or mend the port"
-    other = stream.url.replace("http", "rtsp")
-    assert re.fullmatch(r"127.*:\d+ answers 505 .*|what listens at .* does not speak RTSP", refusal(other))
-    assert refusal(stream.url) == "does a player show images of this address?"
-    assert refusal("tcp://camera") == "is its address complete, with the port?"
+        words = f"{place} does not answer: is that computer on, and does its server hang?"
+        assert refusal(f"rtsp://{place}/cam") == (words, True)
+    words = f"no server listens at {place}: start it, or mend the port"
+    assert refusal(f"rtsp://{place}/cam") == (words, True)
+    other = refusal(stream.url.replace("http", "rtsp"))
+    assert re.fullmatch(r"127.*:\d+ answers 505 .*|what listens at .* does not speak RTSP", other.words)
+    assert not other.may_pass
+    assert refusal(stream.url) == ("does a player show images of this address?", False)
+    assert refusal("tcp://camera") == ("is its address complete, with the port?", False)
     # Nothing listens by TCP where a camera sends by UDP.
-    assert refusal(f"udp://{place}") == "does a player show images of this address?"
-    assert refusal("rtsp://[::1/cam") == "its address is no URL"
+    assert refusal(f"udp://{place}") == ("does a player show images of this address?", False)
+    assert refusal("rtsp://[::1/cam") == ("its address is no URL", False)
     assert without_password("rtsp://u:p@ss@h:1/a@b:c") == "rtsp://u:***@h:1/a@b:c"
     for plain in ("/dev/video0", "rtsp://h:554/x", "rtsp://u@h/x", "C:/a@b"):
         assert without_password(plain) == plain
