@@ -59,6 +59,8 @@ StampedRow = tuple[int, int, tuple[float, float, float]]
 """Stamp, ns, that of the header, 0 if there is none; x m, y m, heading rad."""
 TRUTH = ("truth", "gt", "amcl", "mocap", "vicon")
 """Parts of names of topics that are never taken for odometry."""
+RECTIFIED = "image_rect"
+"""Beginning of names of topics whose images are without distortion, as image_proc names them."""
 DEPTH = "depth"
 """Part of names of topics whose images show distances: taken only where there are no others."""
 
@@ -417,8 +419,10 @@ def _camera(opened: Bag, image: str, options: RecordingOptions, notes: list[str]
     _, message = next(opened.messages(info.name), (0, None))
     if message is None:
         raise DeviceError((opened.damage or [f"{opened.path}: {info.name} has no message"])[-1])
+    # Its driver has removed the distortion: D and K are those of the images before (REP 104).
+    rectified = image.removesuffix("/compressed").rpartition("/")[2].startswith(RECTIFIED)
     try:
-        camera, model, coefficients = camera_of(message)
+        camera, model, coefficients = camera_of(message, rectified)
         mount = _mount(opened, str(message.header.frame_id))
         if mount is not None:
             camera = replace(camera, mount_height=mount.up, mount_forward=mount.forward)
@@ -430,7 +434,7 @@ def _camera(opened: Bag, image: str, options: RecordingOptions, notes: list[str]
         notes.append(f"camera {mount.forward:.2f} m ahead of the axle and {mount.up:.2f} m high, by tf")
         if not high and options.camera_height is None:
             notes.append("a camera is above the floor: tf does not say how high")
-    notes += doubts(message, mount)
+    notes += doubts(message, mount, rectified)
     return options.camera_of(given, high)
 
 

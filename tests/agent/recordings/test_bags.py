@@ -36,6 +36,7 @@ from mapweave.agent.ros_messages.values import Mount, camera_of
 from mapweave.cli import main
 from mapweave.exit_status import FAILED
 from mapweave.hybridmap.errors import DeviceError
+from mapweave.vision.lens import NO_DISTORTION
 from tests.agent.recordings.conftest import BEGUN_NS, COUNT, STEP_NS, Drive, between
 from tests.recordings import write_folder
 
@@ -575,6 +576,21 @@ def test_three_coefficients_of_distortion_are_named(drive: Drive, tmp_path, monk
     write_bag(tmp_path / "drive", drive)
     recording = open_recording(tmp_path / "drive", RecordingOptions(camera_height=0.3))
     assert any("3 coefficients of distortion" in note for note in recording.notes)
+
+
+@pytest.mark.parametrize("ros1", [False, True])
+def test_images_without_distortion_are_not_rectified_again(ros1: bool, drive: Drive, tmp_path, monkeypatch):
+    """Beside them a CameraInfo still tells K and D of the images before, and theirs is P (REP 104)."""
+    made, p = camera_info, np.array([300.0, 0.0, 150.0, 0.0, 0.0, 310.0, 110.0, 0.0, 0.0, 0.0, 1.0, 0.0])
+    monkeypatch.setitem(
+        globals(), "camera_info", lambda *given: replace(made(*given), **{"P" if ros1 else "p": p})
+    )
+    path = tmp_path / ("drive.bag" if ros1 else "drive")
+    write_bag(path, drive, ros1=ros1, image="/cam/image_rect_color")
+    recording = open_recording(path, RecordingOptions(camera_height=0.3))
+    camera = recording.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (300.0, 310.0, 150.0, 110.0)
+    assert recording.distortion == NO_DISTORTION
 
 
 @pytest.mark.parametrize(
