@@ -12,6 +12,8 @@ from mapweave.agent.ros_messages.values import heading_of
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.pose import Array
 
+LEVEL = 0.5
+"""An axis of length 1 is up if its tip is higher: that of a camera that looks up by 30 degrees is not."""
 CSV_COLUMNS = ("stamp_s", "x_m", "y_m", "heading_rad")
 
 
@@ -19,7 +21,8 @@ def read_poses(path: Path) -> StampedPoses:
     """Read poses.
 
     A `.csv` has the columns stamp_s, x_m, y_m and heading_rad. Any other file has lines of
-    `stamp x y z qx qy qz qw`, s and m, z up; lines that begin with # are comments. A last line without its
+    `stamp x y z qx qy qz qw`, s and m, z up, of a robot or of its camera; lines that
+    begin with # are comments. A last line without its
     end is left out. A damaged line ends the poses. Poses are sorted by time.
 
     Raises:
@@ -58,20 +61,43 @@ def _csv(path: Path, text: str) -> tuple[Array, str]:
 
 
 def _tum(path: Path, text: str) -> tuple[Array, str]:
-    rows = list[tuple[float, ...]]()
+    rows, damage = list[list[float]](), ""
     for number, line in enumerate(_whole_lines(text), 1):
         words = line.split("#")[0].replace(",", " ").split()
         if not words:
             continue
         try:
-            stamp, x, y, _, qx, qy, qz, qw = _finite(list(map(float, words)))
-            if not any((qx, qy, qz, qw)):
-                return np.array(rows).reshape(-1, 4), f"{path}: line {number}: a quaternion of zeros is none"
+            row = _finite(list(map(float, words)))
+            _, _, _, _, qx, qy, qz, qw = row
         except ValueError as error:
             why = error if "finite" in str(error) else "a pose is `stamp x y z qx qy qz qw`"
-            return np.array(rows).reshape(-1, 4), f"{path}: line {number}: {why}"
-        rows.append((stamp, x, y, heading_of(qx, qy, qz, qw)))
-    return np.array(rows).reshape(-1, 4), ""
+            damage = f"{path}: line {number}: {why}"
+            break
+        if not any((qx, qy, qz, qw)):
+            damage = f"{path}: line {number}: a quaternion of zeros is none"
+            break
+        rows.append(row)
+    table = np.array(rows).reshape(-1, 8)
+    return np.column_stack([table[:, :3], headings_of(table[:, 4:])]), damage
+
+
+def headings_of(quaternions: Array) -> Array:
+    """Headings of poses in a frame whose z is up, by the axis that is ahead.
+
+    That is x where z of most poses is up, as of robots (REP 103). Else it is z, as of a camera (x right, y
+    down) and of EuRoC's IMU (x up): TUM's and EuRoC's true poses are such.
+
+    Args:
+        quaternions: (N, 4) x, y, z, w, of any length but zero.
+
+    Returns:
+        (N,) rad.
+    """
+    x, y, z, w = quaternions.T
+    up = (w * w + z * z - x * x - y * y) / (quaternions**2).sum(axis=1)
+    if not len(up) or np.median(up) > LEVEL:
+        return np.array([heading_of(*row) for row in quaternions.tolist()])
+    return np.asarray(np.arctan2(y * z - w * x, x * z + w * y))
 
 
 def _whole_lines(text: str) -> list[str]:

@@ -82,7 +82,7 @@ def add_to(commands: Any) -> None:
         "--truth",
         type=Path,
         metavar="FILE",
-        help="truth.csv, or poses as TUM has them (default: truth.csv beside it)",
+        help="truth.csv, or true poses as TUM, EuRoC or KITTI have them (default: those beside it)",
     )
     replay.add_argument("--robot", metavar="NAME", help="one of the robots in the recording's splits.toml")
     _add_output(replay, "default: out/eval-replay/RECORDING")
@@ -103,15 +103,17 @@ def run_replay(arguments: argparse.Namespace) -> int:
     from mapweave.agent.drivers.replay import Replay
     from mapweave.agent.recordings.incomplete import NoOdometry
     from mapweave.evaluation.replaying import evaluate_replay, rows
+    from mapweave.evaluation.truth_files import truth_beside
     from mapweave.output_folder import check_output
     from mapweave.terminal import Bar, plain_or_terminal, tracked
 
     path: Path = arguments.recording
     out = arguments.out or Path("out/eval-replay") / path.resolve().stem
     check_output(out)
-    beside = (path if path.is_dir() else path.parent) / "truth.csv"
-    truth = arguments.truth or (beside if beside.exists() else None)
+    truth = arguments.truth or truth_beside(path)
     console = plain_or_terminal()
+    if truth is not None and arguments.truth is None:
+        console.print(f"truth from {truth}", highlight=False)
     evaluated: ReplayEvaluation | VisualEvaluation
     try:
         replay = Replay(path, arguments.robot, options=options_of(arguments))
@@ -138,6 +140,11 @@ def run_replay(arguments: argparse.Namespace) -> int:
     for written in evaluated.write(out):
         console.print(f"{written}", highlight=False)
     report = evaluated.report()
+    if truth is not None and not report["truth"]:
+        console.print(
+            f"no true pose is within 20 ms of a frame that is used: is {truth} of another clock?",
+            highlight=False,
+        )
     return _print(arguments, report, [("", ""), *rows(report)], str(path))
 
 

@@ -15,12 +15,11 @@ from mapweave.agent.drivers.replay import Replay
 from mapweave.agent.mapping.way_correction import WayCorrection
 from mapweave.agent.mission import Carried
 from mapweave.agent.pipeline import Pipeline
-from mapweave.agent.recordings.pose_files import read_poses
 from mapweave.agent.recordings.recording import Stamps
 from mapweave.agent.recordings.trajectory_file import TrajectoryFile, tum_line
 from mapweave.agent.settings import AgentSettings
 from mapweave.evaluation.map_score import align
-from mapweave.evaluation.truth import Truth
+from mapweave.evaluation.truth_files import read_truth
 from mapweave.evaluation.verdict import shown
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.hybridmap.hybrid_map import HybridMap
@@ -167,14 +166,14 @@ def evaluate_replay(
     Args:
         replay: read to its end.
         settings: of the pipeline.
-        truth: truth.csv, or poses as TUM writes them; None scores nothing.
+        truth: see `read_truth`; None scores nothing.
         on_frame: called after each frame.
 
     Raises:
         DeviceError: the truth is missing or wrong; or no image can be read.
     """
     # A wrong file is reported before the recording is mapped.
-    true_poses(truth, np.zeros(0, np.int64))
+    true_poses(truth, replay.recording.path, np.zeros(0, np.int64))
     description = replay.describe()
     pipelines = [_pipeline(0, description, settings)]
     frames, wheels = list[ReplayedFrame](), Pose2()
@@ -195,7 +194,8 @@ def evaluate_replay(
     stamps = np.array([frame.stamp_ns for frame in frames], np.int64)
     maps = [pipeline.map for pipeline in pipelines]
     notes = list(dict.fromkeys(line for pipeline in pipelines for line in pipeline.complaints))
-    return ReplayEvaluation(str(replay.recording.path), frames, maps, true_poses(truth, stamps), notes)
+    true = true_poses(truth, replay.recording.path, stamps)
+    return ReplayEvaluation(str(replay.recording.path), frames, maps, true, notes)
 
 
 def _moved(frame: ReplayedFrame, moved: WayCorrection, part: int) -> ReplayedFrame:
@@ -204,7 +204,7 @@ def _moved(frame: ReplayedFrame, moved: WayCorrection, part: int) -> ReplayedFra
     return frame if pose is None or frame.part != part else replace(frame, map_from_robot=moved.apply(pose))
 
 
-def true_poses(path: Path | None, stamps_ns: Stamps) -> Array:
+def true_poses(path: Path | None, recording: Path, stamps_ns: Stamps) -> Array:
     """(N, 3) true poses at stamps, NaN where the truth says nothing.
 
     Raises:
@@ -213,14 +213,7 @@ def true_poses(path: Path | None, stamps_ns: Stamps) -> Array:
     out = np.full((len(stamps_ns), 3), math.nan)
     if path is None:
         return out
-    if not path.exists():
-        raise DeviceError(f"{path}: no such file; without --truth nothing is scored")
-    if path.suffix == ".csv":
-        read = Truth.read(path)
-        known, poses = read.stamps_ns, np.array([pose.vector for pose in read.poses]).reshape(-1, 3)
-    else:
-        tum = read_poses(path)
-        known, poses = tum.stamps_ns, tum.poses
+    known, poses = read_truth(path, recording)
     if not len(known):
         raise DeviceError(f"{path}: no poses")
     after = np.clip(np.searchsorted(known, stamps_ns), 1, len(known) - 1) if len(known) > 1 else None

@@ -87,13 +87,13 @@ def evaluate_images(recording: Recording, frames: Iterable[int], truth: Path | N
     Args:
         recording: of a walk.
         frames: numbers of its images, in their order; going through them shows progress.
-        truth: truth.csv, or poses as TUM writes them; None scores nothing.
+        truth: see `read_truth`; None scores nothing.
 
     Raises:
         DeviceError: the truth is missing or wrong; or nothing can be mapped.
     """
     # A wrong file is reported before the recording is mapped.
-    true_poses(truth, np.zeros(0, np.int64))
+    true_poses(truth, recording.path, np.zeros(0, np.int64))
     numbers = list[int]()
 
     def noted() -> Iterable[int]:
@@ -108,9 +108,8 @@ def evaluate_images(recording: Recording, frames: Iterable[int], truth: Path | N
         raise DeviceError(nothing_mapped(recording.path, walk, damage))
     stamps = recording.stamps_ns[numbers]
     read = sum(1 + len(keyframe.followed) for keyframe in walk)
-    return VisualEvaluation(
-        str(recording.path), stamps.tolist(), maps, len(numbers) - read, true_poses(truth, stamps), damage
-    )
+    true = true_poses(truth, recording.path, stamps)
+    return VisualEvaluation(str(recording.path), stamps.tolist(), maps, len(numbers) - read, true, damage)
 
 
 def _squares(trajectory: Sequence[ImagePose], true: dict[int, Array]) -> Array:
