@@ -119,8 +119,9 @@ def _motion(
     robot: Robot, description: RobotDescription, drives: bool, ask: Callable[[str], bool]
 ) -> Iterator[Finding]:
     from mapweave.agent.observation import Command
+    from mapweave.agent.servo.proximity import guard
 
-    comparison = MotionComparison(description)
+    comparison, stopped = MotionComparison(description), ""
     if drives:
         if description.max_forward <= 0.0:
             yield skipped(ENCODERS, "the robot takes no commands")
@@ -131,6 +132,7 @@ def _motion(
         ):
             for observation in _observe(robot, seconds, command):
                 comparison.see(observation)
+                stopped = stopped or guard(command, observation.proximity, description).reason
     elif ask(PUSH):
         for observation in _observe(robot, MOTION_SECONDS):
             comparison.see(observation)
@@ -143,7 +145,7 @@ def _motion(
             "mapweave doctor --drive",
         )
         return
-    yield from comparison.judge()
+    yield from comparison.judge(stopped)
 
 
 def _advice(error: str) -> str:

@@ -69,8 +69,12 @@ class MotionComparison:
         turned = max(self.turns[0], self.turns[1]) >= LEAST_TURN
         return turned and (self.ways[0] >= LEAST_WAY or self.ways[1] >= EXPANSION)
 
-    def judge(self) -> Iterator[Finding]:
-        """What the sums say."""
+    def judge(self, stopped: str = "") -> Iterator[Finding]:
+        """What the sums say.
+
+        Args:
+            stopped: why a robot that drives by itself was held back; empty if it was not.
+        """
         wheel_turn, image_turn, product, square = self.turns
         wheel_way, image_way, way_product, _ = self.ways
         words = (
@@ -112,8 +116,9 @@ class MotionComparison:
                 f"axle, counts of a turn, wheel radius or fx are wrong, or one encoder is dead: {CALIBRATE}",
             )  # fmt: skip
         elif wheel_turn < LEAST_TURN or wheel_way < LEAST_WAY:
-            yield warning(
-                SUBJECT, f"too little motion to compare all: {words}", "drive and turn a little more"
-            )
+            advice = "drive and turn a little more"
+            if stopped:
+                advice = f"{stopped}: put the robot where it has half a metre of free floor ahead"
+            yield warning(SUBJECT, f"too little motion to compare all: {words}", advice)
         else:
             yield good(SUBJECT, f"agree with the image, turns to {product / square:.2f}: {words}")

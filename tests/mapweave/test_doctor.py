@@ -20,7 +20,7 @@ from rich.console import Console
 from mapweave.agent.drivers import camera as driver_camera
 from mapweave.agent.drivers import wheeled
 from mapweave.agent.drivers.serial_port import SerialPort
-from mapweave.agent.observation import Observation, Odometry, RobotDescription
+from mapweave.agent.observation import Command, Observation, Odometry, RobotDescription
 from mapweave.cli import main
 from mapweave.commands import doctor as doctor_command
 from mapweave.doctor import camera, camera_model, driver, libraries, machine
@@ -327,6 +327,36 @@ def test_encoders_are_compared_with_the_image(push, spoil, verdict, words):
         comparison.see(spoil(one, push[0]))
     (finding,) = comparison.judge()
     assert finding.verdict is verdict and words in finding.detail, finding
+
+
+class Cornered:
+    """It can turn on the spot, and something is ahead of it wherever it looks."""
+
+    def __init__(self, walls: PhotoWalls) -> None:
+        self._walls, self._number, self._turn, self._pose = walls, 0, 0.0, Pose2()
+
+    def describe(self) -> RobotDescription:
+        return replace(DESCRIPTION, ranger_bearings=(0.0,), ranger_reach=1.5)
+
+    def sense(self) -> Observation:
+        before, self._pose = self._pose, self._pose @ Pose2(0.0, 0.0, 0.1 * self._turn)
+        self._number += 1
+        return replace(self._walls.observe(before, self._pose, self._number), proximity=np.array([0.02]))
+
+    def act(self, command: Command) -> Command:
+        self._turn = command.turn
+        return Command(0.0, command.turn)
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_robot_that_was_stopped_before_an_obstacle_needs_free_floor(walls):
+    """It drove by itself, and the advice was to drive a little more."""
+    robot = Cornered(walls)
+    (finding,) = driver._motion(robot, robot.describe(), True, lambda words: False)
+    assert finding.verdict is FindingLevel.WARNING and "too little motion" in finding.detail
+    assert finding.advice.startswith("stopped: an obstacle is ahead: put the robot where")
 
 
 # The server
