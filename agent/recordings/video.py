@@ -17,7 +17,12 @@ from mapweave.hybridmap.errors import DeviceError, InvalidValue
 from mapweave.hybridmap.limits import MAX_STAMP_NS
 from mapweave.storage.image_file import check_size
 
-SUFFIXES = {".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg"}
+RAW = {".h264", ".264", ".h265", ".265", ".hevc", ".mjpeg", ".mjpg"}
+"""Streams in no container, as cameras of a Raspberry Pi are recorded: they have no times."""
+SUFFIXES = {
+    ".mp4", ".avi", ".mkv", ".mov", ".webm", ".m4v", ".mpg", ".mpeg", ".ts", ".mts", ".m2ts", ".3gp", ".wmv",
+    ".asf", ".flv", ".ogv", *RAW,
+}  # fmt: skip
 
 INDEXED = {".mp4", ".mov", ".m4v"}
 """Their index stands at the end."""
@@ -25,6 +30,9 @@ ASSUMED_RATE = 30.0
 """Images a second where neither frames nor header say."""
 OTHER_TRACK = 1.0
 """An AVI says how many frames it has; others how long they are, to which sound may add this, s."""
+
+PTS = 71
+"""`cv2.CAP_PROP_PTS`, in frames; OpenCV 4.10 does not know it and says 0."""
 
 
 def video(path: Path, options: RecordingOptions) -> Recording:
@@ -48,14 +56,16 @@ def video_images(path: Path) -> Images:
     """
     capture = _opened(path)
     stamps: list[int] = []
+    begin = 0.0
     while _grabbed(capture):
+        begin = begin if stamps else _begin(capture)
         stamp = 1e6 * capture.get(cv2.CAP_PROP_POS_MSEC)
         # A damaged header gives times that are no numbers.
         stamps.append(round(stamp) if abs(stamp) < MAX_STAMP_NS else 0)
     if len(stamps) < 2:
         lost = "; an MP4 that was cut off has lost its index" if path.suffix.lower() in INDEXED else ""
         raise DeviceError(f"{path}: no video that can be read{lost}")
-    damage, assumed = _cut_off(path, capture, len(stamps), stamps[-1] * 1e-9), ""
+    damage, assumed = _cut_off(path, capture, len(stamps), begin, stamps[-1] * 1e-9), ""
     if not all(before < after for before, after in itertools.pairwise(stamps)):
         # Some containers give no stamps for each frame.
         rate = capture.get(cv2.CAP_PROP_FPS)
@@ -63,6 +73,9 @@ def video_images(path: Path) -> Images:
             rate = 0.0
         assumed = "" if rate > 0 else f"frames without stamps: {ASSUMED_RATE:g} images a second are assumed"
         stamps = [round(1e9 * k / (rate if rate > 0 else ASSUMED_RATE)) for k in range(len(stamps))]
+    if path.suffix.lower() in RAW and not assumed:
+        rate = 1e9 / float(np.median(np.diff(stamps)))
+        assumed = f"a video in no container has no times: {rate:.3g} images a second are assumed"
     return Images(np.array(stamps, np.int64), _sequential(path), damage, assumed)
 
 
@@ -89,10 +102,24 @@ def _grabbed(capture: cv2.VideoCapture) -> bool:
         return False
 
 
-def _cut_off(path: Path, capture: cv2.VideoCapture, frames: int, last_s: float) -> str:
+def _begin(capture: cv2.VideoCapture) -> float:
+    """When the last grabbed frame is shown, s, by the video's clock: recorders of streams let it run on."""
+    rate, count = capture.get(cv2.CAP_PROP_FPS), capture.get(PTS)
+    begin = count / rate if rate > 0.0 else 0.0
+    return begin if math.isfinite(begin) else 0.0
+
+
+def _cut_off(path: Path, capture: cv2.VideoCapture, frames: int, begin_s: float, last_s: float) -> str:
     """What a video lacks of what its header says, in one line; empty if nothing.
 
     Stamps are compared, not counts: a recorder may skip frames and leave their places empty.
+
+    Args:
+        path: of it.
+        capture: at its end.
+        frames: that were read.
+        begin_s: of the first by the video's clock: the length in the header of a Matroska counts from zero.
+        last_s: of the last, since the first.
     """
     rate, stated = capture.get(cv2.CAP_PROP_FPS), capture.get(cv2.CAP_PROP_FRAME_COUNT)
     with path.open("rb") as file:
@@ -100,8 +127,12 @@ def _cut_off(path: Path, capture: cv2.VideoCapture, frames: int, last_s: float) 
     avi = kind == b"RIFF"
     if avi and not 0 < size <= path.stat().st_size - 8:
         return f"{path}: cut off after {frames} frames, {last_s:.1f} s: the file ends before its index"
-    if rate > 0.0 and stated / rate - (last_s + 1.0 / rate) > (0.5 / rate if avi else OTHER_TRACK):
-        return f"{path}: cut off after {frames} frames, {last_s:.1f} s: its header says {stated / rate:.1f} s"
+    if rate <= 0.0:
+        return ""
+    length, other = stated / rate - begin_s, 0.5 / rate if avi else OTHER_TRACK
+    # A length that no drive has is FFmpeg's sign for an unknown one.
+    if 0.0 < length < MAX_STAMP_NS * 1e-9 and length - (last_s + 1.0 / rate) > other:
+        return f"{path}: cut off after {frames} frames, {last_s:.1f} s: its header says {length:.1f} s"
     return ""
 
 

@@ -315,6 +315,25 @@ def test_a_video_that_was_cut_off_says_so(
     )
 
 
+def test_a_video_in_no_container_says_that_its_times_are_assumed(drive: Drive, camera: Path, tmp_path):
+    """As a camera of a Raspberry Pi is recorded; such files were refused."""
+    path = tmp_path / "walk.mjpeg"
+    path.write_bytes(b"".join(cv2.imencode(".jpg", image)[1].tobytes() for image in drive.images))
+    with pytest.raises(NoOdometry) as caught:
+        open_recording(path, RecordingOptions(camera=camera))
+    recording = caught.value.recording
+    assert len(recording) == COUNT and not recording.timed and not recording.damage
+    assert "25 images a second are assumed" in recording.notes[0]
+
+
+def test_a_transport_stream_is_a_video(drive: Drive, camera: Path, tmp_path):
+    path = write_video(tmp_path / "walk.ts", drive.images, 5.0, "mp4v")
+    with pytest.raises(NoOdometry) as caught:
+        open_recording(path, RecordingOptions(camera=camera))
+    recording = caught.value.recording
+    assert recording.timed and not recording.damage and np.diff(recording.stamps_ns).tolist() == [STEP_NS] * 8
+
+
 def test_a_video_that_ends_within_its_header_is_one_line(drive: Drive, tmp_path, capfd):
     """A second reader of OpenCV, which reads no more of it, added a line of its own."""
     path = write_video(tmp_path / "walk.avi", drive.images, 1.0)
