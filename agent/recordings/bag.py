@@ -126,17 +126,19 @@ class Bag:
             return [whole]
         except Exception as error:  # noqa: BLE001  # as above
             reason = _line(error)
-        parts: list[WholeBag | DamagedBag] = []
+        parts: list[DamagedBag] = []
         for file in files_of(path):
             try:
                 parts.append(DamagedBag(file))
             except (DeviceError, OSError) as error:
                 self.damaged(f"{file}: not a bag that can be read ({_line(error)})")
-        if parts:
-            self.damaged(f"{path}: damaged or cut off ({reason}); what comes before is used")
-        elif not self.damage:
+        losses = [reason if part.loss is None else part.loss for part in parts]
+        if any(losses):
+            first = next(loss for loss in losses if loss)
+            self.damaged(f"{path}: damaged or cut off ({first}); what comes before is used")
+        elif not (parts or self.damage):
             self.damaged(f"{path}: not a bag that can be read ({reason})")
-        return parts
+        return [*parts]
 
     def _take_wheels(self, path: Path, custom_data: object) -> None:
         try:

@@ -6,8 +6,10 @@ import contextlib
 import json
 import math
 import sqlite3
+import struct
 import subprocess
 import sys
+import zlib
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
@@ -256,6 +258,68 @@ def check_prefix(path: Path, drive: Drive) -> int:
         assert (observation.odometry.forward, observation.odometry.turn) == pytest.approx((forward, turn))
     assert replay.damage and all("\n" not in line for line in replay.damage)
     return len(seen)
+
+
+def mcap_record(opcode: int, *parts: bytes | str | int) -> bytes:
+    """By the specification of MCAP: strings have their length before them; numbers are uint16."""
+    packed = [
+        part if isinstance(part, bytes)
+        else struct.pack("<H", part) if isinstance(part, int)
+        else struct.pack("<I", len(part)) + part.encode()
+        for part in parts
+    ]  # fmt: skip
+    content = b"".join(packed)
+    return struct.pack("<BQ", opcode, len(content)) + content
+
+
+def write_bare_mcap(path: Path, drive: Drive, profile: str) -> None:
+    """As another recorder writes it, in two chunks, without index; the second has the last three images."""
+    ros1 = profile == "ros1"
+    store: Any = STORE1 if ros1 else STORE
+    serialize = store.serialize_ros1 if ros1 else store.serialize_cdr
+    kinds = ["sensor_msgs/msg/Image", "sensor_msgs/msg/CameraInfo", "nav_msgs/msg/Odometry"]
+    records = []
+    for k, kind in enumerate(kinds):
+        name = kind.replace("/msg", "") if ros1 else kind
+        records.append(mcap_record(3, k + 1, name, "ros1msg" if ros1 else "ros2msg", ""))
+        topic = ("/cam/image_raw", "/cam/camera_info", "/odom")[k]
+        records.append(mcap_record(4, k, k + 1, topic, "ros1" if ros1 else "cdr", ""))
+    for stamp, grey, pose in zip(drive.stamps_ns, drive.images, drive.poses, strict=True):
+        made = (
+            image(store, stamp, grey, "mono8"),
+            camera_info(store, stamp, drive),
+            odometry(store, stamp, pose),
+        )
+        for k, message in enumerate(made):
+            head = struct.pack("<HIQQ", k, 0, stamp, stamp)
+            records.append(mcap_record(5, head + bytes(serialize(message, kinds[k]))))
+    chunks = []
+    for part in (records[:-9], records[-9:]):
+        data = b"".join(part)
+        head = struct.pack("<QQQI", drive.stamps_ns[0], drive.stamps_ns[-1], len(data), zlib.crc32(data))
+        chunks.append(mcap_record(6, head, "", struct.pack("<Q", len(data)) + data))
+    end = mcap_record(15, bytes(4)) + mcap_record(2, bytes(20))
+    magic = b"\x89MCAP0\r\n"
+    path.write_bytes(magic + mcap_record(1, profile, "other") + b"".join(chunks) + end + magic)
+
+
+@pytest.mark.parametrize("profile", ["ros1", ""])
+def test_an_mcap_that_is_not_said_to_be_of_ros2_is_read(profile: str, drive: Drive, tmp_path):
+    """Its messages of ROS 1 were no images, and one without a profile was called damaged."""
+    path = tmp_path / "drive.mcap"
+    write_bare_mcap(path, drive, profile)
+    replay = Replay(path, options=OPTIONS)
+    seen = list(iter(replay.sense, None))
+    assert [observation.stamp_ns for observation in seen] == drive.stamps_ns
+    assert all(np.array_equal(one.image, grey) for one, grey in zip(seen, drive.images, strict=True))
+    assert not replay.damage
+    data = path.read_bytes()
+    at = len(data) * 5 // 6
+    path.write_bytes(data[:at])
+    assert COUNT - 3 <= check_prefix(path, drive) < COUNT, "the pose after the last image may be missing"
+    assert "its end is missing" in open_recording(path, OPTIONS).damage[0]
+    path.write_bytes(data[:at] + bytes([data[at] ^ 1]) + data[at + 1 :])
+    assert check_prefix(path, drive) == COUNT - 3, "the chunk's checksum is wrong"
 
 
 @pytest.mark.parametrize("name", FORMATS)
