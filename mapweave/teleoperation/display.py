@@ -25,7 +25,9 @@ def lines(name: str, report: AgentStatus, command: Command, silence: float, usag
         where = "not localized on its map"
     elif not status.nodes:
         where = f"no map yet  {where}"
-    doing = f"no answer for {silence:.1f} s: the robot stands" if silence else status.words
+    doing = "; ".join(words for words in (report.last_error, status.words) if words)
+    if silence:
+        doing = f"no answer for {silence:.1f} s: the robot stands"
     return [
         f"{name}  map {name}.{report.epoch}  {status.nodes} nodes  {status.mission}  {where}",
         doing,
