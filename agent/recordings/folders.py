@@ -68,7 +68,8 @@ def euroc(folder: Path, options: RecordingOptions) -> Recording:
         raise DeviceError(f"{cam / 'data.csv'}: {error}") from None
     if not paths:
         raise DeviceError(f"{cam / 'data.csv'}: no images")
-    given = _euroc_camera(cam, paths) if options.camera is None else None
+    known = options.camera is None and (cam / "sensor.yaml").exists()
+    given = _euroc_camera(cam, paths) if known else None
     return _folder(folder, "EuRoC", paths, stamps, given, options)
 
 

@@ -1,5 +1,6 @@
 """Which format a recording has, and the way to open it."""
 
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from mapweave.agent.recordings.recording import Recording
 from mapweave.hybridmap.errors import DeviceError
 from mapweave.storage.os_errors import unreadable
 
+PACKED = ".zstd"
+Opener = Callable[[Path, RecordingOptions], Recording]
 FORMATS = (
     "a folder of images with camera.toml, a bag (.mcap, .bag, .db3 or its folder), a video, or a sequence "
     "of KITTI odometry, EuRoC, TUM RGB-D or 4Seasons"
@@ -38,7 +41,7 @@ def open_recording(path: Path, options: RecordingOptions | None = None) -> Recor
     return opened(path, options.of_bag() if opened is bags.bag else options)
 
 
-def _opener(path: Path) -> Callable[[Path, RecordingOptions], Recording]:
+def _opener(path: Path) -> Opener:
     """What opens a recording of this format.
 
     Raises:
@@ -57,19 +60,50 @@ def _opener(path: Path) -> Callable[[Path, RecordingOptions], Recording]:
             return bags.bag
         if path.suffix.lower() in videos.SUFFIXES:
             return videos.video
+        if path.suffix.lower() == PACKED and Path(path.stem).suffix.lower() in bags.SUFFIXES:
+            raise DeviceError(
+                f"{path}: a bag that is packed as a whole; give its folder with metadata.yaml, or unpack it "
+                "with `unzstd`"
+            )
         raise DeviceError(f"{path}: not a recording; one is {FORMATS}")
     if not path.is_dir():
         raise DeviceError(f"{path}: no such folder or file; a recording is {FORMATS}")
+    opened = _named(path) or _unnamed(path)
+    if opened is None:
+        raise DeviceError(f"{path}: not a recording{_near(path)}; one is {FORMATS}")
+    return opened
+
+
+def _named(folder: Path) -> Opener | None:
+    """What opens a folder by a name in it."""
     marks = {
         "images": images_folder, "camera.toml": images_folder, "metadata.yaml": bags.bag, "mav0": euroc,
         "rgb.txt": tum_rgbd, "undistorted_images": four_seasons, "calib.txt": kitti,
         **dict.fromkeys(KITTI_IMAGES, kitti),
     }  # fmt: skip
-    for mark, opened in marks.items():
-        if (path / mark).exists():
-            return opened
-    if bags.parts_of(path):
+    return next((opened for mark, opened in marks.items() if (folder / mark).exists()), None)
+
+
+def _unnamed(folder: Path) -> Opener | None:
+    """What opens a folder of bags, or of images."""
+    if bags.parts_of(folder):
         return bags.bag
-    if has_images(path):
-        return images_folder
-    raise DeviceError(f"{path}: not a recording; one is {FORMATS}")
+    return images_folder if has_images(folder) else None
+
+
+def _near(path: Path) -> str:
+    """Which folder around or inside a folder is one, in words: archives unpack to several levels."""
+    try:
+        below = _folders_in(path)
+        below += [inside for each in below for inside in _folders_in(each)]
+        found = next((each for each in (path.resolve().parent, *below) if _named(each)), None)
+        found = found or next((each for each in below if _unnamed(each)), None)
+    except OSError:
+        # It is a hint alone: another user's folder is not looked into.
+        return ""
+    return "" if found is None else f", but {found} is"
+
+
+def _folders_in(folder: Path) -> list[Path]:
+    with os.scandir(folder) as entries:
+        return sorted(Path(entry.path) for entry in entries if entry.is_dir())

@@ -520,3 +520,38 @@ def test_files_of_macos_beside_the_images_are_none(drive: Drive, tmp_path):
     (tmp_path / "odometry.csv").write_text("forward_m,turn_rad\n" + "0.1,0.0\n" * len(drive.images))
     replay = Replay(tmp_path)
     assert len(replay) == len(drive.images) and replay.damage == []
+
+
+def test_a_folder_around_or_in_a_recording_names_it(drive: Drive, tmp_path):
+    """Archives of benchmarks unpack to several levels: there was only a list of all formats."""
+    third, hall, images = tmp_path / "k/sequences/03", tmp_path / "e/MH_01", tmp_path / "i/data"
+    for place in (third, hall, images):
+        place.mkdir(parents=True)
+    kitti(drive, third)
+    euroc(drive, hall)
+    cv2.imwrite(str(images / "0.png"), drive.images[0])
+    for given, named in (
+        (tmp_path / "k", third),
+        (tmp_path / "e", hall),
+        (tmp_path / "i", images),
+        (hall / "mav0", hall),
+        (hall / "mav0/cam0", hall / "mav0/cam0/data"),
+    ):
+        with pytest.raises(DeviceError, match=f"{given}: not a recording, but {named} is; one is"):
+            open_recording(given)
+
+
+def test_a_bag_that_is_packed_as_a_whole_says_what_to_give(tmp_path):
+    path = tmp_path / "walk_0.db3.zstd"
+    path.write_bytes(b"(\xb5/\xfd")
+    with pytest.raises(DeviceError, match=r"give its folder with metadata.yaml, or unpack it with `unzstd`"):
+        open_recording(path)
+
+
+def test_a_sequence_of_euroc_without_calibration_asks_for_the_camera(drive: Drive, tmp_path):
+    """As TUM VI is published. Nothing was said of what is in it, nor of --camera."""
+    euroc(drive, tmp_path)
+    (tmp_path / "mav0/cam0/sensor.yaml").unlink()
+    with pytest.raises(Incomplete, match="--camera FILE") as caught:
+        open_recording(tmp_path)
+    assert caught.value.recording is not None and len(caught.value.recording) == COUNT
