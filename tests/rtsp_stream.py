@@ -20,6 +20,7 @@ class RtspStream:
 
     Attributes:
         url: of its only stream, /cam.
+        wrong_logins: how often a wrong user name or password came.
     """
 
     def __init__(self, next_frame: Callable[[], bytes], credentials: str = "", port: int = 0) -> None:
@@ -32,6 +33,7 @@ class RtspStream:
         """
         self._next_frame, self._credentials = next_frame, credentials
         self._closing = threading.Event()
+        self.wrong_logins = 0
         self._socket = socket.create_server(("127.0.0.1", port))
         self.place = "{}:{}".format(*self._socket.getsockname())
         self.url = f"rtsp://{self.place}/cam"
@@ -67,6 +69,7 @@ class RtspStream:
             return "200 OK", f"Public: {METHODS}\r\n", ""
         right = "Basic " + base64.b64encode(self._credentials.encode()).decode()
         if self._credentials and fields.get("authorization") != right:
+            self.wrong_logins += "authorization" in fields
             return "401 Unauthorized", 'WWW-Authenticate: Basic realm="cam"\r\n', ""
         if not url.partition("://")[2].partition("/")[2].startswith("cam"):
             return "404 Not Found", "", ""

@@ -8,6 +8,7 @@ import os
 import re
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -127,19 +128,31 @@ class Capture:
         self._thread.join(2.0)
 
     def _open_in_time(self) -> cv2.VideoCapture:
-        end = time.monotonic() + (STREAM_PATIENCE if "://" in self._settings.source else 0.0)
-        while True:
+        source, why = self._settings.source, f"camera {self._name}: cannot be opened; "
+        if "://" not in source:
             try:
                 return self._open()
             except NotOpened:
-                if time.monotonic() >= end:
-                    break
-                time.sleep(RETRY / 5)
-        why = f"camera {self._name}: cannot be opened; "
-        if "://" not in self._settings.source:
-            raise DeviceError(why + self._hint())
-        words, may_pass = refusal(self._settings.source)
-        raise StreamAway(why + words, self._settings.source) if may_pass else DeviceError(why + words)
+                raise DeviceError(why + self._hint()) from None
+        has_password, refused = self._name != source, None
+        end = time.monotonic() + STREAM_PATIENCE
+        while True:
+            with suppress(NotOpened):
+                return self._open()
+            # Cameras lock a user out after some wrong passwords. Once more: the server may just have begun.
+            if refused is not None and refused.login:
+                break
+            over = time.monotonic() >= end
+            # The question to a server that serves one program after the other ends what it serves.
+            if over or (has_password and (refused is None or refused.may_pass)):
+                refused = refusal(source)
+            if over:
+                break
+            time.sleep(RETRY / 5)
+        assert refused is not None
+        if refused.may_pass:
+            raise StreamAway(why + refused.words, source)
+        raise DeviceError(why + refused.words)
 
     def _open(self) -> cv2.VideoCapture:
         settings, source = self._settings, self._settings.source

@@ -24,10 +24,12 @@ class StreamRefusal(NamedTuple):
         words: in words; a question if nothing is.
         may_pass: whether it may open later as it stands: its server is not reached, or not ready, as after a
             power cut. A wrong path or password does not pass.
+        login: whether the server refuses the user name and password.
     """
 
     words: str
     may_pass: bool = False
+    login: bool = False
 
 
 def without_password(source: str) -> str:
@@ -100,7 +102,7 @@ def _in_words(parts: SplitResult, place: str, answer: str) -> StreamRefusal:
         # A digest is not answered here, and the path may be what is wrong.
         digest = "www-authenticate: digest" in answer.lower()
         path = ", or has no such path" if digest else ""
-        return StreamRefusal(f"{place} refuses this user name and password{path}")
+        return StreamRefusal(f"{place} refuses this user name and password{path}", login=True)
     if status == HTTPStatus.NOT_FOUND:
         return StreamRefusal(f"{place} has nothing at {parts.path or '/'}: mend the path")
     if status == HTTPStatus.OK:

@@ -400,6 +400,14 @@ def test_why_a_stream_does_not_open_is_said_without_its_password(
     )
 
 
+def test_a_wrong_password_is_not_tried_again_and_again(opened):
+    """It was 27 times within 5 s; network cameras lock a user out after a few."""
+    stream = opened(RtspStream(Counted().next, "bob:secret"))
+    with pytest.raises(DeviceError, match="refuses this user name and password"):
+        Capture(settings(f"rtsp://bob:wrong@{stream.place}/cam"))
+    assert 1 <= stream.wrong_logins <= 3
+
+
 def test_a_stream_with_the_right_password_opens(opened):
     place = opened(RtspStream(Counted().next, "bob:wr?ong")).place
     camera = opened(Capture(settings(f"rtsp://bob:wr%3Fong@{place}/cam")))
@@ -411,17 +419,17 @@ def test_a_server_that_hangs_or_speaks_another_protocol_is_named(stream: Stream,
     with socket.create_server(("127.0.0.1", 0)) as silent:
         place = "{}:{}".format(*silent.getsockname())
         words = f"{place} does not answer: is that computer on, and does its server hang?"
-        assert refusal(f"rtsp://{place}/cam") == (words, True)
+        assert refusal(f"rtsp://{place}/cam") == (words, True, False)
     words = f"no server listens at {place}: start it, or mend the port"
-    assert refusal(f"rtsp://{place}/cam") == (words, True)
+    assert refusal(f"rtsp://{place}/cam") == (words, True, False)
     other = refusal(stream.url.replace("http", "rtsp"))
     assert re.fullmatch(r"127.*:\d+ answers 505 .*|what listens at .* does not speak RTSP", other.words)
     assert not other.may_pass
-    assert refusal(stream.url) == ("does a player show images of this address?", False)
-    assert refusal("tcp://camera") == ("is its address complete, with the port?", False)
+    assert refusal(stream.url) == ("does a player show images of this address?", False, False)
+    assert refusal("tcp://camera") == ("is its address complete, with the port?", False, False)
     # Nothing listens by TCP where a camera sends by UDP.
-    assert refusal(f"udp://{place}") == ("does a player show images of this address?", False)
-    assert refusal("rtsp://[::1/cam") == ("its address is no URL", False)
+    assert refusal(f"udp://{place}") == ("does a player show images of this address?", False, False)
+    assert refusal("rtsp://[::1/cam") == ("its address is no URL", False, False)
     assert without_password("rtsp://u:p@ss@h:1/a@b:c") == "rtsp://u:***@h:1/a@b:c"
     for plain in ("/dev/video0", "rtsp://h:554/x", "rtsp://u@h/x", "C:/a@b"):
         assert without_password(plain) == plain
