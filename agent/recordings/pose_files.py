@@ -14,6 +14,8 @@ from mapweave.hybridmap.pose import Array
 
 LEVEL = 0.5
 """An axis of length 1 is up if its tip is higher: that of a camera that looks up by 30 degrees is not."""
+STEEP = 0.5
+"""No floor rises by more, as a share of the largest of the three extents of a drive."""
 CSV_COLUMNS = ("stamp_s", "x_m", "y_m", "heading_rad")
 
 
@@ -29,13 +31,17 @@ def read_poses(path: Path) -> StampedPoses:
         DeviceError: the file is missing or wrong.
     """
     text, no_text = read_text(path)
-    rows, damage = _csv(path, text) if path.suffix == ".csv" else _tum(path, text)
+    turned = ""
+    if path.suffix == ".csv":
+        rows, damage = _csv(path, text)
+    else:
+        rows, damage, turned = _tum(path, text)
     damage = damage or no_text
     if len(rows) < 2:
         raise DeviceError(damage or f"{path}: {len(rows)} poses; there must be two or more")
     back, rows = np.diff(rows[:, 0]) < 0, rows[np.argsort(rows[:, 0], kind="stable")]
     new = np.append(True, np.diff(rows[:, 0]) > 0)
-    notes = []
+    notes = [turned] if turned else []
     if back.any():
         often = "once" if back.sum() == 1 else f"{int(back.sum())} times"
         notes.append(
@@ -60,7 +66,7 @@ def _csv(path: Path, text: str) -> tuple[Array, str]:
     return np.array(rows).reshape(-1, 4), damage
 
 
-def _tum(path: Path, text: str) -> tuple[Array, str]:
+def _tum(path: Path, text: str) -> tuple[Array, str, str]:
     rows, damage = list[list[float]](), ""
     for number, line in enumerate(_whole_lines(text), 1):
         words = line.split("#")[0].replace(",", " ").split()
@@ -78,7 +84,26 @@ def _tum(path: Path, text: str) -> tuple[Array, str]:
             break
         rows.append(row)
     table = np.array(rows).reshape(-1, 8)
-    return np.column_stack([table[:, :3], headings_of(table[:, 4:])]), damage
+    if not _in_camera_frame(table[:, 1:4], table[:, 4:]):
+        return np.column_stack([table[:, :3], headings_of(table[:, 4:])]), damage, ""
+    x, y, z, w = table[:, 4:].T
+    headings = np.arctan2(-2.0 * (x * z + w * y), w * w + z * z - x * x - y * y)
+    note = f"{path}: poses in the frame of a camera (x right, y down, z ahead): turned until z is up"
+    return np.column_stack([table[:, 0], table[:, 3], -table[:, 1], headings]), damage, note
+
+
+def _in_camera_frame(positions: Array, quaternions: Array) -> bool:
+    """Whether poses are in the frame of their first image, as ORB-SLAM writes them.
+
+    Where z is up, a floor is many times as wide as it is high. In that frame z is a way along it, and turns
+    are about y, so that the y axes of the poses stay.
+    """
+    if len(positions) < 2:
+        return False
+    extents = np.ptp(positions, axis=0)
+    x, y, z, w = quaternions.T
+    stays = (w * w + y * y - x * x - z * z) / (quaternions**2).sum(axis=1)
+    return bool(extents[2] > STEEP * extents.max() and np.median(stays) > LEVEL)
 
 
 def headings_of(quaternions: Array) -> Array:

@@ -89,6 +89,24 @@ def test_headings_of_a_camera_are_where_it_looks(pitch: float, tmp_path):
     assert stamps[0] == 1_400_000_000_000_000_000
 
 
+@pytest.mark.parametrize("turn", [0.0, 0.3])
+def test_poses_in_the_frame_of_the_first_image_are_turned(turn: float, tmp_path):
+    """As visual odometry writes them: the way to the side was taken for that ahead, without a word."""
+    way = [Pose2()]
+    for _ in range(20):
+        way.append(way[-1] @ Pose2(0.5, 0.0, turn))
+    rows = []
+    for k, pose in enumerate(way):
+        half = -pose.heading / 2
+        rows.append(f"{k / 10} {-pose.y} 0.02 {pose.x} 0 {math.sin(half)} 0 {math.cos(half)}")
+    (tmp_path / "camera.txt").write_text("\n".join(rows) + "\n")
+    read = read_poses(tmp_path / "camera.txt")
+    expected = np.array([pose.vector for pose in way])
+    assert read.poses[:, :2] == pytest.approx(expected[:, :2], abs=1e-9)
+    assert np.exp(1j * read.poses[:, 2]) == pytest.approx(np.exp(1j * expected[:, 2]), abs=1e-9)
+    assert "turned until z is up" in read.notes[0]
+
+
 def test_true_poses_of_euroc_are_read_with_their_nanoseconds(tmp_path):
     path = tmp_path / "mav0" / "state_groundtruth_estimate0" / "data.csv"
     write_euroc(path)
