@@ -27,6 +27,13 @@ FORMATS = (
     "of KITTI odometry, EuRoC, TUM RGB-D or 4Seasons"
 )
 
+MARKS: dict[str, Opener] = {
+    "images": images_folder, "camera.toml": images_folder, "metadata.yaml": bags.bag, "mav0": euroc,
+    "rgb.txt": tum_rgbd, "undistorted_images": four_seasons, "calib.txt": kitti,
+    **dict.fromkeys(KITTI_IMAGES, kitti),
+}  # fmt: skip
+"""Names in a folder that say which format it has, the surest first."""
+
 
 def open_recording(path: Path, options: RecordingOptions | None = None) -> Recording:
     """Open a recording of any known format.
@@ -76,12 +83,7 @@ def _opener(path: Path) -> Opener:
 
 def _named(folder: Path) -> Opener | None:
     """What opens a folder by a name in it."""
-    marks = {
-        "images": images_folder, "camera.toml": images_folder, "metadata.yaml": bags.bag, "mav0": euroc,
-        "rgb.txt": tum_rgbd, "undistorted_images": four_seasons, "calib.txt": kitti,
-        **dict.fromkeys(KITTI_IMAGES, kitti),
-    }  # fmt: skip
-    return next((opened for mark, opened in marks.items() if (folder / mark).exists()), None)
+    return next((opened for mark, opened in MARKS.items() if (folder / mark).exists()), None)
 
 
 def _unnamed(folder: Path) -> Opener | None:
@@ -96,7 +98,9 @@ def _near(path: Path) -> str:
     try:
         below = _folders_in(path)
         below += [inside for each in below for inside in _folders_in(each)]
-        found = next((each for each in (path.resolve().parent, *below) if _named(each)), None)
+        found = next((each for each in below if _named(each)), None)
+        if found is None and path.resolve().name in MARKS:
+            found = path.resolve().parent
         found = found or next((each for each in below if _unnamed(each)), None)
     except OSError:
         # It is a hint alone: another user's folder is not looked into.

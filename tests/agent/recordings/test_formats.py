@@ -530,6 +530,7 @@ def test_a_folder_around_or_in_a_recording_names_it(drive: Drive, tmp_path):
     kitti(drive, third)
     euroc(drive, hall)
     cv2.imwrite(str(images / "0.png"), drive.images[0])
+    (tmp_path / "camera.toml").touch()
     for given, named in (
         (tmp_path / "k", third),
         (tmp_path / "e", hall),
