@@ -22,6 +22,8 @@ from mapweave.vision.lens import NO_DISTORTION, LensModel, lens_of
 
 Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy, px."""
+FOUR_SEASONS_CALIBRATION = "calibration", "Calibration"
+"""Folders that its archives unpack to."""
 KITTI_IMAGES = "image_0", "image_2"
 """Folders of the left cameras, grey and colour."""
 
@@ -114,6 +116,8 @@ def tum_rgbd(folder: Path, options: RecordingOptions) -> Recording:
 def four_seasons(folder: Path, options: RecordingOptions) -> Recording:
     """A sequence as 4Seasons has it: undistorted_images/cam0 and times.txt (frame, seconds, exposure).
 
+    The calibration is an archive of its own: a folder in the sequence or beside it.
+
     Raises:
         DeviceError: something is missing or wrong.
     """
@@ -124,7 +128,29 @@ def four_seasons(folder: Path, options: RecordingOptions) -> Recording:
         raise DeviceError(f"{folder / 'times.txt'}: no line for {lost[0].name}")
     times = folder / "times.txt"
     stamps = stamps_of(times, _numbers(times, [rows[path.stem] for path in paths]))
-    return _folder(folder, "4Seasons", paths, stamps, None, options)
+    file = next((file for file in _calibrations(folder) if file.exists()), None)
+    given = None if file is None or options.camera is not None else _four_seasons_camera(file, paths)
+    return _folder(folder, "4Seasons", paths, stamps, given, options)
+
+
+def _calibrations(folder: Path) -> list[Path]:
+    places = [
+        place / name for place in (folder, folder.resolve().parent) for name in FOUR_SEASONS_CALIBRATION
+    ]
+    return [place / "undistorted_calib_0.txt" for place in places]
+
+
+def _four_seasons_camera(file: Path, paths: Sequence[Path]) -> CameraAndLens:
+    """The first line is `Pinhole fx fy cx cy` and zeros, px: the images are without distortion.
+
+    Raises:
+        DeviceError: it is not.
+    """
+    words = " ".join(_lines(file)[:1]).split()
+    values = _numbers(file, words[1:])
+    if words[:1] != ["Pinhole"] or len(values) < 4 or any(values[4:]):
+        raise DeviceError(f"{file}: the first line must be `Pinhole fx fy cx cy 0`; else give --camera FILE")
+    return _camera(paths, (values[0], values[1], values[2], values[3])), NO_DISTORTION
 
 
 def images_folder(folder: Path, options: RecordingOptions) -> Recording:

@@ -112,8 +112,6 @@ def run_replay(arguments: argparse.Namespace) -> int:
     check_output(out)
     truth = arguments.truth or truth_beside(path)
     console = plain_or_terminal()
-    if truth is not None and arguments.truth is None:
-        console.print(f"truth from {truth}", highlight=False)
     evaluated: ReplayEvaluation | VisualEvaluation
     try:
         replay = Replay(path, arguments.robot, options=options_of(arguments))
@@ -137,6 +135,8 @@ def run_replay(arguments: argparse.Namespace) -> int:
         lines = (*evaluated.notes, *replay.damage)
     for line in lines:
         console.print(line, highlight=False)
+    if truth is not None and arguments.truth is None:
+        console.print(f"truth from {truth}", highlight=False)
     for written in evaluated.write(out):
         console.print(f"{written}", highlight=False)
     report = evaluated.report()

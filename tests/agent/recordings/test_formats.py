@@ -556,3 +556,23 @@ def test_a_sequence_of_euroc_without_calibration_asks_for_the_camera(drive: Driv
     with pytest.raises(Incomplete, match="--camera FILE") as caught:
         open_recording(tmp_path)
     assert caught.value.recording is not None and len(caught.value.recording) == COUNT
+
+
+@pytest.mark.parametrize("folder", ["s/Calibration", "calibration"])
+def test_the_calibration_of_4seasons_is_found(folder: str, drive: Drive, poses_file: Path, tmp_path):
+    """It is an archive of its own: within the sequence (benchmark for relocalization), else beside it."""
+    (sequence := tmp_path / "s").mkdir()
+    four_seasons(drive, sequence)
+    file = tmp_path / folder / "undistorted_calib_0.txt"
+    file.parent.mkdir()
+    c = drive.camera
+    file.write_text(
+        f"Pinhole {c.fx} {c.fy} {c.cx} {c.cy} 0\n{c.width} {c.height}\ncrop\n{c.width} {c.height}\n"
+    )
+    recording = open_recording(sequence, RecordingOptions(camera_height=c.mount_height, odometry=poses_file))
+    camera = recording.camera
+    assert (camera.fx, camera.fy, camera.cx, camera.cy) == (c.fx, c.fy, c.cx, c.cy)
+    assert recording.distortion == NO_DISTORTION
+    file.write_text("EquiDistant 1 2 3 4 5 6 7 8\n")
+    with pytest.raises(DeviceError, match=r"must be `Pinhole fx fy cx cy 0`; else give --camera FILE"):
+        open_recording(sequence, RecordingOptions(camera_height=0.3, odometry=poses_file))
