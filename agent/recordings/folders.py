@@ -24,6 +24,8 @@ Intrinsics = tuple[float, float, float, float]
 """fx, fy, cx, cy, px."""
 FOUR_SEASONS_CALIBRATION = "calibration", "Calibration"
 """Folders that its archives unpack to."""
+LENS_NAMES = dict.fromkeys(("radtan", "radialtangential", "plumb_bob"), LensModel.RADIAL_TANGENTIAL.value)
+"""EuRoC's lens models by the names that Kalibr, OKVIS and ROS have for them: k1, k2, p1, p2."""
 KITTI_IMAGES = "image_0", "image_2"
 """Folders of the left cameras, grey and colour."""
 
@@ -87,7 +89,7 @@ def _euroc_camera(cam: Path, paths: Sequence[Path]) -> CameraAndLens:
         _yaml_list(cam, text, "distortion_coefficients", 4),
     )
     model = re.search(r"^distortion_model:\s*(\S+)", text, re.M)
-    name = str(LensModel.RADIAL_TANGENTIAL) if model is None else model[1]
+    name = str(LensModel.RADIAL_TANGENTIAL) if model is None else LENS_NAMES.get(model[1], model[1])
     if name not in list(LensModel):
         known = " and ".join(LensModel)
         raise DeviceError(f"{cam / 'sensor.yaml'}: lens model {name} is not supported; {known} are")

@@ -576,3 +576,16 @@ def test_the_calibration_of_4seasons_is_found(folder: str, drive: Drive, poses_f
     file.write_text("EquiDistant 1 2 3 4 5 6 7 8\n")
     with pytest.raises(DeviceError, match=r"must be `Pinhole fx fy cx cy 0`; else give --camera FILE"):
         open_recording(sequence, RecordingOptions(camera_height=0.3, odometry=poses_file))
+
+
+@pytest.mark.parametrize("name", ["radtan", "radialtangential", "plumb_bob"])
+def test_a_lens_model_has_other_names_in_other_tools(name: str, drive: Drive, poses_file: Path, tmp_path):
+    """Those of Kalibr, OKVIS and ROS, in a sensor.yaml that was made with them."""
+    euroc(drive, tmp_path)
+    file = tmp_path / "mav0/cam0/sensor.yaml"
+    text = (
+        file.read_text().replace("radial-tangential", name).replace("[0.0, 0.0, 0.0, 0.0]", "[0.1, 0, 0, 0]")
+    )
+    file.write_text(text)
+    options = RecordingOptions(camera_height=0.3, odometry=poses_file)
+    assert open_recording(tmp_path, options).distortion == (0.1, 0.0, 0.0, 0.0, 0.0)
