@@ -423,6 +423,11 @@ def _camera(opened: Bag, image: str, options: RecordingOptions, notes: list[str]
         raise DeviceError((opened.damage or [f"{opened.path}: {info.name} has no message"])[-1])
     # Its driver has removed the distortion: D and K are those of the images before (REP 104).
     rectified = image.removesuffix("/compressed").rpartition("/")[2].startswith(RECTIFIED)
+    matrix = "p" if rectified else "k"
+    # Drivers without calibration leave it zero; ROS 1 writes it in capitals.
+    if not np.any(getattr(message, matrix, getattr(message, matrix.upper(), ()))):
+        zero = f"{info.name} has no calibration: its {matrix.upper()} is zero"
+        return CameraGiven(None, f"{zero}; give --camera FILE (a camera.toml)")
     try:
         camera, model, coefficients = camera_of(message, rectified)
         mount = _mount(opened, str(message.header.frame_id))

@@ -642,6 +642,21 @@ def test_three_coefficients_of_distortion_are_named(drive: Drive, tmp_path, monk
     assert any("3 coefficients of distortion" in note for note in recording.notes)
 
 
+@pytest.mark.parametrize(("topic", "matrix"), [("/cam/image_raw", "K"), ("/cam/image_rect", "P")])
+def test_a_camera_that_is_not_calibrated_is_asked_for(
+    topic: str, matrix: str, drive: Drive, tmp_path, monkeypatch
+):
+    """Its driver leaves zeros: focal lengths had to be positive, and nothing was said of what is there."""
+    made, zeros = camera_info, np.zeros(9 if matrix == "K" else 12)
+    monkeypatch.setitem(
+        globals(), "camera_info", lambda *given: replace(made(*given), **{matrix.lower(): zeros})
+    )
+    write_bag(tmp_path / "drive", drive, image=topic)
+    with pytest.raises(Incomplete, match=f"its {matrix} is zero; give --camera FILE") as caught:
+        open_recording(tmp_path / "drive", OPTIONS)
+    assert caught.value.recording is not None and len(caught.value.recording) == COUNT
+
+
 @pytest.mark.parametrize("ros1", [False, True])
 def test_images_without_distortion_are_not_rectified_again(ros1: bool, drive: Drive, tmp_path, monkeypatch):
     """Beside them a CameraInfo still tells K and D of the images before, and theirs is P (REP 104)."""
