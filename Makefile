@@ -55,12 +55,12 @@ slow: setup $(AUDIT)/.installed
 	@$(MAKE) --no-print-directory -j 2 slow-waits slow-most
 	$(BIN)/python -m pytest -m "slow and alone" $(call marked,alone)
 
-# Beside two workers: these wait for time-outs, or drive in real time, and need half a core at most.
+# Beside three workers: these wait for time-outs, or drive in real time, and need half a core at most.
 slow-waits:
 	$(BIN)/python -m pytest -m "slow and waits" $(call marked,waits)
 
 slow-most:
-	$(BIN)/python -m pytest -m "slow and not alone and not waits" -n 2 --dist worksteal
+	$(BIN)/python -m pytest -m "slow and not alone and not waits" -n 3 --dist worksteal
 
 # About three quarters of an hour on two cores: every scenario, in real processes, and the longest tests.
 scenarios: setup

@@ -152,6 +152,7 @@ def test_the_blocks_of_the_readme_run(tmp_path, monkeypatch, capsys):
     assert simulated.startswith("(240, 320) Odometry(") and len(library) > 3
 
 
+@pytest.mark.slow
 def test_every_block_of_the_page_of_python_runs(tmp_path, monkeypatch, capsys):
     changes = together()
     write_files(changes, tmp_path, monkeypatch)

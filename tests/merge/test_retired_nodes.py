@@ -137,6 +137,7 @@ def test_nodes_are_retired_and_come_back_to_the_bit(merger: Merger):
     assert same(merger.merged(), before)
 
 
+@pytest.mark.slow
 def test_an_area_holds_for_all_maps_and_for_nodes_that_come_later(merger: Merger):
     before = merger.merged()
     (anchor,) = ids(B, 1)

@@ -179,6 +179,7 @@ DOINGS = (
 )  # fmt: skip
 
 
+@pytest.mark.slow
 @settings(max_examples=40)
 @given(st.lists(st.tuples(st.sampled_from(DOINGS), st.integers(0, 5)), max_size=14))
 @example([("drive", 0), ("drive", 0), ("acknowledged", 0), ("prune", 1), ("look", 0), ("kill robot", 0)])

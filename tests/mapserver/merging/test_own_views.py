@@ -78,10 +78,8 @@ def test_a_map_whose_views_contradict_its_own_way_is_named(lie: Lie, seed: int):
     assert {link.pair for link in found.links if ODD not in link.maps} == without_odd(seed)
 
 
-@pytest.mark.parametrize("seed", first_quick([33001, 33002], 1, 1))
-@pytest.mark.parametrize(
-    "fault", first_quick([OdometryFault.SLIP, OdometryFault.CARRIED, OdometryFault.NONE], 2)
-)
+@pytest.mark.parametrize("seed", first_quick([33001, 33002], 0, 1))
+@pytest.mark.parametrize("fault", [OdometryFault.SLIP, OdometryFault.CARRIED, OdometryFault.NONE])
 def test_views_do_not_contradict_a_way_that_slipped_once(fault: OdometryFault, seed: int):
     """Wrong geometry has rules of its own: one slip is no share by which all is too long."""
     assert not merged(draw_fleet(seed, SCENES["room"], fault, stops=2)).implausible

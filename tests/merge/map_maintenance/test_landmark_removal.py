@@ -221,6 +221,7 @@ def test_a_wall_that_is_changed_altogether_fades_though_no_later_view_is_linked_
     assert shares[-1][0].mean() < 0.2
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("kept")
 def test_views_of_implausible_maps_fade_no_landmarks_of_others():
     """From when they are found to be so, and until they are not."""

@@ -31,7 +31,6 @@ from mapweave.merge.pose_graph.verification import verify
 from mapweave.storage.map_file import pack_map_file, unpack_map_file
 from synthetic.maps import changes_of, map_tours, numbered
 from synthetic.world import room, take_map, take_view
-from tests.quick import first_quick
 
 OLD, NEW, OTHER = MapId("r0", 1), MapId("r0", 2), MapId("r1", 1)
 NEW_ALONE = ManualConstraints(
@@ -226,7 +225,8 @@ def test_superseded_nodes_are_not_searched_until_active_again(drives: Drives):
     assert not merged.superseded and all(node_id in merger.places for node_id in merged.poses)
 
 
-@pytest.mark.parametrize("seed", first_quick(range(2), 1))
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2))
 def test_all_that_is_superseded_is_covered_and_nothing_more_could_be(seed: int, monkeypatch):
     """Where ways do not matter: each node has an active one that covers it, and none can be removed."""
     rng = np.random.default_rng(seed)
