@@ -3,6 +3,7 @@
 import ctypes
 import gc
 import os
+import signal
 import sys
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -40,6 +41,10 @@ sys.dont_write_bytecode = False
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 
 pytest_plugins = ["tests.postgres"]
+
+# A shell starts what runs in the background with interrupts ignored, and what that starts inherits it.
+if signal.getsignal(signal.SIGINT) is signal.SIG_IGN:
+    signal.signal(signal.SIGINT, signal.default_int_handler)
 
 # glibc gives free memory back to the kernel, which clears it each time before it gives it again: where images
 # are tracked that was a twentieth of the time. Arrays of 32 MB or more are given back at once nevertheless.
