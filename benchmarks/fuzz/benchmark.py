@@ -11,6 +11,8 @@ place in the code counts once.
 
 import importlib.util
 import json
+import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -40,12 +42,17 @@ def fuzz_one(name: str, folder: Path, seconds: float, seed: int) -> dict[str, An
     """
     command = [sys.executable, "-m", "benchmarks.fuzz.process", name, str(folder), str(seconds), str(seed)]
     counts, said = folder / "counts.json", folder / "said"
+    # LibFuzzer ends its process at once: nothing is removed there.
+    scratch = folder / "temporary"
+    scratch.mkdir()
     with said.open("wb") as output:
-        process = subprocess.Popen(command, stdout=output, stderr=output)
+        surroundings = {**os.environ, "TMPDIR": str(scratch)}
+        process = subprocess.Popen(command, stdout=output, stderr=output, env=surroundings)
         # What it imports and compiles takes a minute on a busy machine, and is no input.
         hung = not (_within(START, process, counts.exists) and _within(seconds + GRACE, process))
         process.kill()
         status = process.wait()
+    shutil.rmtree(scratch, ignore_errors=True)
     words = said.read_text(errors="replace")
     row: dict[str, Any] = json.loads(counts.read_text()) if counts.exists() else dict.fromkeys(SUMS, 0)
     row.setdefault("peak_rss_mb", 0.0)

@@ -30,10 +30,10 @@ class HttpApplication:
 
     def __init__(self) -> None:
         """Start it."""
-        folder = Path(tempfile.mkdtemp(prefix="fuzz-http-"))
+        self._folder = tempfile.TemporaryDirectory(prefix="fuzz-http-")
         bus = MemoryBus(MemoryHub())
         server = MapServer(
-            bus, Keys("demo"), folder / "s0.sqlite", "s0", schedule=LockstepSchedule(),
+            bus, Keys("demo"), Path(self._folder.name) / "s0.sqlite", "s0", schedule=LockstepSchedule(),
             surroundings=MergeSurroundings.repeatable,
         )  # fmt: skip
         self._server = server.__enter__()
@@ -50,6 +50,7 @@ class HttpApplication:
         """End it."""
         self._runner.close()
         self._server.__exit__(None, None, None)
+        self._folder.cleanup()
 
     def answer(self, data: bytes) -> int:
         """Ask, and return the status.

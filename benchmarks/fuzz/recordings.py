@@ -176,6 +176,7 @@ class RecordingTarget:
     has_height: bool = False
     stamps: tuple[float, ...] = ()
     _path: Path | None = field(default=None, repr=False)
+    _folder: tempfile.TemporaryDirectory[str] | None = field(default=None, repr=False)
 
     def samples(self) -> list[bytes]:
         """Each file once; of equal kinds, such as images, the first."""
@@ -204,7 +205,9 @@ class RecordingTarget:
 
     def _recording(self) -> Path:
         if self._path is None:
-            self._path = self.make(Path(tempfile.mkdtemp(prefix="fuzz-recording-")))
+            # Removed as the process ends.
+            self._folder = tempfile.TemporaryDirectory(prefix="fuzz-recording-")
+            self._path = self.make(Path(self._folder.name))
         return self._path
 
     def _files(self) -> list[Path]:

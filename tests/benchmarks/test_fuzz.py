@@ -3,6 +3,9 @@
 import importlib
 import json
 import math
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
@@ -164,3 +167,11 @@ def test_no_kernel_counts_its_branches():
     kernels = {kernel.__module__ for kernel in jit.KERNELS}
     counted = {module for module in kernels if any(module.startswith(name) for name in process.DECODERS)}
     assert counted and counted <= {*process.COMPILED}
+
+
+@pytest.mark.slow
+def test_nothing_is_left_in_the_folder_of_temporary_files(tmp_path):
+    """A run left a hundred folders there: libFuzzer ends its processes before they remove theirs."""
+    command = [sys.executable, "-m", "benchmarks.fuzz", "--seconds", "1", "--targets", "kitti", "http"]
+    subprocess.run(command, env={**os.environ, "TMPDIR": str(tmp_path)}, check=True, capture_output=True)
+    assert not [path.name for path in tmp_path.iterdir() if path.name.startswith("fuzz-")]
