@@ -27,14 +27,8 @@ Items = Generator[Item, None, bool]
 ROS1, ROS2 = "ros1", "ros2"
 """Profiles of MCAP."""
 MCAP_MAGIC, ROS1_MAGIC = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n"
-MCAP_HEADER, MCAP_SCHEMA, MCAP_CHANNEL, MCAP_MESSAGE, MCAP_CHUNK, MCAP_DATA_END = (
-    0x01,
-    0x03,
-    0x04,
-    0x05,
-    0x06,
-    0x0F,
-)
+MCAP_HEADER, MCAP_SCHEMA, MCAP_CHANNEL = 0x01, 0x03, 0x04
+MCAP_MESSAGE, MCAP_CHUNK, MCAP_DATA_END = 0x05, 0x06, 0x0F
 """Opcodes of records, by the specification of MCAP."""
 ROS1_MESSAGE, ROS1_CHUNK, ROS1_CONNECTION = 0x02, 0x05, 0x07
 """The field `op` of records, by the specification of ROS bags 2.0."""

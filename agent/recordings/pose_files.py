@@ -23,9 +23,9 @@ def read_poses(path: Path) -> StampedPoses:
     """Read poses.
 
     A `.csv` has the columns stamp_s, x_m, y_m and heading_rad. Any other file has lines of
-    `stamp x y z qx qy qz qw`, s and m, z up, of a robot or of its camera; lines that
-    begin with # are comments. A last line without its
-    end is left out. A damaged line ends the poses. Poses are sorted by time.
+    `stamp x y z qx qy qz qw`, s and m, z up, of a robot or of its camera; lines that begin with # are
+    comments. Poses in the frame of a camera are turned until z is up, and `notes` says so. A last line
+    without its end is left out. A damaged line ends the poses. Poses are sorted by time.
 
     Raises:
         DeviceError: the file is missing or wrong.
